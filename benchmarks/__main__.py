@@ -8,13 +8,9 @@ import importlib
 import sys
 from pathlib import Path
 
-from warp_lcp.benchmarks import launches
-from warp_lcp.benchmarks.timing import Options
+from warp_lcp.benchmarks.harness.timing import Options
 
-SUITES = (
-    "kernels", "solvers", "scaling", "floor", "peers", "run", "sand", "implicit_mpm", "contacts", "models", "automatic_tolerance",
-    "validation", "narrow_band", "narrow", "replay", "book", "guard", "tradeoff", "tuning", "extremes", "distributed", "short_steps",
-)  # fmt: skip
+SUITES = ("kernels", "solvers", "scaling", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff", "validation", "extremes")
 
 
 def main() -> None:
@@ -25,31 +21,22 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--size", type=int, action="append", default=[])
     parser.add_argument("--repeat", type=int, default=5)
-    parser.add_argument("--problems", type=Path)
-    parser.add_argument("--method", action="append", default=[])
     parser.add_argument("--scene", default="")
     parser.add_argument("--seed", type=int)
     given = parser.parse_args()
-    launches.install()  # before anything imports warp_lcp
-    suite, report = importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"), importlib.import_module("warp_lcp.benchmarks.report")
-    options = Options(
-        given.device,
-        tuple(given.size),
-        given.repeat,
-        lambda text: sys.stderr.write(f"{text}\n"),
-        given.problems,
-        tuple(given.method),
-        given.scene,
-        given.seed,
+    suite, report = (
+        importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"),
+        importlib.import_module("warp_lcp.benchmarks.harness.report"),
     )
+    options = Options(given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.scene, given.seed)
     given.out.mkdir(parents=True, exist_ok=True)
     gc.collect()
-    gc.freeze()  # searches for arrays (`benchmarks.memory`) pass over the hundreds of thousands of objects that imports have made
+    gc.freeze()  # searches for arrays (`machine.array_bytes`) pass over the hundreds of thousands of objects that imports have made
     try:
         results = suite.measure(options, given.out)
     except MemoryError as error:
         sys.exit(f"out of memory: {error}")
-    for line in report.write(given.suite, suite.TITLE, results, options, given.out):
+    for line in report.write(given.suite, suite.TITLE, results, given.out):
         options.say(line)
     for line in results.failures:
         options.say(f"not as it must be: {line}")

@@ -13,43 +13,31 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.memory import array_bytes, forget_peak, resident_bytes
+from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, resident_bytes
+from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import Splash, warm_changes
-from warp_lcp.benchmarks.timing import Figure
 
 RTOL = 1e-6
+STOPPING = wl.StoppingCriteria(rtol=RTOL)
 TOLERANCES = (1e-4, 1e-6, 1e-8)
 MIDST = 3  # iterations after which a method has made all of its buffers
 
 
 @dataclass
 class Case:
-    """A solve that is measured again and again.
+    """A solve that is measured again and again."""
 
-    Args:
-        form: coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`.
-        scene: the scene.
-        bounds: which unknowns have p >= 0.
-        solver: settings of the method.
-        device: Warp device.
-        full: whether reuse, warm starts and time to tolerances are measured too.
-        label: what the method is called; its class's name if empty.
-        reused: whether only reuse is, where `full` is False.
-    """
-
-    form: str
-    scene: Splash
-    bounds: str
-    solver: Any
-    device: str
-    full: bool = True
-    label: str = ""
-    reused: bool = False
+    form: str  # coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`
+    scene: Splash  # the scene
+    bounds: str  # which unknowns have p >= 0
+    solver: Any  # settings of the method
+    device: str  # Warp device
+    full: bool = True  # whether reuse, warm starts and time to tolerances are measured too
+    label: str = ""  # what the method is called; its class's name if empty
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
     history: list[wl.Record] = field(default_factory=list)
     _warm: Iterator[tuple[float, int]] | None = None
-    _kept: tuple[wl.LCP, Any] | None = None
 
     @property
     def method(self) -> str:
@@ -76,7 +64,7 @@ class Case:
         times.append(time.perf_counter())
         work = self.solver.init(problem)
         times.append(time.perf_counter())
-        result = wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=RTOL), workspace=work)
+        result = wl.solve(problem, self.solver, stopping=STOPPING, workspace=work)
         wp.synchronize_device(self.device)
         times.append(time.perf_counter())
         self.counts |= {
@@ -92,62 +80,31 @@ class Case:
             self.samples["setup"].append(times[3] - times[0])
             self.samples["total"].append(times[4] - times[0])
 
-    def cold_again(self, *, keep: bool) -> None:
-        """Solve cold with a workspace that has solved before."""
-        if self._kept is None:
-            problem, _ = self._in_place()
-            self._kept = problem, self.solver.init(problem)
-        problem, work = self._kept
-        begun = time.perf_counter()
-        result = wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=RTOL), workspace=work)
-        wp.synchronize_device(self.device)
-        self.counts["reuse_iterations"] = result.iterations
-        if keep:
-            self.samples["reuse"].append(time.perf_counter() - begun)
-
     def again(self, *, keep: bool) -> None:
-        """Solve with a workspace that has solved before: cold; by the method's bare loop; and warm after b changed by 1 %."""
+        """Solve with a workspace that has solved before: cold, and warm after b changed by 1 %."""
         if self._warm is None:
             self._warm = self._solves()
-        for label in ("reuse", "bare", "warm"):
+        for label in ("reuse", "warm"):
             seconds, iterations = next(self._warm)
             self.counts[f"{label}_iterations"] = iterations
             if keep:
                 self.samples[label].append(seconds)
 
     def _solves(self) -> Iterator[tuple[float, int]]:
-        """Yield seconds and iterations of a cold solve, the bare loop, a warm solve, and so on, in place and with one workspace."""
+        """Yield seconds and iterations of a cold solve, a warm solve, and so on, in place and with one workspace."""
         problem, b = self._in_place()
         work, fields = self.solver.init(problem), [self._stored(v) for v in warm_changes(self.scene)]
-        start, stopping, turn = wp.zeros_like(b), wl.StoppingCriteria(rtol=RTOL), 0
+        start, turn = wp.zeros_like(b), 0
         while True:
-            begun = time.perf_counter()
-            result = wl.solve(problem, self.solver, stopping=stopping, workspace=work)
-            wp.synchronize_device(self.device)
-            yield time.perf_counter() - begun, result.iterations
-            wp.copy(start, result.x)
-            yield self._bare(problem, work, result.iterations), result.iterations
-            turn += 1
-            wp.copy(b, fields[turn % 2])
-            begun = time.perf_counter()
-            result = wl.solve(problem, self.solver, stopping=stopping, x0=start, workspace=work)
-            wp.synchronize_device(self.device)
-            yield time.perf_counter() - begun, result.iterations
-
-    def _bare(self, problem: wl.LCP, work: Any, steps: int) -> float:
-        """Return the seconds of the method's own steps, without statuses, history, best iterate or search for singular components."""
-        begun = time.perf_counter()
-        residual = work.residual
-        residual.start(work.x, keep=False)
-        tolerance = RTOL * residual.evaluate(work.x)
-        work.start(warm=False, tolerance=tolerance)
-        for _ in range(steps):
-            residual.current = False
-            self.solver.step(problem, work, work.x)
-            if not residual.current:
-                residual.evaluate(work.x)
-        wp.synchronize_device(self.device)
-        return time.perf_counter() - begun
+            for warm in (False, True):
+                begun = time.perf_counter()
+                result = wl.solve(problem, self.solver, stopping=STOPPING, x0=start if warm else None, workspace=work)
+                wp.synchronize_device(self.device)
+                yield time.perf_counter() - begun, result.iterations
+                if not warm:
+                    wp.copy(start, result.x)
+                    turn += 1
+                    wp.copy(b, fields[turn % 2])
 
     def memory(self) -> None:
         """Count the bytes of operator, problem and workspace, b and the bounds included: in the midst of a solve in place, and after it."""
@@ -160,7 +117,7 @@ class Case:
             if record.iteration == MIDST:
                 most.append(array_bytes())
 
-        wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=RTOL), workspace=work, callback=look)
+        wl.solve(problem, self.solver, stopping=STOPPING, workspace=work, callback=look)
         most.append(array_bytes())
         self.counts["bytes_per_cell"] = (max(most) - before) / self.cells
         self.counts["resident_per_cell"] = max(0, resident_bytes(peak=True) - resident) / self.cells
@@ -180,8 +137,6 @@ class Case:
         """Return what was measured."""
         figures = {name: Figure.of(times, "s") for name, times in self.samples.items()}
         figures |= {name: Figure(value, "B" if "per_cell" in name else "") for name, value in self.counts.items()}
-        if self.samples["bare"]:
-            figures["loop_over_bare"] = Figure.of([a / b for a, b in zip(self.samples["reuse"], self.samples["bare"], strict=True)])
         return figures
 
     def _in_place(self) -> tuple[wl.LCP, wp.array[Any]]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.machine import machine
-from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Table
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
 from warp_lcp.gallery.contact_stepper import ContactStepper
@@ -23,6 +22,7 @@ TOLERANCE = 1e-13  # of the residual at x = 0: curves end there
 RATIOS = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 EQUAL = (200, 1000, 5000)  # sweeps at which NNCG and PGS are compared
 TARGET = 10.0  # how many times smaller the residual of NNCG should be than that of PGS
+DRAWN = ("box-stack", "wall", "heavy-on-light", "hanging-snake")  # scenes whose residuals are drawn
 STACKS = ("box-stack", "sphere-stack", "wall", "leaning-wall", "heavy-on-light")
 LARGEST_LCP = 1500  # unknowns of a Stewart-Trinkle problem up to which Lemke's method and Newton's are waited for
 
@@ -47,18 +47,13 @@ def measure(options: Options, out: Path) -> Results:
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
     solves: list[Record] = []
     charts: list[Chart] = []
-    rows: list[list[Any]] = []
     for name in SCENES:
         system = _system(name, options.device)
         options.say(f"{name}: {system.contacts} contacts, {len(system.lower)} joint rows")
-        curves = _scene(name, system, options, solves, rows)
-        sweeps = {label: (x, y) for label, (x, y, _) in curves.items()}
-        seconds = {label: (t, y) for label, (_, y, t) in curves.items()}
-        unit = "residual / residual at x = 0"
-        charts.append(Lines(f"{name}-iterations", system.name, "sweeps, linear iterations, pivots or factorizations", unit, sweeps))
-        charts.append(Lines(f"{name}-seconds", system.name, "seconds", unit, seconds))
+        curves = _scene(name, system, options, solves)
+        steps, unit = "sweeps, linear iterations, pivots or factorizations", "residual / residual at x = 0"
+        charts += [Lines(name, system.name, steps, unit, curves)] if name in DRAWN else []
     equal = _equal(options)
-    _write_csv(out / "contacts-history.csv", rows)
     return Results([*records, *solves, *equal], [_finding(equal), _equal_table(equal), *_tables(solves)], charts)
 
 
@@ -76,10 +71,10 @@ def _stop(most: int, tolerance: float = TOLERANCE) -> wl.StoppingCriteria:
     return wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most, divergence=1e30)
 
 
-Curve = tuple[list[float], list[float], list[float]]
+Curve = tuple[list[float], list[float]]
 
 
-def _scene(name: str, system: ContactSystem, options: Options, solves: list[Record], rows: list[list[Any]]) -> dict[str, Curve]:
+def _scene(name: str, system: ContactSystem, options: Options, solves: list[Record]) -> dict[str, Curve]:
     """Solve a scene by all methods; return linear iterations, relative residuals and seconds of each."""
     curves: dict[str, Curve] = {}
     models: list[tuple[ContactModel, str, dict[str, Any]]] = [(BoxedModel(), "boxed", BOXED), (StewartTrinkleModel(4), "LCP", LCP)]
@@ -100,8 +95,7 @@ def _scene(name: str, system: ContactSystem, options: Options, solves: list[Reco
             first = result.history[0].residual
             history = [(h.linear_iterations, h.residual / first, h.seconds) for h in result.history]
             shown = [(n, r, t) for n, r, t in history if n > 0 and r > 0]
-            curves[f"{label} ({kind})"] = ([n for n, _, _ in shown], [r for _, r, _ in shown], [t for _, _, t in shown])
-            rows += [[name, kind, label, n, f"{r:.6e}", f"{t:.6f}"] for n, r, t in _thinned(history)]
+            curves[f"{label} ({kind})"] = ([n for n, _, _ in shown], [r for _, r, _ in shown])
             cone = system.residual(model.impulses(system, result.x.numpy()))
             figures = {
                 "residual": Figure(min(r for _, r, _ in history)),
@@ -117,16 +111,6 @@ def _scene(name: str, system: ContactSystem, options: Options, solves: list[Reco
                     figures |= {f"sweeps_to_{level:.0e}": Figure(reached[0]), f"seconds_to_{level:.0e}": Figure(reached[1], "s")}
             solves.append(Record(f"{name}: {label}", figures, facts | {"status": result.status.name}))
     return curves
-
-
-def _thinned(history: list[tuple[int, float, float]]) -> list[tuple[int, float, float]]:
-    """Return every step up to 20, then those that are a tenth later: files stay small."""
-    kept, next_one = [], 0.0
-    for i, row in enumerate(history):
-        if i >= next_one or i == len(history) - 1:
-            kept.append(row)
-            next_one = i + 1 if i < 20 else 1.1 * i
-    return kept
 
 
 def _equal(options: Options) -> list[Record]:
@@ -190,11 +174,3 @@ def _tables(solves: list[Record]) -> list[Table]:
         )
         tables.append(Table(name, columns, rows, remark if name == next(iter(SCENES)) else ""))
     return tables
-
-
-def _write_csv(path: Path, rows: list[list[Any]]) -> None:
-    """Write all histories."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["scene", "model", "method", "linear_iterations", "relative_residual", "seconds"])
-        writer.writerows(rows)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.machine import present
+from warp_lcp.benchmarks.harness.machine import present
 
 f32_3d, u8_3d = wp.array3d(dtype=wp.float32), wp.array3d(dtype=wp.uint8)
 

@@ -1,25 +1,29 @@
-"""Every kernel that a solve launches on the finest grid, by itself: cells and bytes a second against what copying memory reaches.
+"""Every pass that a solve makes over the finest grid, by itself: cells and bytes a second against what copying memory reaches.
 
-The kernels are those that solves of a full basin launch (`benchmarks.launches` listens), so that the list follows the code. The bytes are
-those of the fields that a kernel reads and writes, each counted once a direction.
+The passes are those that solves of a full basin bind, so that the list follows the code. The bytes are those of the fields that a pass
+declares to read and to write, each counted once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.benchmarks.harness.machine import COPIED, machine, present
+from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns, ratios
 from warp_lcp.benchmarks.kernel_peers import numba_products, plain_product
-from warp_lcp.benchmarks.launches import Launch, Traffic, distinct, listen, stored_sizes, traffic
-from warp_lcp.benchmarks.machine import COPIED, machine, present
 from warp_lcp.benchmarks.problems import Splash, basin
-from warp_lcp.benchmarks.record import Bars, Record, Results, Table
-from warp_lcp.benchmarks.timing import Figure, Options, in_turns, ratios
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.row_pass import Bound
 
 TITLE = "Kernels of the grid engine on the finest grid"
 SIZES = (128, 256)
@@ -31,9 +35,44 @@ SET_UP = (
 )  # fmt: skip
 SERIAL = ("stencil.relax",)  # in place and in two colors: bound by store forwarding, not by memory
 FORMS = ("unit", "faces")
-SMALL = 32  # cells a side of the grid on which it is found what a kernel reads and writes
 COPIES = 3
 PEER_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """A pass with its fields, by name."""
+
+    bound: Bound
+    fields: dict[str, wp.array[Any]]
+
+    @property
+    def name(self) -> str:
+        """Area, name, types and what is absent: `cycle.sweep uniform float32 uint8 -b`."""
+        absent = [f"-{name}" for name in self.bound.form.declared.optional if name not in self.fields]
+        return " ".join((self.bound.form.declared.name, *self.bound.form.words, *absent))
+
+    @property
+    def writes(self) -> dict[str, int]:
+        """Bytes that are written."""
+        return {name: size for name, size in self._sizes().items() if name in self.bound.form.declared.writes}
+
+    @property
+    def reads(self) -> dict[str, int]:
+        """Bytes that are read."""
+        return {name: size for name, size in self._sizes().items() if name not in self.bound.form.declared.writes}
+
+    @property
+    def bytes(self) -> float:
+        """Bytes that must be moved, those of ghost cells apart."""
+        n = round(self.bound.rows.size ** (1 / 3)) - 2
+        return sum(self._sizes().values()) * n**3 / (n + 2) ** 3
+
+    def _sizes(self) -> dict[str, int]:
+        """Return the bytes of the fields of this grid and of the next coarser one; other arrays are small."""
+        declared = self.bound.form.declared
+        small = {*declared.by_row, *declared.whole, "out"}
+        return {name: a.size * wp.types.type_size_in_bytes(a.dtype) for name, a in self.fields.items() if a.size and name not in small}
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -55,12 +94,11 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _measure_form(n: int, form: str, options: Options) -> list[Record]:
-    """Hear the kernels of one form of coefficients, then measure them in turns with copies and the peers."""
+    """Hear the passes of one form of coefficients, then measure them in turns with copies and the peers."""
     device = options.device
     heard, product = _hear(_basin(n, form), device)
-    moved = _bytes_per_cell(n, form, device, heard)
     a, b = (wp.full(min(COPIED, 64 * n**3), 1.0, dtype=wp.float32, device=device) for _ in range(2))
-    kernels = [(name, _synchronized(launch.run, device)) for name, launch in heard.items()]
+    kernels = [(name, _synchronized(one.bound.launch, device)) for name, one in heard.items()]
     peers = _peers(product, n, device) if form == "unit" else {}
     work: dict[str, Callable[[], None]] = {}
     for third in range(COPIES):  # spread over a round, which takes seconds at 256^3
@@ -68,29 +106,29 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
         work |= dict(kernels[third::COPIES])
     times = in_turns(work, options.repeat)
     if peers:  # apart, for then all are done within milliseconds: other users of the machine slow them alike
-        apart = in_turns({"product": _synchronized(product.run, device), "copy": work["copy 0"], **peers}, PEER_ROUNDS * options.repeat)
+        apart = in_turns(
+            {"product": _synchronized(product.bound.launch, device), "copy": work["copy 0"], **peers}, PEER_ROUNDS * options.repeat
+        )
         own = [8 * a.size / t for t in apart["copy"]]
     copying = [8 * a.size / median(taken) for taken in zip(*(times[f"copy {third}"] for third in range(COPIES)), strict=True)]
     records = []
-    for key, launch in heard.items():
-        role = "set-up" if launch.name.startswith(SET_UP) else "serial" if launch.name.startswith(SERIAL) else "hot"
-        name = PRODUCT if launch is product else launch.name
-        found, per_cell = moved[key]
-        with_peers = launch is product and bool(peers)
+    for key, one in heard.items():
+        role = "set-up" if key.startswith(SET_UP) else "serial" if key.startswith(SERIAL) else "hot"
+        with_peers = one is product and bool(peers)
         taken, copied = (apart["product"], own) if with_peers else (times[key], copying)
-        figures = _figures(taken, n, per_cell, copied) | {"launches": Figure(launch.count)}
+        figures = _figures(taken, n, one.bytes / n**3, copied)
         if with_peers:
             figures |= {f"over {peer}": ratios(apart[peer], apart["product"]) for peer in peers}
-        fields = {"reads": sorted(found.reads), "writes": sorted(found.writes)}
-        records.append(Record(f"{n}^3 {form}: {name}", figures, {"form": form, "role": role, **fields}))
+        facts = {"form": form, "role": role, "reads": sorted(one.reads), "writes": sorted(one.writes)}
+        records.append(Record(f"{n}^3 {form}: {PRODUCT if one is product else key}", figures, facts))
     for peer in peers:
         figures = _figures(apart[peer], n, 8 if "constant" in peer else 9, own)
         records.append(Record(f"{n}^3 {form}: {peer}", figures, {"form": form, "role": "peer"}))
     finder = wl.GridPoisson(_basin(n, form).cells, device=device, **_basin(n, form).faces)
     search = in_turns({"search": finder.floating_components}, options.repeat)["search"]
     name = f"{n}^3 {form}: search for floating components, all kernels"
-    records.append(Record(name, _figures(search, n, 0.0, copying) | {"launches": Figure(1)}, {"form": form, "role": "set-up"}))
-    return sorted(records, key=lambda r: -(r.value("seconds") or 0) * (r.value("launches") or 0))
+    records.append(Record(name, _figures(search, n, 0.0, copying), {"form": form, "role": "set-up"}))
+    return sorted(records, key=lambda r: -(r.value("seconds") or 0))
 
 
 def _basin(n: int, form: str) -> Splash:
@@ -113,44 +151,38 @@ def _synchronized(run: Callable[[], None], device: str) -> Callable[[], None]:
     return waited
 
 
-def _bytes_per_cell(n: int, form: str, device: str, heard: dict[str, Launch]) -> dict[str, tuple[Traffic, float]]:
-    """Return what each kernel moves, found with the same kernel on a small grid where there is one: 256^3 takes minutes."""
-    small = min(n, SMALL)
-    alike = heard if small == n else _hear(_basin(small, form), device)[0]
-    found = {}
-    for name, launch in heard.items():
-        m, one = (small, alike[name]) if name in alike else (n, launch)
-        moved = traffic(one, stored_sizes((m, m, m)))
-        found[name] = moved, moved.bytes / m**3
-    return found
+def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
+    """Return the passes over the finest grid that solves of the scene bind, by a unique label, and the float32 product among them."""
+    heard: list[Heard] = []
+    bind = RowPass.bind
 
+    def listening(declared: RowPass, rows: Rows, *, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> Bound:
+        bound = bind(declared, rows, stencil=stencil, bounds=bounds, **given)
+        fields = {name: value for name, value in given.items() if isinstance(value, wp.array)}
+        if stencil is not None:
+            fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}
+        fields |= {name: value for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False) if name}
+        heard.append(Heard(bound, fields))
+        return bound
 
-def _hear(scene: Splash, device: str) -> tuple[dict[str, Launch], Launch]:
-    """Return the kernels that solves of the scene launch, by a unique label, and the float32 product among them."""
-    solvers = (wl.ProjectedMultigrid(), 5), (wl.MinimumMapNewton(), 4), (wl.ProjectedSOR(), 1)
-    heard: list[Launch] = []
-    for solver, most in solvers:
-        for bounds in ("walls", "linear") if isinstance(solver, wl.ProjectedMultigrid) else ("walls",):
-            with listen() as new:
-                problem = scene.problem(bounds, device)
-                wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=0, max_iterations=most))
-            heard += distinct(new, scene.n**3)
-    A = wl.GridPoisson(scene.cells, device=device, **scene.faces)
-    x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device=device)
-    with listen() as new:
+    with mock.patch.object(RowPass, "bind", listening):
+        for solver, most in ((wl.ProjectedMultigrid(), 5), (wl.MinimumMapNewton(), 4), (wl.ProjectedSOR(), 1)):
+            for bounds in ("walls", "linear") if isinstance(solver, wl.ProjectedMultigrid) else ("walls",):
+                wl.solve(scene.problem(bounds, device), solver, stopping=wl.StoppingCriteria(rtol=0, max_iterations=most))
+        A = wl.GridPoisson(scene.cells, device=device, **scene.faces)
+        x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device=device)
         A.stencil.product(x, wp.zeros_like(x))
-    kinds: dict[str, Launch] = {}
-    for launch in [*heard, new[0]]:
-        kinds.setdefault(launch.name, launch)
-    for launch in kinds.values():
-        if "changed" in launch.arrays:  # rows that are made again: all of them
-            launch.arrays["changed"].fill_(1)
-    return kinds, kinds[new[0].name]
+    kinds: dict[str, Heard] = {}
+    for one in heard:
+        declared = one.bound.form.declared
+        if one.bound.rows.size == A.layout.size and not declared.box and not declared.listed:
+            kinds.setdefault(one.name, one)
+    return kinds, kinds[heard[-1].name]
 
 
-def _peers(product: Launch, n: int, device: str) -> dict[str, Callable[[], None]]:
+def _peers(product: Heard, n: int, device: str) -> dict[str, Callable[[], None]]:
     """Return the peers of the product on the same memory: where a field lies in the caches' sets is worth 30 % at 128^3."""
-    d, x, y = (product.arrays[name].reshape((n + 2,) * 3) for name in ("d", "x", "y"))
+    d, x, y = (product.fields[name].reshape((n + 2,) * 3) for name in ("d", "x", "y"))
     return {"Warp, one thread a cell": plain_product(d, x, y, device), **numba_products(d.numpy(), x.numpy(), y.numpy())}
 
 

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import argparse
 import gc
-import importlib
 import math
 import sys
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -21,13 +19,13 @@ import numpy as np
 import tomli_w
 import warp as wp
 
-from warp_lcp.benchmarks.machine import machine
-from warp_lcp.benchmarks.memory import array_bytes
-from warp_lcp.benchmarks.record import Record, Results, Table
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.harness.machine import array_bytes, machine
+from warp_lcp.benchmarks.harness.record import Record, Results, Table
+from warp_lcp.benchmarks.harness.report import markdown
+from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.stepping import plan_dt
-from warp_lcp.scene.models import TABLE, prices
+from warp_lcp.scene.models import TABLE
 from warp_lcp.scene.scene import Scene, Time
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.scene.table import validate
@@ -39,26 +37,19 @@ WATCHED = 3  # steps that the shares of the stages are taken from
 STAGES = ("sort", "particles-to-grid", "grid-to-particles", "advection", "diagnostics")  # whose time is the particles'
 QUIET = {"diagnostics": False}
 REFERENCE = "{}"  # the tables of the reference scene, as text
+BEGIN, END = "<!-- Written by `python -m warp_lcp.benchmarks.models` down to the next mark; do not edit. -->", "<!-- end -->"
 Tables = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Offer:
-    """A model: tables of the reference scene with it, and of the nearest scene without; those left out are the reference's.
+    """A model: tables of the reference scene with it, and of the nearest scene without; those left out are the reference's."""
 
-    Args:
-        on: with it.
-        off: without it.
-        unit: what its bytes are counted by, `cell` or `particle`.
-        spent: what its seconds are counted by, where that is another: what works only where the liquid is goes with the particles.
-        frames: it works when a frame is made, not in a step.
-    """
-
-    on: Tables
-    off: Tables = field(default_factory=dict)
-    unit: str = "cell"
-    spent: str = ""
-    frames: bool = False
+    on: Tables  # with it
+    off: Tables = field(default_factory=dict)  # without it
+    unit: str = "cell"  # what its bytes are counted by, `cell` or `particle`
+    spent: str = ""  # what its seconds are counted by, where that is another: what works only where the liquid is goes with the particles
+    frames: bool = False  # it works when a frame is made, not in a step
 
 
 def offers(simulator: str, dimension: int) -> dict[str, Offer]:
@@ -101,9 +92,7 @@ def reference(simulator: str, dimension: int, tables: Tables, size: int) -> Scen
     if simulator == "fluids":
         scene["domain"]["wall"] = "free-slip"
         scene["pressure"] = {"surface": "voxel"}
-    scene["liquid" if simulator == "fluids" else "sand"] = [
-        {"shape": "box", "min": [0.0] * dimension, "max": [0.55, 0.4, 0.5][:dimension]},
-    ]
+    scene["liquid" if simulator == "fluids" else "sand"] = [{"shape": "box", "min": [0.0] * dimension, "max": [0.55, 0.4, 0.5][:dimension]}]
     merged = scene | {name: scene["domain"] | value if name == "domain" else value for name, value in tables.items()}
     return validate(simulators()[simulator].scene_model, merged, "reference")
 
@@ -125,12 +114,12 @@ def run_seconds(simulation: Any, time: Time) -> np.ndarray:
 def step_seconds_of(simulation: Any, dt: float) -> tuple[float, dict[str, Any]]:
     """Return the seconds of a step and its row: the processor's own seconds on a CPU, which other programs take no part of."""
     device = simulation.grid.device
-    clock = time.perf_counter if device.is_cuda else time.process_time
+    read = clock(str(device))
     wp.synchronize_device(device)
-    begun = clock()
+    begun = read()
     row = simulation.step(dt)
     wp.synchronize_device(device)
-    return clock() - begun, row
+    return read() - begun, row
 
 
 @dataclass
@@ -276,58 +265,12 @@ def price_list(records: list[Record]) -> Mapping[str, Any]:
     return listed
 
 
-PAGE = """# What models cost
-
-<!-- Written by `python -m warp_lcp.benchmarks.models`; do not edit. -->
-
-A scene has what it asks for and nothing else: a model that is off loads no kernel, allocates no byte and logs no column (a test for each of
-them proves it). `warp-lcp check SCENE` says which models a scene turns on and why, and what they take of its memory and of a step, by the
-prices below; `--calibrate` takes a few steps and scales them to the machine at hand. The prices are those of half a second of a run, with
-steps as long as a run's, and of two resolutions: a part of each is the same at any size, a part grows with the cells or the particles. What
-a scene asks for but cannot need is not built, and the plan says so:
-
-- where no wall separates, or no side has a wall, the pressure is the solution of equations: no bounds are stored or tested;
-- a closed box full of liquid has no free surface, and no level set is made for one;
-- 2-D scenes have no third component of anything.
-
-`warp-lcp bench models` measures them anew. The seconds are those of one core of {machine}.
-
-{tables}
-
-## A tolerance that follows the time step
-
-With `[solver] tolerance = "auto"` (liquids) a solve stops when the velocity error that it leaves is a tenth of the error that the step's
-length makes anyway. The step takes the acceleration by the pressure as constant, so its error in the velocity is to first order half of
-what that acceleration changes by from one step to the next: 1/2 ||G (x - x0)||, with x = dt p / (rho dx), x0 the last step's pressure over
-this step and G the gradient, and ||G e||^2 = e'A e. It is measured after each solve, in one product with A, and counts for the next step,
-times (dt / dt_last)^2 where that is shorter.
-
-What multigrid cycles leave is as short as the cells, where A is of order one: in forty steps of four scenes the velocity error was 0.12 to
-1.0 times the residual. So the solve ends when the residual (root mean square over the cells) is a tenth of the time error, or rounding
-noise where a liquid rests or falls freely. It is at most a tenth of the residual at zero pressure as the step before had it, and at least
-1e-6 of it. The first two steps, before which there is no change to measure, go to 1e-4.
-
-The log then has the columns `tolerance`, the relative residual that a step was held to, and `time_error` [m/s]. Sand has no such tolerance:
-its own is in units of a cell's weight.
-
-{automatic}
-"""
-
-
-def write_page(page: Path, results: Results, automatic: Table) -> None:
-    """Write the page of the documentation."""
-    tables = "\n\n".join(f"## {table.title}\n\n{markdown(table)}" for table in results.tables)
-    machine = str(results.records[0].facts["hardware"]["cpu"])
-    page.write_text(PAGE.format(machine=machine, tables=tables, automatic=markdown(automatic)), "utf-8")
-
-
-def markdown(table: Table) -> str:
-    """Return a table as the page has it."""
-    return "\n".join([table.remark, "", _row(table.columns), _row(["---"] * len(table.columns)), *map(_row, table.rows)])
-
-
-def _row(cells: Any) -> str:
-    return f"| {' | '.join(cells)} |"
+def write_page(page: Path, results: Results) -> None:
+    """Put the tables into the page of the documentation, between its two marks."""
+    head, _, rest = page.read_text("utf-8").partition(BEGIN)
+    tables = "\n\n".join("\n".join([f"## {table.title}", "", *markdown(table)]) for table in results.tables)
+    told = f"The seconds are those of one core of {results.records[0].facts['hardware']['cpu']}."
+    page.write_text(f"{head}{BEGIN}\n{told}\n\n{tables}\n{END}{rest.partition(END)[2]}", "utf-8")
 
 
 def main() -> None:
@@ -339,12 +282,9 @@ def main() -> None:
     given = parser.parse_args()
     options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
     results = measure(options, Path())
-    compared = importlib.import_module("warp_lcp.benchmarks.automatic_tolerance").measure(options, Path())
     head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m warp_lcp.benchmarks.models`.\n\n"
     Path(str(files("warp_lcp.scene") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
-    prices.cache_clear()
-    results.tables.extend(importlib.import_module("warp_lcp.benchmarks.predictions").measure(options, Path()).tables)
-    write_page(given.page, results, compared.tables[0])
+    write_page(given.page, results)
 
 
 if __name__ == "__main__":

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+import warp_lcp as wl
 from warp_lcp.gallery.fluid import BOUNDS, SOLID_CENTER, SOLID_RADIUS, Splash, SplashPart, basin, splash, splash_part
 
-__all__ = ["BOUNDS", "Splash", "SplashPart", "anisotropic", "basin", "cut_cells", "splash", "splash_part", "warm_changes"]
+__all__ = ["BOUNDS", "Splash", "SplashPart", "anisotropic", "basin", "cut_cells", "natural", "splash", "splash_part", "warm_changes"]
 
 
 def cut_cells(scene: Splash) -> Splash:
@@ -30,3 +31,18 @@ def warm_changes(scene: Splash, size: float = 0.01) -> tuple[np.ndarray, np.ndar
     """Return b and a right-hand side that differs from it by `size` of its norm, by another velocity field."""
     other = splash(scene.n, phase=0.23).b
     return scene.b, scene.b + size * np.linalg.norm(scene.b) / np.linalg.norm(other) * other
+
+
+def natural(cells: np.ndarray, b: np.ndarray, lower: float | np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return min(x - l, A x + b) on FLUID cells and 0 elsewhere, with coefficients of 1, by no code of the solvers; all of one shape."""
+    fluid, air = cells == wl.FLUID, cells == wl.AIR
+    p, y = np.where(fluid, x, 0.0), b.copy()
+    for axis in range(3):
+        below, above = ([slice(None)] * 3 for _ in range(2))
+        below[axis], above[axis] = slice(None, -1), slice(1, None)
+        i, j = tuple(below), tuple(above)
+        open_ = (fluid[i] & (fluid[j] | air[j])) | (fluid[j] & air[i])  # SOLID cells, and the box around all, let nothing through
+        flux = np.where(open_, p[i] - p[j], 0.0)
+        y[i] += flux
+        y[j] -= flux
+    return np.where(fluid, np.minimum(p - lower, y), 0.0)

@@ -5,19 +5,18 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.machine import machine
-from warp_lcp.benchmarks.record import Bars, Record, Results, Table
-from warp_lcp.benchmarks.stopwatch import timed
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options, timed
 from warp_lcp.material import particle_simulation
 from warp_lcp.material.boundary import WholeCells
 from warp_lcp.run.loop import RunRequest, run_scene
@@ -75,13 +74,8 @@ def measure(options: Options, out: Path) -> Results:
     options.say("particles")
     particles = _particles(size or PARTICLES, options)
     records += [*scenes, walls, particles]
-    chart = Bars(
-        "stages",
-        "Share of a step",
-        "%",
-        {f"{r.name}: {k[6:]}": 100 * f.value for r in scenes for k, f in r.figures.items() if k[:6] == "share "},
-    )
-    return Results(records, [_table(scenes), _figures_table([walls, particles])], [chart])
+    shares = {f"{r.name}: {k[6:]}": 100 * f.value for r in scenes for k, f in r.figures.items() if k[:6] == "share "}
+    return Results(records, [_table(scenes), _figures_table([walls, particles])], [Bars("stages", "Share of a step", "%", shares)])
 
 
 def _overrides(duration: float, size: int) -> list[str]:
@@ -101,15 +95,8 @@ def _run(name: str, duration: float, size: int, device: str) -> dict[str, float]
     stages = {stage: sum(seconds[stage]) for stage in STAGES}
     linear = sum(row["linear_iterations"] or 0 for row in watch.rows)
     rest = steps - sum(stages.values())
-    return {
-        "steps": len(watch.rows),
-        "in steps": steps,
-        "total": total,
-        "linear": linear,
-        **stages,
-        "rest of steps": rest,
-        "output": total - steps,
-    }
+    counts = {"steps": len(watch.rows), "in steps": steps, "total": total, "linear": linear}
+    return counts | stages | {"rest of steps": rest, "output": total - steps}
 
 
 def _scene_record(name: str, samples: Sequence[dict[str, float]]) -> Record:
@@ -165,23 +152,12 @@ class BothSolves:
         return wp.array(ratio * free.reshape(guess.shape) * (guess != 0), dtype=wp.float64, device=x0.device)
 
 
-@contextmanager
-def _solving_both(device: str) -> Any:
-    both = BothSolves(wl.solve, device)
-    wl.solve = both  # type: ignore[assignment]
-    try:
-        yield both
-    finally:
-        wl.solve = both.plain
-
-
 def _walls(size: int, options: Options) -> Record:
     """Solve every step of the running dam break with separating walls and without bounds."""
-    scene, watch = (
-        load_scene("dam-break", [*_overrides(WALL_TIME, size), "solver.method=projected-multigrid", "solver.tolerance=1e-6"]),
-        Watch(),
-    )
-    with tempfile.TemporaryDirectory() as folder, _solving_both(options.device) as both:
+    scene = load_scene("dam-break", [*_overrides(WALL_TIME, size), "solver.method=projected-multigrid", "solver.tolerance=1e-6"])
+    watch = Watch()
+    both = BothSolves(wl.solve, options.device)
+    with tempfile.TemporaryDirectory() as folder, mock.patch.object(wl, "solve", both):
         run_scene(RunRequest(scene=scene, out=Path(folder) / "run", device=options.device, force=True), observer=watch)
     parts = np.array_split(np.arange(1, len(both.linear)), options.repeat)  # the first step is cold
     ratio = [sum(both.bounded[i] for i in part) / sum(both.linear[i] for i in part) for part in parts if len(part)]

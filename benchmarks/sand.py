@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.machine import machine
-from warp_lcp.benchmarks.record import Lines, Record, Results, Table
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Lines, Record, Results, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.coupled import METHODS
 from warp_lcp.granular.scene import SandScene
@@ -24,6 +24,10 @@ TOLERANCE = 1e-3  # of the stresses, in units of rho g dx
 MOST = 4000  # iterations that a method may take here
 COLLAPSE_END = 1.2  # [s]
 STEPS = 20  # of the large scenes that are timed
+COLLAPSE = {
+    "a step": "seconds_per_step", "iterations": "iterations", f"steps at {TOLERANCE:g}": "share_converged", "runout / width": "runout",
+    "last top speed": "max_speed", "last energy, of the most": "kinetic_energy",
+}  # fmt: skip
 ROUNDS = (10, 20, 40, 80, 160, 320, 640, 1280)  # iterations at which the curves are taken
 
 
@@ -34,7 +38,11 @@ def measure(options: Options, out: Path) -> Results:
     states, curves = _methods(size, options)
     models = [_collapse(size, model, options) for model in ("cone", "box")]
     steps = [_steps(name, scene, options) for name, scene in _large().items()]
-    tables = [_method_table(states), _model_table(models), _step_table(steps)]
+    tables = [
+        _method_table(states),
+        _table("The whole collapse", "yield set", COLLAPSE, models),
+        _table("Steps of large scenes", "scene", {"particles": "particles", "a step": "seconds", "iterations": "iterations"}, steps),
+    ]
     chart = Lines("convergence", "Residual against seconds, mid-flow", "seconds", "residual [rho g dx]", curves)
     return Results([*records, *states, *models, *steps], tables, [chart])
 
@@ -175,27 +183,12 @@ def _steps(name: str, scene: SandScene, options: Options) -> Record:
 
 
 def _method_table(records: list[Record]) -> Table:
-    rows = [
-        [r.name, r.facts["status"], *(str(r.figures[k]) for k in ("iterations", "residual", "seconds", "ratio"))] for r in records
-    ]  # fmt: skip
+    keys = ("iterations", "residual", "seconds", "ratio")
+    rows = [[r.name, r.facts["status"], *(str(r.figures[k]) for k in keys)] for r in records]
     columns = ["state: method", "status", "iterations", "residual", "seconds", "of interleaved sweeps"]
     return Table(f"The step after a state of the collapse, to {TOLERANCE:g} rho g dx", columns, rows)
 
 
-def _model_table(records: list[Record]) -> Table:
-    keys = ["seconds_per_step", "iterations", "share_converged", "runout", "max_speed", "kinetic_energy"]
-    columns = [
-        "yield set",
-        "a step",
-        "iterations",
-        f"steps at {TOLERANCE:g}",
-        "runout / width",
-        "last top speed",
-        "last energy, of the most",
-    ]
-    return Table("The whole collapse", columns, [[r.name, *(str(r.figures[k]) for k in keys)] for r in records])
-
-
-def _step_table(records: list[Record]) -> Table:
-    rows = [[r.name, *(str(r.figures[k]) for k in ("particles", "seconds", "iterations"))] for r in records]
-    return Table("Steps of large scenes", ["scene", "particles", "a step", "iterations"], rows)
+def _table(title: str, what: str, columns: dict[str, str], records: list[Record]) -> Table:
+    """Return a table of figures by their columns' names."""
+    return Table(title, [what, *columns], [[r.name, *(str(r.figures[k]) for k in columns.values())] for r in records])

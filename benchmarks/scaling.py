@@ -1,7 +1,11 @@
-"""What a solve costs as the grid grows: set-up, iterations, seconds to three tolerances, bytes a cell, and the exponent of the growth."""
+"""What a solve costs as the grid grows: set-up, iterations, seconds to three tolerances, bytes a cell, and the exponent of the growth.
+
+And how far it can get: solves in each precision that are asked for a residual of 0 end at their floor.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -14,11 +18,10 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.cases import TOLERANCES, Case
-from warp_lcp.benchmarks.machine import COPIED, machine
-from warp_lcp.benchmarks.problems import BOUNDS, Splash, splash
-from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Table
-from warp_lcp.benchmarks.targets import Target
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.harness.machine import COPIED, machine
+from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table, Target, shown, spread, table_of_targets
+from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.benchmarks.problems import BOUNDS, Splash, natural, splash
 from warp_lcp.run.devices import free_memory
 
 TITLE = "Cost of a solve against the size of the grid"
@@ -27,22 +30,19 @@ SOLVE_BYTES = 60  # a cell: operator, problem, workspace, b, bounds, the result 
 SCENE_BYTES = 60  # a cell, in the memory of the host: the scene, the fields that it is made with (41 at 128^3) and the bounds
 ASYMPTOTIC = 64  # cells a side from which on the growth is fitted: below, launches cost more than cells
 FIGURES = tuple(f"to_{t:.0e}" for t in TOLERANCES)
+PRECISIONS = ("single", "mixed", "double")
+REACHED = 1e-8  # relative residual that mixed precision must reach on every grid
+ENDLESS = wl.StoppingCriteria(rtol=0.0, max_iterations=60, patience=6)
 FIELD_BYTES = 8  # of copying a float32 field: a read and a write
 
 
 @dataclass
 class Growing:
-    """One kind of bounds at one size.
+    """One kind of bounds at one size."""
 
-    Args:
-        scene: the problem.
-        bounds: `linear`, `walls`, `everywhere`.
-        device: Warp device.
-    """
-
-    scene: Splash
-    bounds: str
-    device: str
+    scene: Splash  # the problem
+    bounds: str  # `linear`, `walls`, `everywhere`
+    device: str  # Warp device
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
 
@@ -104,9 +104,23 @@ def measure(options: Options, out: Path) -> Results:
     copying = where.value("copy") or 0.0
     records = [case.record(copying) for case in cases]
     growth = [_growth(bounds, [c for c in cases if c.bounds == bounds]) for bounds in BOUNDS]
+    floors = [floor(scene, bounds, p, options.device) for scene in map(splash, sizes) for bounds in BOUNDS[:2] for p in PRECISIONS]
     skipped = [Record(f"{n}^3", {}, {"left out": why}) for n, why in left_out.items()]
-    tables = [_targets(growth), _growth_table(growth), _table(records), *([_left_out(left_out)] if left_out else [])]
-    return Results([where, *records, *growth, *skipped], tables, _charts(records, growth))
+    tables = [_targets(growth, floors), _growth_table(growth), _table(records), _floor_table(floors)]
+    if left_out:
+        rows = [[f"{n}^3", why] for n, why in left_out.items()]
+        tables.append(Table("Sizes that were not measured", ["cells", "why"], rows))
+    return Results([where, *records, *growth, *floors, *skipped], tables, _charts(records, growth, floors), _failures(floors))
+
+
+def floor(scene: Splash, bounds: str, precision: str, device: str) -> Record:
+    """Solve until no step makes the residual smaller; return that over the residual at 0, computed here and as the solve tells it."""
+    result = wl.solve(scene.problem(bounds, device), wl.ProjectedMultigrid(precision=precision), stopping=ENDLESS)
+    x = result.x.numpy().astype(np.float64).reshape(scene.b.shape)
+    norms = [float(np.linalg.norm(natural(scene.cells, scene.b, scene.lower(bounds), p))) for p in (x, np.zeros_like(x))]
+    figures = {"floor": Figure(norms[0] / norms[1]), "told": Figure(result.relative_residual), "iterations": Figure(result.iterations)}
+    facts = {"n": scene.n, "floor of": f"{precision}, {bounds}", "precision": precision, "status": result.status.name}
+    return Record(f"floor {scene.n}^3 {bounds} {precision}", figures, facts)
 
 
 def fitting(asked: Sequence[int], device: str) -> tuple[list[int], dict[int, str]]:
@@ -141,13 +155,14 @@ def _growth(bounds: str, cases: Sequence[Growing]) -> Record:
     return Record(f"growth {bounds}", figures, {"bounds": bounds, "from": large[0].scene.n, "to": large[-1].scene.n})
 
 
-def _targets(growth: Sequence[Record]) -> Table:
-    rows = [
-        Target(f"exponent of the seconds to 1e-6, {g.facts['bounds']}, {g.facts['from']}^3 to {g.facts['to']}^3", 1.05, figure).row()
-        for g in growth
-        for figure in [g.figures.get("exponent_to_1e-06") if g.facts["from"] >= ASYMPTOTIC else None]
-    ]
-    return Table("Figures to reach", ["figure", "target", "measured", "met?"], rows)
+def _targets(growth: Sequence[Record], floors: Sequence[Record]) -> Table:
+    targets = []
+    for g in growth:
+        figure = g.figures.get("exponent_to_1e-06") if g.facts["from"] >= ASYMPTOTIC else None
+        what = f"exponent of the seconds to 1e-6, {g.facts['bounds']}, {g.facts['from']}^3 to {g.facts['to']}^3"
+        targets.append(Target(what, 1.05, figure))
+    worst = max(r.figures["floor"].value for r in floors if r.facts["precision"] == "mixed")
+    return table_of_targets("figure", [*targets, Target("mixed precision: largest floor of any grid", REACHED, Figure(worst))])
 
 
 def _growth_table(growth: Sequence[Record]) -> Table:
@@ -162,12 +177,12 @@ def _table(records: Sequence[Record]) -> Table:
     columns += ["ns a cell", "in copies of a field", "bytes a cell"]
     rows = []
     for r in records:
-        times = ["" if (v := r.value(name)) is None else f"{1e3 * v:.1f}" for name in ("setup", *FIGURES)]
-        middle = r.figures.get("to_1e-06", Figure(0.0))
-        spread = f"{1e3 * (middle.low or 0):.1f} to {1e3 * (middle.high or 0):.1f}"
-        counts = " / ".join("" if (v := r.value(f"iterations_{name}")) is None else f"{v:.0f}" for name in FIGURES)
-        rest = ["" if (v := r.value(name)) is None else f"{v:.1f}" for name in ("per_cell", "in_copies", "bytes_per_cell")]
-        rows.append([f"{r.facts['n']}^3", r.facts["bounds"], f"{r.value('unknowns'):.0f}", *times, spread, counts, *rest])
+        row = [f"{r.facts['n']}^3", r.facts["bounds"], *shown(r, ["unknowns"], ".0f"), *shown(r, ("setup", *FIGURES), ".1f", 1e3)]
+        row += [
+            spread(r.figures.get("to_1e-06", Figure(0.0)), 1e3),
+            " / ".join(shown(r, [f"iterations_{name}" for name in FIGURES], ".0f")),
+        ]
+        rows.append([*row, *shown(r, ("per_cell", "in_copies", "bytes_per_cell"), ".1f")])
     remark = (
         "Seconds from the arrays of cells and b to each tolerance, cold, set-up included. In copies of a field: the seconds to 1e-6 over "
         "those that this machine takes to copy one float32 field of the grid. Bytes: of operator, problem and workspace, b and the bounds "
@@ -176,21 +191,47 @@ def _table(records: Sequence[Record]) -> Table:
     return Table("Sizes", columns, rows, remark)
 
 
-def _left_out(left_out: dict[int, str]) -> Table:
-    return Table("Sizes that were not measured", ["cells", "why"], [[f"{n}^3", why] for n, why in left_out.items()])
+def _floor_table(floors: Sequence[Record]) -> Table:
+    columns = ["cells", "precision, problem", "floor", "as the solve tells it", "steps", "status"]
+    rows = [
+        [f"{r.facts['n']}^3", r.facts["floor of"], *shown(r, ("floor", "told"), ".2e"), *shown(r, ["iterations"]), r.facts["status"]]
+        for r in floors
+    ]
+    remark = (
+        "Solves that are asked for a residual of 0. The floor is the norm of min(x - l, A x + b) over that at x = 0, computed in float64 "
+        "with NumPy from cells, b and the x that came back; single precision returns x in float32."
+    )
+    return Table("Floors", columns, rows, remark)
 
 
-def _charts(records: Sequence[Record], growth: Sequence[Record]) -> list[Chart]:
-    """Return the seconds to 1e-6 over the unknowns, and those a cell."""
+def _failures(floors: Sequence[Record]) -> list[str]:
+    """Return where mixed precision does not get there, or a solve tells another residual than x has."""
+    lines = []
+    for r in floors:
+        own, told = r.figures["floor"].value, r.figures["told"].value
+        if r.facts["precision"] == "mixed" and own > REACHED:
+            lines.append(f"{r.name}: ends at {own:.2e}")
+        # at the floor x has few digits that count: rounding in two orders of summation differs by a share of the floor itself
+        if not math.isclose(own, told, rel_tol=0.5):
+            lines.append(f"{r.name}: the solve tells {told:.2e}, x has {own:.2e}")
+    return lines
+
+
+def _charts(records: Sequence[Record], growth: Sequence[Record], floors: Sequence[Record]) -> list[Chart]:
+    """Return the seconds to 1e-6 over the unknowns, and the floors over the cells a side."""
     curves: dict[str, tuple[list[float], list[float]]] = {}
     for g in growth:
         here = [r for r in records if r.facts["bounds"] == g.facts["bounds"] and "to_1e-06" in r.figures]
         fitted = g.value("exponent_to_1e-06")
         label = g.facts["bounds"] + ("" if fitted is None else f", exponent {fitted:.2f}")
         curves[label] = [r.value("unknowns") or 0.0 for r in here], [r.value("to_1e-06") or 0.0 for r in here]
-    per_cell: dict[str, tuple[list[float], list[float]]] = {}
-    for bounds in BOUNDS:
-        here = [r for r in records if r.facts["bounds"] == bounds and "per_cell" in r.figures]
-        per_cell[bounds] = [r.facts["n"] for r in here], [r.value("per_cell") or 0.0 for r in here]
-    title = "Cold solves to 1e-6, set-up included"
-    return [Lines("seconds", title, "unknowns", "s", curves), Lines("per-cell", title, "cells a side", "ns a cell", per_cell)]
+    ends: dict[str, tuple[list[float], list[float]]] = {}
+    for r in floors:
+        x, y = ends.setdefault(r.facts["floor of"], ([], []))
+        x.append(r.facts["n"])
+        y.append(r.figures["floor"].value)
+    double = frozenset(label for label in ends if label.startswith("double"))  # it would hide the others
+    return [
+        Lines("seconds", "Cold solves to 1e-6, set-up included", "unknowns", "s", curves),
+        Lines("floors", "Smallest relative residual", "cells a side", "residual / residual at 0", ends, marked=double),
+    ]

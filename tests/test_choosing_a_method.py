@@ -3,15 +3,45 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.method_exponents import MATRICES, outcome
-from warp_lcp.problem import reformulate
+from warp_lcp import gallery, reformulate
+from warp_lcp.gallery import Plant, planted
+from warp_lcp.gallery.matrices import spectrum_matrix
 from warp_lcp.recommend import RULES
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEXT = (DOCS / "choosing-a-method.md").read_text()
+
+LIMITS = {"max_iterations": 400, "patience": 100}
+
+
+def indefinite(n=60, seed=71):
+    """Return a planted problem with a symmetric matrix of which a tenth of the eigenvalues is negative."""
+    rng = np.random.default_rng(seed)
+    values = np.where(np.arange(n) < n // 10, -0.3, np.geomspace(0.1, 1, n))
+    return planted(spectrum_matrix(values, rng), rng, Plant(), name="indefinite", facts=frozenset({"symmetric"}))
+
+
+MATRICES = {
+    "definite": lambda: gallery.definite(60, seed=71),
+    "singular": lambda: gallery.semidefinite(60, seed=71),
+    "unsymmetric, definite": lambda: gallery.skewed(60, seed=71),
+    "friction cone": lambda: gallery.contact(10, seed=71),
+    "indefinite": indefinite,
+}
+
+
+def outcome(name, problem):
+    """Return how a method ends on a problem: "solved", "refuses" or a status."""
+    method = wl.METHODS[name]
+    try:
+        result = wl.solve(problem.lcp(device="cpu"), method(), stopping=wl.StoppingCriteria(rtol=1e-6, **LIMITS))
+    except ValueError:
+        return "refuses"
+    return "solved" if result else result.status.name
 
 
 def section(title):
@@ -27,7 +57,7 @@ def table(title):
 
 def test_the_decision_list_is_the_rules():
     lines = re.findall(r"^\d+\. (.*)$", section("The decision list"), flags=re.M)
-    assert lines == [f"{rule.when} {rule.why}: `{rule.method}`." for rule in RULES]
+    assert lines == [f"{rule.reason}: `{rule.method}`." for rule in RULES]
 
 
 def test_every_method_is_named_and_no_other():

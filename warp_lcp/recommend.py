@@ -1,12 +1,12 @@
-"""Which method to take for a problem, and why: rules read off measurements, `benchmarks.recommendation`."""
+"""Which method to take for a problem, and why: rules in the order in which they are tried."""
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from typing import Literal
 
 from warp_lcp.problem.lcp import LCP
@@ -18,30 +18,11 @@ from warp_lcp.solvers.registry import METHODS
 from warp_lcp.traits import TRIAL, Traits, traits_of
 
 ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}
-SURE_SWEEPS = 12  # so few that a rate which does not last makes no difference
-SWEEPS_ON_GRIDS, SWEEPS_ON_SPARSE = 25, 50  # fewer are faster than a multigrid cycle's set-up and some cycles, or than systems with A
-MOST_SMALL = 100  # unknowns up to which systems on the free ones cost less than many sweeps, whatever the matrix
-MOST_PIVOTED = 400  # unknowns from which Lemke's pivots of O(n^2), about n / 4 of them, take longer than Newton's systems
-MOST_INNER = 1000  # unknowns of a friction cone from which interior points are slower than active sets
-FEWER = 60  # unknowns up to which a dense matrix is so small that launches and the host decide
-MOST_RESTING = 150  # unknowns of contacts at rest
-AT_REST = 0.6  # share of zeros in b
+FEW_SWEEPS = {"grid": 25, "sparse": 30}  # fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems with A
 LONGEST = 5000  # steps of a method that sweeps: the prediction may be too low
-FEW = 4  # unknowns that all sets of bounds are tried for
-# numbers of 8 bytes that a method holds besides A, for each entry of a matrix and for each unknown: those of workspaces on 300 and 600
-# dense, 5,000 and 20,000 sparse and 34,000 grid unknowns, rounded up; factors of dense matrices, which are made anew each step, included
-MEMORY = {
-    "minimum-map-newton": (2.0, 30.0),
-    "primal-dual-active-set": (2.0, 30.0),
-    "fischer-newton": (3.0, 30.0),
-    "interior-point": (3.0, 40.0),
-    "quadratic-program": (4.0, 40.0),
-    "lemke": (8.0, 40.0),
-    "subspace-minimization": (2.0, 30.0),
-    "projected-multigrid": (0.0, 12.0),
-}
-LEAN = (0.0, 18.0)  # methods that hold some fields only
-LEANEST = ("psor", "accelerated-projected-gradient", "projected-jacobi")
+# numbers of 8 bytes besides A that methods hold for an entry of a matrix and for an unknown, rounded up from measured workspaces
+FIELDS_ONLY, SYSTEMS = (0, 18), (4, 40)
+LEAN = ("psor", "accelerated-projected-gradient", "projected-jacobi")  # hold fields only and take matrices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,229 +84,50 @@ class Rule:
 
     Args:
         method: name in METHODS.
-        when: what it is for, the beginning of a sentence.
-        why: the end of that sentence.
+        reason: a sentence without its full stop.
         applies: whether it does.
-        steps: the tenth, the median and the ninetieth percentile of the steps it took on the training problems; None where the trial tells.
+        steps: which nine of ten such problems take no more of, whatever the accuracy; None: that is known by the trial, or not at all.
         alternatives: other names.
     """
 
     method: str
-    when: str
-    why: str
+    reason: str
     applies: Callable[[Traits], bool]
-    steps: tuple[int, int, int] | None
+    steps: int | None
     alternatives: tuple[str, ...]
 
 
-def _sweep_price(t: Traits) -> float:
-    """Return what the sweeps of ProjectedSOR cost, in microseconds of an AMD EPYC's core: launches and host, then entries."""
-    return t.sweeps * (140 + 0.005 * t.entries)
-
-
-def _block_price(t: Traits) -> float:
-    """Return what those of BlockedGaussSeidel cost."""
-    return t.block_sweeps * (140 + 0.03 * t.entries)
-
-
-def _few_sweeps(t: Traits) -> bool:
-    if t.bounds == "none" and t.kind == "grid":  # nothing cuts smooth errors off, which sweeps leave
-        return False
-    if not t.m_matrix:  # the rate of the first sweeps does not last
-        return t.sweeps <= SURE_SWEEPS and (t.kind == "sparse" or _singular(t))
-    most = {"grid": SWEEPS_ON_GRIDS, "sparse": SWEEPS_ON_SPARSE}.get(t.kind, 0)
-    return t.sweeps <= most and _sweep_price(t) <= _block_price(t)
-
-
-def _few_block_sweeps(t: Traits) -> bool:
-    if _pivotable(t) or (t.bounds == "none" and t.kind == "grid"):
-        return False
-    most = {"grid": SWEEPS_ON_GRIDS / 2, "sparse": SWEEPS_ON_SPARSE / 2}.get(t.kind, 5 if _singular(t) else 2)
-    return t.block_sweeps <= most and _block_price(t) < _sweep_price(t)
-
-
-def _singular(t: Traits) -> bool:
-    return t.symmetric and t.definiteness in ("semidefinite", "indefinite") and t.diagonal != "negative"
-
-
-def _pivotable(t: Traits) -> bool:
-    return t.diagonal != "positive" and not t.symmetric
-
-
-def _has_piqp() -> bool:
-    return importlib.util.find_spec("piqp") is not None
-
-
+# fmt: off
 RULES: tuple[Rule, ...] = (
-    Rule(
-        "blocked-gauss-seidel",
-        "Bounds that are affine in x, as friction has them, where the trial says that a few sweeps are enough,",
-        "are for methods that sweep, best over small blocks",
-        lambda t: t.bounds == "affine" and t.block_sweeps <= SURE_SWEEPS,
-        None,
-        ("nncg", "subspace-minimization", "psor"),
-    ),
-    Rule(
-        "subspace-minimization",
-        "Bounds that are affine in x, with few unknowns,",
-        "are for methods that sweep, and small systems on the free unknowns speed those up",
-        lambda t: t.bounds == "affine" and t.unknowns <= MOST_SMALL,
-        (2, 4, 18),
-        ("nncg", "blocked-gauss-seidel", "psor"),
-    ),
-    Rule(
-        "nncg",
-        "Bounds that are affine in x, with many unknowns,",
-        "are for methods that sweep, and conjugate gradients speed those up",
-        lambda t: t.bounds == "affine",
-        None,
-        ("psor", "blocked-gauss-seidel", "staggering"),
-    ),
-    Rule(
-        "projected-jacobi",
-        "Bounds that are affine in x, with an operator that can neither be swept nor shows its rows,",
-        "are for the one method that takes both",
-        lambda t: t.bounds == "affine",
-        None,
-        (),
-    ),
-    Rule(
-        "minimum-map-newton",
-        "An operator that shows no rows",
-        "cannot be swept; Newton's method needs the fewest products",
-        lambda t: t.kind == "operator",
-        (4, 6, 8),
-        ("primal-dual-active-set", "mprgp", "fischer-newton"),
-    ),
-    Rule(
-        "minimum-map-newton",
-        "A definite matrix of at most 200 unknowns, or of a bandwidth up to 3,",
-        "is solved directly on the host, for less than launches cost",
-        lambda t: t.direct and (t.definiteness == "definite" or (t.m_matrix and t.definiteness == "unknown")),
-        (1, 3, 9),
-        ("primal-dual-active-set", "lemke", "interior-point"),
-    ),
-    Rule(
-        "blocked-gauss-seidel",
-        "Where the trial says that a few sweeps over small blocks are enough,",
-        "they cost less than systems with A",
-        _few_block_sweeps,
-        None,
-        ("psor", "minimum-map-newton"),
-    ),
-    Rule(
-        "direct-enumeration",
-        f"At most {FEW} unknowns",
-        "have few sets of bounds: trying them all is sure and as fast as anything",
-        lambda t: t.unknowns <= FEW and t.kind != "operator",
-        (1, 1, 1),
-        ("lemke", "primal-dual-active-set"),
-    ),
-    Rule(
-        "psor",
-        "Where the trial says that a few sweeps are enough,",
-        "they cost less than setting up a multigrid hierarchy",
-        _few_sweeps,
-        None,
-        ("nncg", "minimum-map-newton"),
-    ),
-    Rule(
-        "projected-multigrid",
-        "On a grid",
-        "the number of multigrid cycles hardly depends on its size",
-        lambda t: t.kind == "grid",
-        (3, 7, 8),
-        ("minimum-map-newton", "mprgp"),
-    ),
-    Rule(
-        "minimum-map-newton",
-        "Zeros on the diagonal of contacts at rest, whose b is mostly 0,",
-        "leave little to find: Newton's method is there in a few steps",
-        lambda t: _pivotable(t) and t.quiet >= AT_REST and t.kind == "dense" and t.unknowns <= MOST_RESTING,
-        (1, 1, 8),
-        ("primal-dual-active-set", "lemke", "fischer-newton", "interior-point"),
-    ),
-    Rule(
-        "lemke",
-        "Zeros on the diagonal, as the slip speeds of friction cones have them, with few unknowns",
-        "are for pivots: Lemke's method is sure where A is copositive",
-        lambda t: _pivotable(t) and t.unknowns <= (MOST_PIVOTED if t.kind == "sparse" else FEWER),
-        (1, 4, 5),
-        ("fischer-newton", "interior-point"),
-    ),
-    Rule(
-        "interior-point",
-        "Zeros on the diagonal of a sparse matrix",
-        "are no obstacle to interior points, whose systems are shifted",
-        lambda t: _pivotable(t) and t.kind == "sparse" and t.unknowns <= MOST_INNER,
-        (4, 7, 8),
-        ("fischer-newton", "minimum-map-newton"),
-    ),
-    Rule(
-        "fischer-newton",
-        "Zeros on the diagonal of a dense matrix",
-        "are no obstacle to Fischer and Burmeister's function",
-        lambda t: _pivotable(t) and t.kind == "dense",
-        (5, 8, 12),
-        ("interior-point", "lemke"),
-    ),
-    Rule(
-        "primal-dual-active-set",
-        "A sparse symmetric singular matrix",
-        "takes an active-set method that goes on by proximal points",
-        lambda t: _singular(t) and t.kind == "sparse",
-        (2, 10, 39),
-        ("fischer-newton", "interior-point", "mprgp"),
-    ),
-    Rule(
-        "quadratic-program",
-        "A symmetric singular matrix",
-        "makes a convex quadratic program, which PIQP solves without regular blocks",
-        lambda t: _singular(t) and t.definiteness == "semidefinite" and _has_piqp(),
-        (1, 1, 1),
-        ("interior-point", "fischer-newton", "minimum-map-newton"),
-    ),
-    Rule(
-        "interior-point",
-        "A symmetric singular matrix",
-        "has singular blocks for Newton's method, and interior points shift theirs",
-        _singular,
-        (7, 11, 14),
-        ("fischer-newton", "minimum-map-newton"),
-    ),
-    Rule(
-        "subspace-minimization",
-        "A sparse symmetric matrix that is no M-matrix",
-        "lets sweeps find the active set, and conjugate gradients the rest",
-        lambda t: t.kind == "sparse" and t.symmetric and not t.m_matrix and t.unknowns > MOST_SMALL,
-        (3, 5, 6),
-        ("nncg", "primal-dual-active-set", "mprgp"),
-    ),
-    Rule(
-        "lemke",
-        "A sparse symmetric matrix of few unknowns that is no M-matrix",
-        "takes few pivots",
-        lambda t: t.kind == "sparse" and t.symmetric and not t.m_matrix and t.unknowns <= FEWER,
-        (2, 2, 12),
-        ("incremental-pivoting", "primal-dual-active-set"),
-    ),
-    Rule(
-        "subspace-minimization",
-        "A dense symmetric matrix of few unknowns that is no M-matrix",
-        "lets sweeps find the active set in less than Newton's steps take",
-        lambda t: t.kind == "dense" and t.symmetric and not t.m_matrix and t.unknowns <= FEWER and t.bounds != "none",
-        (1, 1, 2),
-        ("minimum-map-newton", "quadratic-program", "lemke"),
-    ),
-    Rule(
-        "minimum-map-newton",
-        "Any other matrix",
-        "takes a few systems on the free unknowns",
-        lambda t: True,
-        (1, 3, 9),
-        ("primal-dual-active-set", "interior-point", "fischer-newton", "lemke"),
-    ),
+    Rule("subspace-minimization", "Bounds that are affine in x, as friction has them, are for sweeps; small systems speed up few unknowns",
+         lambda t: t.bounds == "affine" and t.unknowns <= 100, 18, ("nncg", "blocked-gauss-seidel", "psor")),
+    Rule("nncg", "Bounds that are affine in x are for sweeps; conjugate gradients speed up many unknowns",
+         lambda t: t.bounds == "affine", None, ("psor", "blocked-gauss-seidel", "staggering")),
+    Rule("projected-jacobi", "Bounds that are affine in x and no rows leave one method",
+         lambda t: t.bounds == "affine", None, ()),
+    Rule("minimum-map-newton", "An operator that shows no rows cannot be swept, and Newton's method needs the fewest products",
+         lambda t: t.kind == "operator", 8, ("primal-dual-active-set", "mprgp", "fischer-newton")),
+    Rule("minimum-map-newton", "A definite matrix of at most 200 unknowns, or of a bandwidth up to 3, is solved directly on the host",
+         lambda t: t.direct and t.definiteness == "definite", 9, ("primal-dual-active-set", "lemke", "interior-point")),
+    Rule("psor", "A grid or a sparse matrix that a few sweeps solve, as a trial says, needs no hierarchy and no systems",
+         lambda t: t.bounds != "none" and t.sweeps <= FEW_SWEEPS.get(t.kind, 0), None, ("nncg", "minimum-map-newton")),
+    Rule("projected-multigrid", "On a grid the number of multigrid cycles hardly depends on its size",
+         lambda t: t.kind == "grid", 8, ("minimum-map-newton", "mprgp")),
+    Rule("lemke", "Zeros on the diagonal, as friction cones have them, are for pivots where unknowns are few",
+         lambda t: t.pivotable and t.unknowns <= 200, 5, ("fischer-newton", "interior-point")),
+    Rule("interior-point", "Zeros on the diagonal of a sparse matrix are no obstacle to interior points, whose systems are shifted",
+         lambda t: t.pivotable and t.kind == "sparse", 8, ("fischer-newton", "minimum-map-newton")),
+    Rule("fischer-newton", "Zeros on the diagonal of a dense matrix are no obstacle to Fischer and Burmeister's function",
+         lambda t: t.pivotable, 12, ("interior-point", "lemke")),
+    Rule("quadratic-program", "A symmetric semi-definite matrix makes a convex quadratic program, which PIQP solves",
+         lambda t: t.singular and t.definiteness == "semidefinite" and find_spec("piqp") is not None, 1,
+         ("interior-point", "fischer-newton", "minimum-map-newton")),
+    Rule("interior-point", "A symmetric singular matrix has singular blocks, and interior points shift theirs",
+         lambda t: t.singular, 14, ("fischer-newton", "minimum-map-newton")),
+    Rule("minimum-map-newton", "Any other matrix takes a few systems on the free unknowns",
+         lambda t: True, 9, ("primal-dual-active-set", "interior-point", "fischer-newton", "lemke")),
 )
+# fmt: on
 
 
 def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget | None = None) -> Recommendation:
@@ -361,21 +163,10 @@ def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget |
     return _within(found, budget, problem) if budget else found
 
 
-def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
-    """Return what a rule says."""
-    sweeps = {"psor": t.sweeps, "nncg": t.sweeps, "blocked-gauss-seidel": t.block_sweeps}.get(rule.method)
-    expected, limit = None, LONGEST
-    if rule.steps is not None:
-        low, median, high = rule.steps
-        expected = f"{low} to {high} steps, {median} at the median of the training problems"
-        limit = max(100, 10 * high)
-    elif sweeps is not None and math.isfinite(sweeps):
-        expected = f"about {math.ceil(sweeps)} sweeps, by the rate of the first {TRIAL}"
-    reasons = (f"{rule.when} {rule.why}.", _portrait(t))
-    stopping = StoppingCriteria(rtol=rtol, max_iterations=limit, patience=max(30, limit // 10))
-    direct = rule.method == "minimum-map-newton" and t.direct
-    method = MinimumMapNewton(direct=True) if direct else METHODS[rule.method]()
-    return Recommendation(rule.method, method, stopping, reasons, expected, tuple(n for n in rule.alternatives if n in t.able), t)
+def memory_of(name: str, t: Traits) -> int:
+    """Return about how many bytes a method holds besides the problem's own arrays."""
+    square, fields = FIELDS_ONLY if name in (*LEAN, "nncg", "projected-multigrid") else SYSTEMS
+    return 8 * (square * (t.entries if t.kind in ("dense", "sparse") else 0) + fields * t.unknowns)
 
 
 def _rules(t: Traits) -> Iterator[Rule]:
@@ -383,42 +174,38 @@ def _rules(t: Traits) -> Iterator[Rule]:
     return (rule for rule in RULES if rule.method in t.able and rule.applies(t))
 
 
-def _portrait(t: Traits) -> str:
-    """Return a sentence about the problem."""
-    shape = "symmetric" if t.symmetric else "unsymmetric"
-    known = "of unknown definiteness" if t.definiteness == "unknown" else t.definiteness
-    bounds = {"none": "no bounds", "one-sided": "bounds on one side", "box": "bounds on both sides", "affine": "bounds affine in x"}[
-        t.bounds
-    ]
-    signs = ", with the signs of an M-matrix" if t.m_matrix else ""
-    return f"A is of kind {t.kind} with {t.unknowns} unknowns, {shape}, {known}{signs}; there are {bounds}."
+def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
+    """Return what a rule says."""
+    expected, limit = None, LONGEST
+    if rule.steps is not None:
+        expected, limit = f"{rule.steps} steps or fewer", max(100, 10 * rule.steps)
+    elif rule.method in ("psor", "nncg") and math.isfinite(t.sweeps):
+        expected = f"about {math.ceil(t.sweeps)} sweeps, by the rate of the first {TRIAL}"
+    matrix = f"{t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}, definiteness: {t.definiteness}"
+    reasons = (f"{rule.reason}.", f"The problem: {matrix}, bounds: {t.bounds}.")
+    direct = rule.method == "minimum-map-newton" and t.direct
+    method = MinimumMapNewton(direct=True) if direct else METHODS[rule.method]()
+    stopping = StoppingCriteria(rtol=rtol, max_iterations=limit, patience=max(30, limit // 10))
+    return Recommendation(rule.method, method, stopping, reasons, expected, tuple(n for n in rule.alternatives if n in t.able), t)
 
 
-def memory_of(name: str, t: Traits) -> int:
-    """Return about how many bytes a method holds besides the problem's own arrays."""
-    square, fields = MEMORY.get(name, LEAN)
-    entries = t.entries if t.kind in ("dense", "sparse") else 0
-    return int(8 * (square * entries + fields * t.unknowns))
-
-
-def _within(first: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
+def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
     """Return a recommendation that respects a budget, or says that it cannot."""
-    found, t = first, first.traits
-    if budget.bytes is not None and memory_of(found.name, t) > budget.bytes:
-        lean = next((n for n in LEANEST if n in t.able and _starts(n, problem)), None)
-        if lean is None or memory_of(lean, t) > budget.bytes:
-            found = _said(found, f"No method fits into {budget.bytes} bytes; this one takes about {memory_of(found.name, t)}.")
+    t = found.traits
+    if budget.bytes is not None and (needs := memory_of(found.name, t)) > budget.bytes:
+        lean = next((n for n in LEAN if n in t.able and memory_of(n, t) <= budget.bytes and _takes(n, problem)), None)
+        if lean is None:
+            found = _said(found, f"No method fits into {budget.bytes} bytes; this one takes about {needs}.")
         else:
-            why = f"{found.name} takes about {memory_of(found.name, t)} bytes of the {budget.bytes} allowed; {lean} holds some fields only."
-            found = _instead(found, lean, why)
+            found = _instead(
+                found, lean, f"{found.name} takes about {needs} bytes of the {budget.bytes} allowed; {lean} holds fields only."
+            )
     if budget.iterations is not None:
-        sweeps = {"psor": t.sweeps, "nncg": t.sweeps, "blocked-gauss-seidel": t.block_sweeps}.get(found.name)
-        if budget.bytes is None and sweeps is not None and sweeps > budget.iterations:
-            others = ((rule, rule.steps[1]) for rule in _rules(t) if rule.steps is not None)
-            fewer = next(((rule, steps) for rule, steps in others if steps <= budget.iterations), None)
+        if budget.bytes is None and found.name in ("psor", "nncg") and t.sweeps > budget.iterations:
+            fewer = next((rule for rule in _rules(t) if rule.steps is not None and rule.steps <= 2 * budget.iterations), None)
             if fewer is not None:
-                why = f"{found.name} would take {sweeps:.0f} of the {budget.iterations} steps allowed, {fewer[0].method} about {fewer[1]}."
-                found = _said(_from_rule(fewer[0], t, found.stopping.rtol), why)
+                why = f"{found.name} would take {t.sweeps:.0f} of the {budget.iterations} steps allowed, {fewer.method} some {fewer.steps}."
+                found = _said(_from_rule(fewer, t, found.stopping.rtol), why)
         found = replace(found, stopping=replace(found.stopping, max_iterations=budget.iterations))
     return found if budget.seconds is None else _in_time(found, budget.seconds, problem)
 
@@ -426,26 +213,20 @@ def _within(first: Recommendation, budget: Budget, problem: LCP) -> Recommendati
 def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendation:
     """Return a recommendation whose first step ends in time: sweeps improve x from the first one on."""
     begun = time.perf_counter()
-    solved = _tried(found.name, problem, 1)
+    taken = _takes(found.name, problem, steps=1)
     took = time.perf_counter() - begun
-    if solved and took <= seconds:
+    if taken and took <= seconds:
         return _said(found, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed.")
-    if "psor" not in found.traits.able or not _starts("psor", problem):
-        return _said(found, f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no sweep is possible here.")
     begun = time.perf_counter()
-    _tried("psor", problem, TRIAL)
-    sweep = (time.perf_counter() - begun) / TRIAL
-    many = max(1, int(seconds / sweep))
+    if "psor" not in found.traits.able or not _takes("psor", problem, steps=TRIAL):
+        return _said(found, f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no sweep is possible here.")
+    many = max(1, int(seconds / ((time.perf_counter() - begun) / TRIAL)))
     why = f"{found.name} took {took:.2g} s for its first step, more than the {seconds:g} s allowed: {many} sweeps fit, each is of use."
     cheaper = _instead(found, "psor", why)
     return replace(cheaper, stopping=replace(cheaper.stopping, max_iterations=min(many, cheaper.stopping.max_iterations)))
 
 
-def _starts(name: str, problem: LCP) -> bool:
-    return _tried(name, problem, 0)
-
-
-def _tried(name: str, problem: LCP, steps: int) -> bool:
+def _takes(name: str, problem: LCP, *, steps: int = 0) -> bool:
     """Make some steps and return whether the method takes the problem."""
     try:
         solve(problem, METHODS[name](), stopping=StoppingCriteria(max_iterations=steps))
@@ -461,5 +242,6 @@ def _said(found: Recommendation, reason: str) -> Recommendation:
 def _instead(found: Recommendation, name: str, reason: str) -> Recommendation:
     """Return another method for the same criteria, with the limit of steps of a method that sweeps."""
     stopping = replace(found.stopping, max_iterations=LONGEST, patience=LONGEST // 10)
-    changed = replace(found, name=name, method=METHODS[name](), stopping=stopping, expected=None)
-    return _said(replace(changed, alternatives=(found.name, *(n for n in found.alternatives if n != name))), reason)
+    alternatives = (found.name, *(n for n in found.alternatives if n != name))
+    changed = replace(found, name=name, method=METHODS[name](), stopping=stopping, expected=None, alternatives=alternatives)
+    return _said(changed, reason)

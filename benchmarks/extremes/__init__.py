@@ -10,13 +10,14 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from random import SystemRandom
+from typing import Any
 
 from warp_lcp.benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
 from warp_lcp.benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
 from warp_lcp.benchmarks.extremes.unseen import FRESH, judging
-from warp_lcp.benchmarks.machine import machine
-from warp_lcp.benchmarks.record import Record, Results, Table
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Record, Results, Table, shown
+from warp_lcp.benchmarks.harness.timing import Figure, Options
 
 TITLE = "Extremes: hostile problems and scenes, and what they come to"
 FAMILIES = (
@@ -56,46 +57,49 @@ def measure(options: Options, out: Path) -> Results:
             verdicts.append(judge(case, precision, options.device))
             if verdicts[-1].wrong:
                 options.say(f"{verdicts[-1].name}: {verdicts[-1].outcome}")
-    records = [machine(options.device, elements=1 << 22, repeat=options.repeat), *(record(v) for v in verdicts)]
+    where = machine(options.device, elements=1 << 22, repeat=options.repeat)
+    records = [where, *by_family(verdicts)]
+    found = families(records[1:])
     unseen, beyond = judging.summary(verdicts, seed)
     failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in verdicts if v.wrong] + beyond
-    return Results(records, [families(verdicts), unseen, table(verdicts)], failures=failures)
+    records += [record(v) for v in verdicts if v.wrong]
+    return Results(records, [found, unseen, table(verdicts)], failures=failures)
 
 
 def record(verdict: Verdict) -> Record:
-    """Return what the file keeps."""
+    """Return what the file keeps of a case that is not as it must be."""
     attempt = verdict.attempt
-    figures = {"seconds": Figure(attempt.seconds, "s")}
-    if attempt.residual is not None:
-        figures["residual"] = Figure(attempt.residual)
-    facts = {
+    facts: dict[str, Any] = {
         "family": verdict.case.family,
         "precision": verdict.precision,
         "expected": str(verdict.promise),
         "outcome": verdict.outcome,
-        "status": attempt.status,
-        "residual": attempt.residual,
-        "seconds": attempt.seconds,
-        "budget": verdict.case.budget,
-        "message": attempt.message or None,
-        "passed": not verdict.wrong,
-        **attempt.facts,
     }
-    return Record(verdict.name, figures, facts)
+    facts |= {"status": attempt.status, "residual": attempt.residual, "message": attempt.message, **attempt.facts}
+    return Record(verdict.name, {"seconds": Figure(attempt.seconds, "s")}, facts)
 
 
-def families(verdicts: Sequence[Verdict]) -> Table:
+def by_family(verdicts: Sequence[Verdict]) -> list[Record]:
     """Return how many cases of each family are as they must be."""
-    rows = []
+    records = []
     for family in dict.fromkeys(v.case.family for v in verdicts):
         own = [v for v in verdicts if v.case.family == family]
-        counts = [sum(v.promise.expected is kind for v in own) for kind in Expected]
-        kinds = ", ".join(f"{n} {kind.value}" for n, kind in zip(counts, Expected, strict=True) if n)
-        wrong, slowest = sum(bool(v.wrong) for v in own), max(v.attempt.seconds for v in own)
-        rows.append([family, str(len({v.case.name for v in own})), str(len(own)), kinds, str(wrong), f"{slowest:.2f}"])
-    total = len({(v.case.family, v.case.name) for v in verdicts})
-    wrong_ones, seconds = sum(bool(v.wrong) for v in verdicts), sum(v.attempt.seconds for v in verdicts)
-    remark = f"{total} cases, {len(verdicts)} attempts in {seconds:.0f} s, {wrong_ones} not as they must be."
+        counts = {"cases": len({v.case.name for v in own}), "attempts": len(own), "wrong": sum(bool(v.wrong) for v in own)}
+        figures = {name: Figure(count) for name, count in counts.items()}
+        figures |= {kind.value: Figure(n) for kind in Expected if (n := sum(v.promise.expected is kind for v in own))}
+        seconds = [v.attempt.seconds for v in own]
+        records.append(Record(family, figures | {"slowest": Figure(max(seconds), "s"), "seconds": Figure(sum(seconds), "s")}))
+    return records
+
+
+def families(records: Sequence[Record]) -> Table:
+    """Return the families' records as a table."""
+    rows = []
+    for r in records:
+        kinds = ", ".join(f"{figure.value:.0f} {kind.value}" for kind in Expected if (figure := r.figures.get(kind.value)))
+        rows.append([r.name, *shown(r, ("cases", "attempts"), ".0f"), kinds, *shown(r, ["wrong"], ".0f"), *shown(r, ["slowest"], ".2f")])
+    cases, attempts, wrong, seconds = (sum(r.value(f) or 0 for r in records) for f in ("cases", "attempts", "wrong", "seconds"))
+    remark = f"{cases:.0f} cases, {attempts:.0f} attempts in {seconds:.0f} s, {wrong:.0f} not as they must be."
     return Table("Families", ("family", "cases", "attempts", "expected", "not as they must be", "slowest [s]"), rows, remark)
 
 

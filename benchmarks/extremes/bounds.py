@@ -18,21 +18,21 @@ EXACT_OR_FLOOR = Promise(Expected.EITHER, frozenset({"FLOOR"}))
 
 def scales() -> Iterator[Case]:
     """Yield right-hand sides from 0 to 1e30, and spikes."""
-    family = "scales of b"
-    yield from both(family, "b = 0", lambda: pool(SHAPE, b=np.zeros(SHAPE)))
-    yield from both(family, "b = -0.0", lambda: pool(SHAPE, b=np.full(SHAPE, -0.0)))
+    case = partial(both, "scales of b")
+    yield from case("b = 0", lambda: pool(SHAPE, b=np.zeros(SHAPE)))
+    yield from case("b = -0.0", lambda: pool(SHAPE, b=np.full(SHAPE, -0.0)))
     for scale in (1e-30, 1e-15, 1e15, 1e30):
-        yield from both(family, f"b of {scale:g}", partial(pool, SHAPE, b=scale * noise(SHAPE)))
-        yield from both(family, f"b and bounds of {scale:g}", partial(boxed, scale))
+        yield from case(f"b of {scale:g}", partial(pool, SHAPE, b=scale * noise(SHAPE)))
+        yield from case(f"b and bounds of {scale:g}", partial(boxed, scale))
     for scale in (1e-160, 1e-310):
-        yield from both(family, f"b of {scale:g}", partial(pool, SHAPE, b=scale * noise(SHAPE)), promises=same(refusal("b: values up to")))
-    yield from both(family, "b of 1e160", lambda: pool(SHAPE, b=1e160 * noise(SHAPE)), promises=same(OVERFLOWS))
-    yield from both(family, "one cell of b at 1e12", lambda: spike(1e12))
-    yield from both(
-        family, "b over 30 decades", lambda: pool(SHAPE, b=noise(SHAPE) * 10 ** np.random.default_rng(SEED + 11).uniform(-15, 15, SHAPE))
+        yield from case(f"b of {scale:g}", partial(pool, SHAPE, b=scale * noise(SHAPE)), promises=same(refusal("b: values up to")))
+    yield from case("b of 1e160", lambda: pool(SHAPE, b=1e160 * noise(SHAPE)), promises=same(OVERFLOWS))
+    yield from case("one cell of b at 1e12", lambda: spike(1e12))
+    yield from case(
+        "b over 30 decades", lambda: pool(SHAPE, b=noise(SHAPE) * 10 ** np.random.default_rng(SEED + 11).uniform(-15, 15, SHAPE))
     )
-    yield from both(family, "bounds at 1e30", lambda: pool(SHAPE, lower=-1e30, upper=1e30))
-    yield from both(family, "b of 1e-30 beside a bound of 1e10", tiny_beside_huge)
+    yield from case("bounds at 1e30", lambda: pool(SHAPE, lower=-1e30, upper=1e30))
+    yield from case("b of 1e-30 beside a bound of 1e10", tiny_beside_huge)
 
 
 def boxed(scale: float) -> GridProblem:
@@ -56,26 +56,24 @@ def tiny_beside_huge() -> GridProblem:
 
 def degenerate() -> Iterator[Case]:
     """Yield solutions with x_i = l_i and y_i = 0 on many cells, and sets that hold all or nothing."""
-    family = "active sets"
+    case = partial(both, "active sets")
     for share in (0.1, 0.5, 0.9):
-        yield from both(family, f"x = y = 0 on {share:.0%} of the cells", partial(planted, share))
-    yield from both(family, "x = y = 0 on all cells but one", lambda: planted(1.0))
-    yield from both(family, "all active", lambda: pool(SHAPE, b=np.abs(noise(SHAPE)) + 0.01, lower=0.0))
-    yield from both(family, "all active but one", all_but_one)
-    yield from both(family, "none active", lambda: pool(SHAPE, b=-np.abs(noise(SHAPE)) - 0.01, lower=0.0))
-    yield from both(family, "l = u everywhere", lambda: pool(SHAPE, lower=0.5, upper=0.5))
-    yield from both(family, "l = u on half of the cells", half_fixed)
-    yield from both(family, "box of 1e-12", lambda: pool(SHAPE, lower=-1e-12, upper=1e-12))
-    yield from both(family, "b = 0 on half of the cells", lambda: pool(SHAPE, b=np.where(noise(SHAPE) > 0, 0.0, noise(SHAPE, SEED + 12))))
-    yield from both(family, "equal b everywhere", lambda: pool(SHAPE, b=np.full(SHAPE, -1.0), lower=0.0, upper=50.0))
-    yield from both(family, "lower bounds of noise, l > 0", lambda: pool(SHAPE, lower=np.abs(noise(SHAPE, SEED + 13))))
-    yield from both(family, "upper bounds only", lambda: pool(SHAPE, lower=-np.inf, upper=0.0))
-    yield from both(
-        family, "checkerboard of bounds", lambda: pool(SHAPE, lower=np.where(np.indices(SHAPE).sum(axis=0) % 2 == 0, 0.0, -np.inf))
-    )
-    yield from both(family, "resting under a ceiling", ceiling)
+        yield from case(f"x = y = 0 on {share:.0%} of the cells", partial(planted, share))
+    yield from case("x = y = 0 on all cells but one", lambda: planted(1.0))
+    yield from case("all active", lambda: pool(SHAPE, b=np.abs(noise(SHAPE)) + 0.01, lower=0.0))
+    yield from case("all active but one", all_but_one)
+    yield from case("none active", lambda: pool(SHAPE, b=-np.abs(noise(SHAPE)) - 0.01, lower=0.0))
+    yield from case("l = u everywhere", lambda: pool(SHAPE, lower=0.5, upper=0.5))
+    yield from case("l = u on half of the cells", half_fixed)
+    yield from case("box of 1e-12", lambda: pool(SHAPE, lower=-1e-12, upper=1e-12))
+    yield from case("b = 0 on half of the cells", lambda: pool(SHAPE, b=np.where(noise(SHAPE) > 0, 0.0, noise(SHAPE, SEED + 12))))
+    yield from case("equal b everywhere", lambda: pool(SHAPE, b=np.full(SHAPE, -1.0), lower=0.0, upper=50.0))
+    yield from case("lower bounds of noise, l > 0", lambda: pool(SHAPE, lower=np.abs(noise(SHAPE, SEED + 13))))
+    yield from case("upper bounds only", lambda: pool(SHAPE, lower=-np.inf, upper=0.0))
+    yield from case("checkerboard of bounds", lambda: pool(SHAPE, lower=np.where(np.indices(SHAPE).sum(axis=0) % 2 == 0, 0.0, -np.inf)))
+    yield from case("resting under a ceiling", ceiling)
     for far in (1e6, 1e20, -1e20):
-        yield from both(family, f"start at {far:g}", lambda: pool(SHAPE), x0=np.full(SHAPE, far))
+        yield from case(f"start at {far:g}", lambda: pool(SHAPE), x0=np.full(SHAPE, far))
 
 
 def planted(share: float) -> GridProblem:
@@ -117,24 +115,16 @@ def ceiling() -> GridProblem:
 
 def tolerances() -> Iterator[Case]:
     """Yield tolerances that no arithmetic reaches: FLOOR, not CONVERGED and not an endless loop."""
-    family = "tolerances"
+    case = partial(both, "tolerances")
     for rtol in (1e-15, 1e-17, 0.0):
         for name, shape in (("2-D", (64, 66)), ("3-D", (17, 18, 19))):
             promises: dict[str, Promise] = same(BELOW_ROUNDING if rtol < 1e-16 else EXACT_OR_FLOOR)  # type: ignore[assignment]
-            yield from both(
-                family,
-                f"rtol = {rtol:g}, {name}",
-                partial(pool, shape),
-                promises=promises,
-                stopping={"rtol": rtol, "max_iterations": 500},
+            yield from case(
+                f"rtol = {rtol:g}, {name}", partial(pool, shape), promises=promises, stopping={"rtol": rtol, "max_iterations": 500}
             )
-    yield from both(
-        family, "rtol = 1e-12, single stops", lambda: pool((64, 66)), promises={"single": BELOW_ROUNDING}, stopping={"rtol": 1e-12}
-    )
-    yield from both(family, "atol = 1e30", lambda: pool(SHAPE), stopping={"atol": 1e30})
+    yield from case("rtol = 1e-12, single stops", lambda: pool((64, 66)), promises={"single": BELOW_ROUNDING}, stopping={"rtol": 1e-12})
+    yield from case("atol = 1e30", lambda: pool(SHAPE), stopping={"atol": 1e30})
     stopped = Promise(Expected.STOPPED, frozenset({"MAX_ITERATIONS"}))
     for limit in (0, 1):
-        yield from both(family, f"{limit} iterations", lambda: pool(SHAPE), promises=same(stopped), stopping={"max_iterations": limit})
-    yield from both(
-        family, "256x256 to 1e-13", lambda: pool((256, 256)), promises=dict.fromkeys(PRECISIONS, EITHER), stopping={"rtol": 1e-13}
-    )
+        yield from case(f"{limit} iterations", lambda: pool(SHAPE), promises=same(stopped), stopping={"max_iterations": limit})
+    yield from case("256x256 to 1e-13", lambda: pool((256, 256)), promises=dict.fromkeys(PRECISIONS, EITHER), stopping={"rtol": 1e-13})

@@ -41,17 +41,11 @@ class Expected(Enum):
 
 @dataclass(frozen=True)
 class Promise:
-    """What a case must come to.
+    """What a case must come to."""
 
-    Args:
-        expected: kind.
-        statuses: the statuses it may stop with.
-        names: what the message of a refusal must contain.
-    """
-
-    expected: Expected
-    statuses: frozenset[str] = frozenset()
-    names: str = ""
+    expected: Expected  # kind
+    statuses: frozenset[str] = frozenset()  # the statuses it may stop with
+    names: str = ""  # what the message of a refusal must contain
 
     def __str__(self) -> str:
         """Return it in words."""
@@ -72,25 +66,15 @@ def refusal(names: str) -> Promise:
 
 @dataclass
 class Attempt:
-    """What a case came to.
+    """What a case came to."""
 
-    Args:
-        status: of the result, or `refused`, or what a simulation says.
-        residual: independent and relative; None where there is none.
-        seconds: wall time [s].
-        message: of a refusal or a failed step.
-        faults: what is wrong whatever was expected.
-        met: whether the independent residual meets the tolerance.
-        facts: what else a record keeps.
-    """
-
-    status: str
-    residual: float | None = None
-    seconds: float = 0.0
-    message: str = ""
-    faults: list[str] = field(default_factory=list)
-    met: bool = False
-    facts: dict[str, Any] = field(default_factory=dict)
+    status: str  # of the result, or `refused`, or what a simulation says
+    residual: float | None = None  # independent and relative; None where there is none
+    seconds: float = 0.0  # wall time [s]
+    message: str = ""  # of a refusal or a failed step
+    faults: list[str] = field(default_factory=list)  # what is wrong whatever was expected
+    met: bool = False  # whether the independent residual meets the tolerance
+    facts: dict[str, Any] = field(default_factory=dict)  # what else a record keeps
 
 
 class Case(Protocol):
@@ -141,31 +125,18 @@ def interrupted_after(seconds: float) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SolveCase:
-    """A problem given to a method.
+    """A problem given to a method."""
 
-    Args:
-        family: the cases that share an expectation.
-        name: unique in its family.
-        problem: makes the problem.
-        method: of `wl.METHODS`.
-        promises: by precision; SOLVED where there is none.
-        options: of the method.
-        stopping: criteria besides rtol and max_iterations, or instead of them.
-        x0: a guess.
-        budget: seconds that a precision may take.
-        solve: stands in for `wl.solve`, where something wrong is to be caught.
-    """
-
-    family: str
-    name: str
-    problem: Callable[[], Problem]
-    method: str = "projected-multigrid"
-    promises: Mapping[str, Promise] = field(default_factory=dict)
-    options: Mapping[str, Any] = field(default_factory=dict)
-    stopping: Mapping[str, Any] = field(default_factory=dict)
-    x0: np.ndarray | None = None
-    budget: float = BUDGET
-    solve: Callable[..., wl.SolveResult] = wl.solve
+    family: str  # the cases that share an expectation
+    name: str  # unique in its family
+    problem: Callable[[], Problem]  # makes the problem
+    method: str = "projected-multigrid"  # of `wl.METHODS`
+    promises: Mapping[str, Promise] = field(default_factory=dict)  # by precision; SOLVED where there is none
+    options: Mapping[str, Any] = field(default_factory=dict)  # of the method
+    stopping: Mapping[str, Any] = field(default_factory=dict)  # criteria besides rtol and max_iterations, or instead of them
+    x0: np.ndarray | None = None  # a guess
+    budget: float = BUDGET  # seconds that a precision may take
+    solve: Callable[..., wl.SolveResult] = wl.solve  # stands in for `wl.solve`, where something wrong is to be caught
 
     def promise(self, precision: str) -> Promise:
         """Return what it must come to."""
@@ -230,21 +201,13 @@ def checked(problem: Problem, result: wl.SolveResult, criteria: Mapping[str, Any
 
 @dataclass(frozen=True)
 class RefusalCase:
-    """A call that must raise ValueError before anything is solved.
+    """A call that must raise ValueError before anything is solved."""
 
-    Args:
-        family: the cases that share an expectation.
-        name: unique in its family.
-        call: takes device and precision.
-        names: what the message must contain: the argument.
-        budget: seconds it may take.
-    """
-
-    family: str
-    name: str
-    call: Callable[[str, str], object]
-    names: str
-    budget: float = BUDGET
+    family: str  # the cases that share an expectation
+    name: str  # unique in its family
+    call: Callable[[str, str], object]  # takes device and precision
+    names: str  # what the message must contain: the argument
+    budget: float = BUDGET  # seconds it may take
     precisions: tuple[str, ...] = PRECISIONS
 
     def promise(self, precision: str) -> Promise:

@@ -33,18 +33,18 @@ def faces_of(shape: tuple[int, ...], value: Any) -> dict[str, np.ndarray]:
 
 def slivers() -> Iterator[Case]:
     """Yield cut cells whose open fractions go down to 1e-12 and below."""
-    family = "cut fractions"
+    case = partial(both, "cut fractions")
     for shape in SHAPES:
         for smallest in (1e-3, 1e-6, 1e-12, 1e-30):
             name = f"one face in 20 open by {smallest:g}, {len(shape)}-D"
-            yield from both(family, name, partial(sprinkled, shape, smallest), promises=SINGLE_MAY_STOP)
-        yield from both(family, f"fractions 0 to 1, {len(shape)}-D", partial(uniform_fractions, shape), promises=SINGLE_MAY_STOP)
+            yield from case(name, partial(sprinkled, shape, smallest), promises=SINGLE_MAY_STOP)
+        yield from case(f"fractions 0 to 1, {len(shape)}-D", partial(uniform_fractions, shape), promises=SINGLE_MAY_STOP)
     for fraction in (1e-3, 1e-6, 1e-12):
         name = f"pool behind a face open by {fraction:g}"
-        yield from both(family, name, partial(behind_a_gap, fraction), promises=SINGLE_MAY_STOP)
-        yield from both(family, f"lone cells behind {fraction:g}", partial(lone_cells, fraction), promises=SINGLE_MAY_STOP)
+        yield from case(name, partial(behind_a_gap, fraction), promises=SINGLE_MAY_STOP)
+        yield from case(f"lone cells behind {fraction:g}", partial(lone_cells, fraction), promises=SINGLE_MAY_STOP)
     for theta in (1e-2, 1e-6, 1e-12):
-        yield from both(family, f"surface at 1/{theta:g}", partial(ghost_fluid, theta), promises=SINGLE_MAY_STOP)
+        yield from case(f"surface at 1/{theta:g}", partial(ghost_fluid, theta), promises=SINGLE_MAY_STOP)
 
 
 def sprinkled(shape: tuple[int, ...], smallest: float) -> GridProblem:
@@ -97,26 +97,26 @@ def ghost_fluid(theta: float) -> GridProblem:
 
 def contrasts() -> Iterator[Case]:
     """Yield coefficients over 12 decades, densities to 10^8 to 1, and cells a thousand times flatter than wide."""
-    family = "contrasts"
+    case = partial(both, "contrasts")
     for ratio in (1e2, 1e4, 1e6, 1e8):
         promises = SINGLE_MAY_STOP if ratio <= LARGEST_CONTRAST else MIXED_MAY_STOP
-        yield from both(family, f"layers of density 1:{ratio:g}", partial(layered, ratio), promises=promises, stopping=ROUGH)
-        yield from both(family, f"bubbles of density 1:{ratio:g}", partial(bubbles, ratio), promises=promises, stopping=ROUGH)
+        yield from case(f"layers of density 1:{ratio:g}", partial(layered, ratio), promises=promises, stopping=ROUGH)
+        yield from case(f"bubbles of density 1:{ratio:g}", partial(bubbles, ratio), promises=promises, stopping=ROUGH)
     for shape in SHAPES:
         for decades in (4, 12):
             name = f"coefficients over {decades} decades, {len(shape)}-D"
             promises = dict.fromkeys(PRECISIONS, EITHER) if decades == 12 else SINGLE_MAY_STOP
-            yield from both(family, name, partial(decades_of, shape, decades), promises=promises, stopping=ROUGH)
+            yield from case(name, partial(decades_of, shape, decades), promises=promises, stopping=ROUGH)
         for axis in range(len(shape)):
             for ratio in (1e3, 1e-3):
                 name = f"anisotropy {ratio:g} along {'xyz'[axis]}, {len(shape)}-D"
-                yield from both(family, name, partial(pool, shape, faces={f"face_{'xyz'[axis]}": ratio}))
+                yield from case(name, partial(pool, shape, faces={f"face_{'xyz'[axis]}": ratio}))
     for low, high in ((-6, 6), (0, 12), (-12, 0)):
         name = f"shift from 1e{low} to 1e{high}"
-        yield from both(family, name, partial(shifted, low, high), promises=SINGLE_MAY_STOP, stopping=ROUGH)
+        yield from case(name, partial(shifted, low, high), promises=SINGLE_MAY_STOP, stopping=ROUGH)
     for scale in (1e-12, 1e12, 1e-30, 1e30):
         name = f"all coefficients {scale:g}"
-        yield from both(family, name, partial(pool, (40, 44), faces={"face_x": scale, "face_y": scale}))
+        yield from case(name, partial(pool, (40, 44), faces={"face_x": scale, "face_y": scale}))
 
 
 def layered(ratio: float) -> GridProblem:
@@ -156,22 +156,21 @@ def shifted(low: int, high: int) -> GridProblem:
 def bodies() -> Iterator[Case]:
     """Yield rigid bodies in the liquid, as a term U W U' of masses from 10^-8 to 10^8 of the liquid's."""
     family = "rigid bodies"
+    case = partial(both, family)
     for inverse in (1e-8, 1e-4, 1.0, 1e4, 1e8):
         promises = SINGLE_MAY_STOP if inverse <= LIGHTEST else MIXED_MAY_STOP
-        yield from both(family, f"one body, 1/mass = {inverse:g}", partial(swimming, [inverse]), promises=promises, stopping=ROUGH)
+        yield from case(f"one body, 1/mass = {inverse:g}", partial(swimming, [inverse]), promises=promises, stopping=ROUGH)
     name, four = "four, 1/mass from 1e-8 to 1e8", partial(swimming, [1e-8, 1e8, 1.0, 1e4])
     yield SolveCase(family, f"{name}, projected-multigrid", four, promises=MIXED_MAY_STOP, stopping=ROUGH)
     yield SolveCase(family, f"{name}, minimum-map-newton", four, "minimum-map-newton", same(EITHER), stopping=ROUGH)
-    yield from both(family, "held: W = 0", lambda: swimming([0.0, 0.0]))
+    yield from case("held: W = 0", lambda: swimming([0.0, 0.0]))
     for inverse in (1e2, 1e4, 1e6, 1e8):
         promises = SINGLE_MAY_STOP if inverse <= LIGHTEST else MIXED_MAY_STOP
-        yield from both(
-            family, f"two, 1/mass = {inverse:g}, 3-D", partial(swimming_3d, [inverse, inverse]), promises=promises, stopping=ROUGH
-        )
-    yield from both(family, "heavy bodies, 3-D", lambda: swimming_3d([1e-8, 1e-8]))
-    yield from both(family, "a column that touches nothing", with_empty_column)
-    yield from both(family, "two equal columns", doubled_column)
-    yield from both(family, "a piston closes a chamber", piston)
+        yield from case(f"two, 1/mass = {inverse:g}, 3-D", partial(swimming_3d, [inverse, inverse]), promises=promises, stopping=ROUGH)
+    yield from case("heavy bodies, 3-D", lambda: swimming_3d([1e-8, 1e-8]))
+    yield from case("a column that touches nothing", with_empty_column)
+    yield from case("two equal columns", doubled_column)
+    yield from case("a piston closes a chamber", piston)
 
 
 def swimming(inverse_masses: list[float]) -> GridProblem:

@@ -21,23 +21,14 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Exact:
-    """The equations of the unknowns alone, in float64.
+    """The equations of the unknowns alone, in float64."""
 
-    Args:
-        matrix: shape (n, n).
-        b: shape (n,), units of y.
-        lower: shape (n,).
-        upper: shape (n,).
-        columns: U of a term U W U', shape (n, k); none if None.
-        weights: W, shape (k, k).
-    """
-
-    matrix: Any
-    b: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    columns: np.ndarray | None = None
-    weights: np.ndarray | None = None
+    matrix: Any  # shape (n, n)
+    b: np.ndarray  # shape (n,), units of y
+    lower: np.ndarray  # shape (n,)
+    upper: np.ndarray  # shape (n,)
+    columns: np.ndarray | None = None  # U of a term U W U', shape (n, k); none if None
+    weights: np.ndarray | None = None  # W, shape (k, k)
 
     @property
     def start(self) -> np.ndarray:

@@ -26,52 +26,38 @@ def given(family: str, name: str, make: Callable[[], Any], methods: tuple[str, .
 
 def singular() -> Iterator[Case]:
     """Yield symmetric positive semi-definite matrices with a null space, and matrices of a few numbers."""
-    family = "zero eigenvalues"
+    case = partial(given, "zero eigenvalues")
     convex = ("minimum-map-newton", "mprgp", "interior-point", "incremental-pivoting", "lemke")
     for rank in (1, N // 2, N - 1):
-        yield from given(
-            family,
+        yield from case(
             f"dense of rank {rank}, b in its range",
             partial(in_range, rank),
             convex,
             promises=same(EITHER) if rank == 1 else {"single": EITHER},
         )
-    yield from given(
-        family,
-        "sparse, constants are a null space",
-        ring,
-        ("minimum-map-newton", "mprgp", "incremental-pivoting"),
-        promises={"single": EITHER},
+    yield from case(
+        "sparse, constants are a null space", ring, ("minimum-map-newton", "mprgp", "incremental-pivoting"), promises={"single": EITHER}
     )
-    yield from given(
-        family,
+    yield from case(
         "A = 0, b >= 0",
         lambda: MatrixProblem(matrix=np.zeros((3, 3)), b=np.array([0.0, 1.0, 2.0])),
         ("minimum-map-newton", "lemke", "psor"),
     )
-    yield from given(
-        family,
+    yield from case(
         "A = 0, b < 0",
         lambda: MatrixProblem(matrix=np.zeros((3, 3)), b=np.array([0.0, 1.0, -2.0])),
         ("minimum-map-newton", "lemke"),
         promises=same(INFEASIBLE),
     )
     for b, promises in ((1.0, {}), (-1.0, same(INFEASIBLE))):
-        yield from given(
-            family, f"sparse with an empty row, b = {b:g} there", partial(empty_row, b), ("minimum-map-newton",), promises=promises
-        )
+        yield from case(f"sparse with an empty row, b = {b:g} there", partial(empty_row, b), ("minimum-map-newton",), promises=promises)
     for small in (1e-8, 1e-14, 1e-300):
-        yield from given(
-            family,
-            f"smallest eigenvalue {small:g}",
-            partial(nearly, small),
-            ("minimum-map-newton", "incremental-pivoting"),
-            promises=same(EITHER),
+        yield from case(
+            f"smallest eigenvalue {small:g}", partial(nearly, small), ("minimum-map-newton", "incremental-pivoting"), promises=same(EITHER)
         )
     for size in (1e-30, 1e30):
         matrix = np.array([[2.0, -1.0], [-1.0, 2.0]]) * size
-        yield from given(
-            family, f"entries of {size:g}", partial(MatrixProblem, matrix=matrix, b=np.array([0.5, -2.5]) * size),
+        yield from case(f"entries of {size:g}", partial(MatrixProblem, matrix=matrix, b=np.array([0.5, -2.5]) * size),
             ("minimum-map-newton", "incremental-pivoting", "lemke"), promises={"single": EITHER},
         )  # fmt: skip
 
@@ -114,31 +100,26 @@ def nearly(small: float) -> MatrixProblem:
 
 def cycling() -> Iterator[Case]:
     """Yield P-matrices on which Newton's method with the minimum map goes round in circles, and those that take pivots 2^n steps."""
-    family = "P-matrices"
+    case = partial(given, "P-matrices")
     robust = ("minimum-map-newton", "fischer-newton", "lemke")
     for n in (3, 4, 5, 6, 7, 9, 12, 30):
-        yield from given(family, f"cyclic, {n} unknowns", partial(circulant, n), robust)
+        yield from case(f"cyclic, {n} unknowns", partial(circulant, n), robust)
         for start in ("first", "alternating"):
             x0 = np.zeros(n)
             x0[:: n if start == "first" else 2] = 1.0
-            yield from given(family, f"cyclic, {n} unknowns, {start} start", partial(circulant, n), ("minimum-map-newton",), x0=x0)
+            yield from case(f"cyclic, {n} unknowns, {start} start", partial(circulant, n), ("minimum-map-newton",), x0=x0)
     for n in (8, 16):
-        yield from given(
-            family,
-            f"Murty's, {n} unknowns",
-            partial(murty, n),
-            ("minimum-map-newton", "lemke"),
-            but={"lemke": same(EITHER)} if n > 8 else {},
+        yield from case(
+            f"Murty's, {n} unknowns", partial(murty, n), ("minimum-map-newton", "lemke"), but={"lemke": same(EITHER)} if n > 8 else {}
         )
-        yield from given(
-            family,
+        yield from case(
             f"Fathi's, {n} unknowns",
             partial(fathi, n),
             ("minimum-map-newton", "incremental-pivoting", "lemke"),
             promises={"single": EITHER},
         )
     for seed in range(4):
-        yield from given(family, f"unsymmetric, random {seed}", partial(unsymmetric, seed), robust)
+        yield from case(f"unsymmetric, random {seed}", partial(unsymmetric, seed), robust)
 
 
 def circulant(n: int) -> MatrixProblem:

@@ -32,29 +32,17 @@ class Problem(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class GridProblem:
-    """Cells with face coefficients, bounds, and perhaps rigid bodies as a term U W U'.
+    """Cells with face coefficients, bounds, and perhaps rigid bodies as a term U W U'."""
 
-    Args:
-        cells: AIR, FLUID, SOLID, shape (nz, ny, nx) or (ny, nx).
-        b: field.
-        lower: number or field.
-        upper: number or field.
-        faces: `face_x` and so on, numbers or arrays.
-        shift: None, number or field.
-        periodic: whether x, y, z wrap around.
-        columns: U, shape of `cells` and (k,); none if None.
-        weights: W, shape (k, k).
-    """
-
-    cells: np.ndarray
-    b: np.ndarray
-    lower: Any = 0.0
-    upper: Any = np.inf
-    faces: Mapping[str, Any] = field(default_factory=dict)
-    shift: Any = None
-    periodic: tuple[bool, ...] = (False, False, False)
-    columns: np.ndarray | None = None
-    weights: np.ndarray | None = None
+    cells: np.ndarray  # AIR, FLUID, SOLID, shape (nz, ny, nx) or (ny, nx)
+    b: np.ndarray  # field
+    lower: Any = 0.0  # number or field
+    upper: Any = np.inf  # number or field
+    faces: Mapping[str, Any] = field(default_factory=dict)  # `face_x` and so on, numbers or arrays
+    shift: Any = None  # None, number or field
+    periodic: tuple[bool, ...] = (False, False, False)  # whether x, y, z wrap around
+    columns: np.ndarray | None = None  # U, shape of `cells` and (k,); none if None
+    weights: np.ndarray | None = None  # W, shape (k, k)
 
     def lcp(self, device: str, storage: Any) -> wl.LCP:
         """Return it for the library."""

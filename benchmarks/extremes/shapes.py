@@ -55,16 +55,16 @@ def grounded(shape: tuple[int, ...]) -> GridProblem:
 
 def sizes() -> Iterator[Case]:
     """Yield grids of one cell, one layer, prime sizes, 10^6 cells and long ones."""
-    family = "sizes"
+    case = partial(both, "sizes")
     for shape in ((1, 1), (1, 1, 1), (1, 2), (2, 1), (1, 1, 7), (1, 7, 1), (7, 1, 1), (1, 1, 4096), (4096, 1, 1), (1, 13, 17)):
-        yield from both(family, "x".join(map(str, shape)), partial(grounded, shape))
+        yield from case("x".join(map(str, shape)), partial(grounded, shape))
     for shape in ((2, 2), (3, 1), (127, 131), (1, 127, 131), (31, 37, 41), (2, 3, 5)):
-        yield from both(family, "x".join(map(str, shape)) + " below air", partial(pool, shape))
+        yield from case("x".join(map(str, shape)) + " below air", partial(pool, shape))
     for shape in ((3, 3000), (3000, 3), (2, 2000), (2, 2, 2000), (2000, 2, 2), (3, 2000, 3)):
-        yield from both(family, "1:1000, " + "x".join(map(str, shape)), partial(pool, shape), promises={"single": EITHER})
-    yield from both(family, "1024x1024", lambda: pool((1024, 1024)), budget=LARGE_BUDGET)
-    yield from both(family, "1024x1024 with noise as mask", lambda: sponge((1024, 1024), 0.75), budget=LARGE_BUDGET)
-    yield from both(family, "2-D like 3-D of one layer, periodic", lambda: pool((1, 61, 67), periodic=(True, False, False)))
+        yield from case("1:1000, " + "x".join(map(str, shape)), partial(pool, shape), promises={"single": EITHER})
+    yield from case("1024x1024", lambda: pool((1024, 1024)), budget=LARGE_BUDGET)
+    yield from case("1024x1024 with noise as mask", lambda: sponge((1024, 1024), 0.75), budget=LARGE_BUDGET)
+    yield from case("2-D like 3-D of one layer, periodic", lambda: pool((1, 61, 67), periodic=(True, False, False)))
 
 
 def sponge(shape: tuple[int, ...], liquid: float) -> GridProblem:
@@ -88,28 +88,29 @@ def without_inflow(cells: np.ndarray, b: np.ndarray) -> np.ndarray:
 def masks() -> Iterator[Case]:
     """Yield grids of few or no unknowns, checkerboards, needles and walls of one cell."""
     family = "masks"
+    case = partial(both, family)
     for name, kind in (("solid", SOLID), ("air", AIR)):
         yield RefusalCase(family, f"all {name}", partial(without_unknowns, kind), "A ")
     for name, around in (("air", AIR), ("solid", SOLID)):
         for shape in ((3, 3), (5, 5, 5)):
             for b in (-1.0, 1.0, 0.0):
                 if not (around == SOLID and b < 0):
-                    yield from both(family, f"one cell in {name}, {len(shape)}-D, b = {b:g}", partial(single, shape, around, b))
-    yield from both(family, "one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), promises=same(INFEASIBLE))
+                    yield from case(f"one cell in {name}, {len(shape)}-D, b = {b:g}", partial(single, shape, around, b))
+    yield from case("one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), promises=same(INFEASIBLE))
     for shape in ((40, 41), (12, 13, 14)):
         for other in (AIR, SOLID):
             name = f"checkerboard of liquid and {'air' if other == AIR else 'solid'}, {len(shape)}-D"
-            yield from both(family, name, partial(checkerboard, shape, other))
+            yield from case(name, partial(checkerboard, shape, other))
     yield SolveCase(family, "labyrinth 65x65, minimum-map-newton", lambda: labyrinth(65), "minimum-map-newton")
     yield SolveCase(family, "labyrinth 65x65, projected-multigrid", lambda: labyrinth(65), promises=same(EITHER))  # LIMITS
-    yield from both(family, "labyrinth 33x33 without bounds", lambda: labyrinth(33, lower=-np.inf))
-    yield from both(family, "two pools joined by a needle", lambda: needle(64))
-    yield from both(family, "chambers behind walls of one cell", lambda: chambers(59))
-    yield from both(family, "one air cell in 64x64", lambda: punctured((64, 64)))
-    yield from both(family, "one air cell in 24x24x24", lambda: punctured((24, 24, 24)))
+    yield from case("labyrinth 33x33 without bounds", lambda: labyrinth(33, lower=-np.inf))
+    yield from case("two pools joined by a needle", lambda: needle(64))
+    yield from case("chambers behind walls of one cell", lambda: chambers(59))
+    yield from case("one air cell in 64x64", lambda: punctured((64, 64)))
+    yield from case("one air cell in 24x24x24", lambda: punctured((24, 24, 24)))
     for liquid in (0.1, 0.5, 0.9):
-        yield from both(family, f"sponge, {liquid:.0%} liquid", partial(sponge, (67, 71), liquid))
-    yield from both(family, "3-D sponge, 60% liquid", lambda: sponge((19, 23, 29), 0.6))
+        yield from case(f"sponge, {liquid:.0%} liquid", partial(sponge, (67, 71), liquid))
+    yield from case("3-D sponge, 60% liquid", lambda: sponge((19, 23, 29), 0.6))
 
 
 def without_unknowns(kind: int, device: str, precision: str) -> wl.LCP:
@@ -169,6 +170,7 @@ def punctured(shape: tuple[int, ...]) -> GridProblem:
 def closed_pools() -> Iterator[Case]:
     """Yield liquid without air: b that adds up to 0 can be met, others only where a bound lets go."""
     family = "closed pools"
+    case = partial(both, family)
     for shape in ((48, 53), (17, 18, 19)):
         full = np.full(shape, FLUID)
         name = f"{len(shape)}-D"
@@ -184,16 +186,13 @@ def closed_pools() -> Iterator[Case]:
                 )
                 promises = {} if sign > 0 else same(INFEASIBLE)
                 yield SolveCase(family, f"p >= 0, {off}", partial(GridProblem, cells=full, b=b), method, promises)
-    yield from both(family, "one of 40 is incompatible", lambda: many_pools(0.05), promises=same(INFEASIBLE))
-    yield from both(family, "40 compatible ones", lambda: many_pools(0.0))
-    yield from both(
-        family, "boxed, inflow", lambda: GridProblem(cells=np.full((9, 9), FLUID), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0)
+    yield from case("one of 40 is incompatible", lambda: many_pools(0.05), promises=same(INFEASIBLE))
+    yield from case("40 compatible ones", lambda: many_pools(0.0))
+    yield from case("boxed, inflow", lambda: GridProblem(cells=np.full((9, 9), FLUID), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0))
+    yield from case(
+        "incompatible by rounding only", lambda: GridProblem(cells=np.full((64, 64), FLUID), b=noise((64, 64)) * 1e6, lower=-np.inf)
     )
-    yield from both(
-        family, "incompatible by rounding only", lambda: GridProblem(cells=np.full((64, 64), FLUID), b=noise((64, 64)) * 1e6, lower=-np.inf)
-    )
-    yield from both(
-        family, "periodic in x and y, compatible",
+    yield from case("periodic in x and y, compatible",
         lambda: GridProblem(cells=np.full((31, 32), FLUID), b=noise((31, 32)), lower=-np.inf, periodic=(True, True, False)),
     )  # fmt: skip
 

@@ -9,21 +9,22 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from warp_lcp.benchmarks.problems import Splash
+from warp_lcp.benchmarks.problems import BOUNDS, Splash
 from warp_lcp.operators.grid_poisson import FLUID
+
+INEQUALITIES = BOUNDS[1:]
+
+
+class PeerFailed(RuntimeError):
+    """A peer gave no answer; the message says why."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """The problem y = A x + b, x >= lower, on the FLUID cells of a scene, assembled.
+    """The problem y = A x + b, x >= lower, on the FLUID cells of a scene, assembled."""
 
-    Args:
-        scene: the scene.
-        bounds: `linear`, `walls`, `everywhere`.
-    """
-
-    scene: Splash
-    bounds: str
+    scene: Splash  # the scene
+    bounds: str  # `linear`, `walls`, `everywhere`
 
     @cached_property
     def matrix(self) -> sp.csr_array:
@@ -60,21 +61,13 @@ class Question:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a peer found.
+    """What a peer found."""
 
-    Args:
-        x: shape (unknowns,).
-        setup: of what could be reused for another b [s].
-        solve: of the rest [s].
-        iterations: of the method.
-        linear_iterations: within them.
-    """
-
-    x: np.ndarray
-    setup: float
-    solve: float
-    iterations: int
-    linear_iterations: int | None = None
+    x: np.ndarray  # shape (unknowns,)
+    setup: float  # of what could be reused for another b [s]
+    solve: float  # of the rest [s]
+    iterations: int  # of the method
+    linear_iterations: int | None = None  # within them
 
     @property
     def total(self) -> float:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from warp_lcp.benchmarks.machine import machine
-from warp_lcp.benchmarks.record import Record, Results
-from warp_lcp.benchmarks.timing import Options
-from warp_lcp.benchmarks.tradeoff.charts import preset_table, run_charts, run_sheet, run_table, solve_charts, solve_table
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Record, Results
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.benchmarks.tradeoff.charts import preset_table, run_chart, run_table, solve_chart, solve_table
 from warp_lcp.benchmarks.tradeoff.runs import FRAMES, Run, Runs
 from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
 from warp_lcp.benchmarks.tradeoff.solves import measure_solves
@@ -26,7 +26,7 @@ QUICK_FRAMES = 3
 def measure(options: Options, out: Path) -> Results:
     """Run the scenes with all settings."""
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
-    results = Results(records, [], [], vector=True)
+    results = Results(records, [])
     for name in [options.scene] if options.scene else SCENES:
         resolution = max(options.sizes, default=SCENES.get(name) or load_scene(name).domain.resolution)
         frames = FRAMES if resolution > QUICK else QUICK_FRAMES
@@ -47,8 +47,7 @@ def _measure_scene(name: str, resolution: int, frames: int, options: Options, re
     solves = measure_steps(scene, options, frames) if scene.scene.simulator == "granular" else measure_solves(scene, options, frames)
     results.records.extend([*own, *solves])
     results.tables.extend([preset_table(scene.scene.name, own), run_table(scene.scene.name, own), solve_table(scene.scene.name, solves)])
-    results.charts.extend([*run_charts(scene.scene.name, own), *solve_charts(scene.scene.name, solves)])
-    results.sheets.append(run_sheet(scene.scene.name, [*own, *solves]))
+    results.charts.extend([*run_chart(scene.scene.name, own), *solve_chart(scene.scene.name, solves)])
 
 
 def _overrides(simulator: str, preset: str) -> tuple[str, ...]:
@@ -59,11 +58,7 @@ def _overrides(simulator: str, preset: str) -> tuple[str, ...]:
 
 def _record(scene: str, run: Run, runs: Runs) -> Record:
     facts: dict[str, Any] = {"scene": scene, "kind": "run", "curve": run.setting.curve, "settings": run.setting.name}
-    facts |= {
-        "device": runs.options.device,
-        "frames": runs.frames,
-        "resolution": round(run.setting.scale * runs.resolution),
-        "scale": run.setting.scale,
-    }
+    resolution = round(run.setting.scale * runs.resolution)
+    facts |= {"device": runs.options.device, "frames": runs.frames, "resolution": resolution, "scale": run.setting.scale}
     facts |= {"failed": run.failed} if run.failed else {}
     return Record(f"{scene} {run.setting.curve}: {run.setting.name}", runs.figures(run), facts)

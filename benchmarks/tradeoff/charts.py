@@ -1,59 +1,39 @@
-"""Tables, sheets and charts of what accuracy costs."""
+"""Tables and charts of what accuracy costs."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
 
-from warp_lcp.benchmarks.record import Chart, Lines, Record, Sheet, Table
+from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Table
 from warp_lcp.benchmarks.tradeoff.runs import front_of
 
 PARETO = "Pareto front"
 FINEST = "distance_to_finest"
-SEEN = {
-    "distance": "mass elsewhere than in the reference run of this resolution [share]",
-    "distance_to_finest": "mass elsewhere than in the finest reference run [share]",
-    "energy_error": "largest error of the energy [share]",
-    "front_error": "error of the front at the end [m]",
-    "volume_drift": "growth of the volume [share]",
-    "packing": "densest cell, less 1",
-}
-SOLVED = {"residual": "relative residual, recomputed in float64", "error": "error against a converged float64 solution"}
-FIGURES = ("seconds", "steps", "iterations", "linear_iterations", "bytes", "residual", *SEEN, "front", "penetration", "error")
 SMALLEST = 1e-16  # that a logarithmic axis shows
 
 
-def run_charts(scene: str, records: Sequence[Record]) -> list[Chart]:
-    """Return a chart for each thing that a user sees: its error over the seconds of a run, the Pareto front marked.
-
-    Runs of other resolutions, whose own references are others, count only where all are compared with one, the finest.
-    """
-    own = [r for r in records if r.facts["scale"] == 1.0]
-    return [chart for name, label in SEEN.items() for chart in _charts(scene, records if name == FINEST else own, name, label, "run")]
+def run_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
+    """Return the distance to the finest run over the seconds of the runs, the Pareto front marked."""
+    label = "mass elsewhere than in the finest reference run [share]"
+    return _chart(scene, FINEST, label, "run", [(str(r.facts["curve"]), r) for r in records])
 
 
-def solve_charts(scene: str, records: Sequence[Record]) -> list[Chart]:
-    """Return residual and error over the seconds of the solves, the Pareto front marked."""
-    named = [
-        Record(r.name, r.figures, {**r.facts, "curve": f"{r.facts['method']}, {r.facts['precision']}"})
-        for r in records
-        if r.facts["kind"] == "solve"
-    ]
-    return [chart for figure, label in SOLVED.items() for chart in _charts(scene, named, figure, label, "solve")]
+def solve_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
+    """Return the error over the seconds of the solves, the Pareto front marked."""
+    solves = [(f"{r.facts['method']}, {r.facts['precision']}", r) for r in records if r.facts["kind"] == "solve"]
+    return _chart(scene, "error", "error against a converged float64 solution", "solve", solves)
 
 
-def _charts(scene: str, records: Sequence[Record], figure: str, label: str, kind: str) -> list[Chart]:
+def _chart(scene: str, figure: str, label: str, kind: str, records: Sequence[tuple[str, Record]]) -> list[Chart]:
     """Return the chart of a figure over seconds, none where no record has it."""
     curves: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
     points = []
-    for r in records:
-        seconds, error = r.value("seconds"), r.value(figure)
-        if seconds is None or error is None:
-            continue
-        point = (seconds, max(abs(error - (figure == "packing")), SMALLEST))
-        points.append(point)
-        for axis, value in zip(curves[str(r.facts["curve"])], point, strict=True):
-            axis.append(value)
+    for curve, r in records:
+        if (seconds := r.value("seconds")) is not None and (error := r.value(figure)) is not None:
+            points.append((seconds, max(abs(error), SMALLEST)))
+            for axis, value in zip(curves[curve], points[-1], strict=True):
+                axis.append(value)
     if not points:
         return []
     best = [points[i] for i in front_of(points)]
@@ -62,35 +42,13 @@ def _charts(scene: str, records: Sequence[Record], figure: str, label: str, kind
     return [Lines(name, f"{scene}: {label}", f"seconds of a {kind}", label, curves, marked=frozenset({PARETO}))]
 
 
-def run_sheet(scene: str, records: Sequence[Record]) -> Sheet:
-    """Return every setting with all its figures; an empty cell is not known."""
-    facts = ("kind", "curve", "settings", "method", "precision", "tolerance", "resolution", "device", "status", "failed")
-    rows = []
-    for r in records:
-        values = [r.value(figure) for figure in FIGURES]
-        rows.append([r.name, *(str(r.facts.get(f, "")) for f in facts), *("" if v is None else f"{v:.6g}" for v in values)])
-    return Sheet(scene, ["name", *facts, *FIGURES], rows)
-
-
 def run_table(scene: str, records: Sequence[Record]) -> Table:
     """Return the runs, the Pareto front of seconds and distance marked."""
     ran = [r for r in records if r.figures]
     own = [r for r in ran if r.facts["scale"] == 1.0]
     best, best_of_all = _front(own, "distance"), _front(ran, FINEST)
-    columns = [
-        "settings",
-        "",
-        "seconds",
-        "steps",
-        "iterations",
-        "MB",
-        "distance",
-        "to the finest",
-        "energy",
-        "front [m]",
-        "volume",
-        "packing",
-    ]
+    columns = ["settings", "", "seconds", "steps", "iterations", "MB", "distance", "to the finest", "energy", "front [m]", "volume"]
+    columns.append("packing")
     rows = []
     for r in records:
         preset = str(r.facts["curve"]).startswith("preset ")

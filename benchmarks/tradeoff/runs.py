@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
-from warp_lcp.benchmarks.memory import array_bytes
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.harness.machine import array_bytes
+from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, Setting
 from warp_lcp.run.trial import BIN, Trial, trial
 from warp_lcp.scene.presets import changed, price_table
@@ -22,21 +22,13 @@ FRAMES = 18
 
 @dataclass
 class Run:
-    """What a setting took.
+    """What a setting took."""
 
-    Attributes:
-        setting: the setting.
-        trial: of its first run.
-        seconds: of all its runs.
-        bytes: of device arrays at the end.
-        failed: why it has no trial.
-    """
-
-    setting: Setting
-    trial: Trial | None = None
-    seconds: list[float] = field(default_factory=list)
-    bytes: int = 0
-    failed: str = ""
+    setting: Setting  # the setting
+    trial: Trial | None = None  # of its first run
+    seconds: list[float] = field(default_factory=list)  # of all its runs
+    bytes: int = 0  # of device arrays at the end
+    failed: str = ""  # why it has no trial
 
 
 class Runs:

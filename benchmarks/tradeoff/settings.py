@@ -16,17 +16,11 @@ REFERENCE = 2.0  # of the finest run's
 
 @dataclass(frozen=True)
 class Setting:
-    """A scene's keys with other values.
+    """A scene's keys with other values."""
 
-    Args:
-        curve: what it belongs to: settings that differ in one key alone.
-        overrides: as `warp-lcp run --set` takes them.
-        scale: of the resolution.
-    """
-
-    curve: str
-    overrides: tuple[str, ...]
-    scale: float = 1.0
+    curve: str  # what it belongs to: settings that differ in one key alone
+    overrides: tuple[str, ...]  # as `warp-lcp run --set` takes them
+    scale: float = 1.0  # of the resolution
 
     @property
     def name(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.record import Record
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
 from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.presets import changed
 from warp_lcp.scene.scene import Scene
@@ -74,10 +73,10 @@ def _step(scene: Scene, state: State, device: str) -> tuple[np.ndarray, dict[str
     """Take a step from a state, and return the particles' velocities [m/s], the log's row and the seconds."""
     simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
     simulation.restore(state[0])
-    clock = time.perf_counter if wp.get_device(device).is_cuda else time.process_time
-    begun = clock()
+    read = clock(device)
+    begun = read()
     row = simulation.step(state[1])
     wp.synchronize_device(device)
-    taken = clock() - begun
+    taken = read() - begun
     after = simulation.state()
     return after["velocity"], dict(row), taken

@@ -6,11 +6,14 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from warp_lcp.benchmarks.machine import machine
-from warp_lcp.benchmarks.record import Results
-from warp_lcp.benchmarks.timing import Options
+import numpy as np
+
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Chart, Results, Table
+from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.validation import (
     ceiling,
     dam_break,
@@ -33,7 +36,6 @@ from warp_lcp.benchmarks.validation import (
     volume,
 )
 from warp_lcp.benchmarks.validation.finding import Trial, table
-from warp_lcp.benchmarks.validation.html_page import Section, page
 
 TITLE = "Liquids, sand and rigid bodies against known answers"
 CHECKS = {
@@ -71,16 +73,39 @@ KNOWN = {  # why a check is known not to hold everywhere; the report says so whe
 
 def measure(options: Options, out: Path) -> Results:
     """Run all checks."""
-    sections: list[Section] = []
+    trials: dict[str, list[Trial]] = {}
+    charts: list[Chart] = []
     for name, module in CHECKS.items():
         options.say(f"{name} ...")
-        found, drawn = module.check(options.device)
-        options.say(f"{name}: {sum(t.passed for t in found)} of {len(found)} as they must be, {sum(t.seconds for t in found):.0f} s")
-        charts = [chart for chart in drawn if chart.curves]
-        sections.append(Section(name, inspect.getdoc(module) or "", found, charts, KNOWN.get(name, "")))
+        trials[name], drawn = module.check(options.device)
+        passed = sum(t.passed for t in trials[name])
+        options.say(f"{name}: {passed} of {len(trials[name])} as they must be, {sum(t.seconds for t in trials[name]):.0f} s")
+        charts += [chart for chart in drawn if chart.curves]
+    found = [t for own in trials.values() for t in own]
     where = machine(options.device, elements=1 << 22, repeat=options.repeat)
-    trials: list[Trial] = [t for s in sections for t in s.trials]
-    records = [where, *(t.record() for t in trials)]
-    failures = [line for t in trials for line in t.failures()]
-    charts = [chart for s in sections for chart in s.charts]
-    return Results(records, [table(trials)], charts, failures, page=page(TITLE, where, sections))
+    tables = [summary(trials), misses(trials), *(table(name, inspect.getdoc(CHECKS[name]) or "", own) for name, own in trials.items())]
+    return Results([where, *(t.record() for t in found)], tables, charts, [line for t in found for line in t.failures()])
+
+
+def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
+    """Return a row a check: how many figures keep their bounds, and how many controls fail theirs."""
+    rows, sums = list[list[str]](), np.zeros(4, dtype=int)
+    for name, own in trials.items():
+        kinds = [[f.passed for t in own for f in t.findings if f.control is control] for control in (False, True)]
+        counts = [n for kind in kinds for n in (sum(kind), len(kind))]
+        sums += counts
+        verdict = "as it must be" if all(t.passed for t in own) else "not all as it must be"
+        seconds = sum(t.seconds for t in own)
+        rows.append([name, f"{counts[0]} of {counts[1]}", f"{counts[2]} of {counts[3]}", f"{seconds:.1f}", verdict])
+    remark = (
+        f"{sums[0]} of {sums[1]} figures keep their tolerance, and {sums[2]} of {sums[3]} negative controls fail theirs, as they must; "
+        f"{sum(t.seconds for own in trials.values() for t in own):.0f} s in all. A negative control is a set-up that is wrong on "
+        "purpose: a check that it passes would prove nothing."
+    )
+    return Table("Checks", ["check", "within tolerance", "controls that fail", "seconds", "verdict"], rows, remark)
+
+
+def misses(trials: Mapping[str, Sequence[Trial]]) -> Table:
+    """Return what is not as it must be, and why that is known."""
+    rows = [[line, KNOWN.get(name, "")] for name, own in trials.items() for t in own for line in t.failures()]
+    return Table("Not as it must be", ["figure", "known"], rows)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.record import Chart
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at
 from warp_lcp.benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, Numerics, box, create, positions, pressures, steps
 from warp_lcp.fluids import LiquidSimulation
 
@@ -45,22 +45,19 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     return [trial(n, device, numerics, ceiling) for n in RESOLUTIONS for numerics, ceiling in cases], []
 
 
-def trial(resolution: int, device: str, numerics: Numerics, ceiling: str = "flat") -> Trial:
+@check_at("ceiling", "{resolution} cells, {numerics.name}, {ceiling}")
+def trial(found: Findings, resolution: int, device: str, numerics: Numerics, ceiling: str = "flat") -> None:
     """Drop the block, then again with each thing that would hold it."""
-
-    def run(found: Findings) -> None:
-        fall = drop(resolution, device, numerics, ceiling)
-        found.add("expected way", fall.expected, low=8.0, unit="cells")
-        found.add("worst particle", fall.worst, high=0.5, unit="cells")
-        found.add("largest |p| over rho g H", max(abs(fall.lowest), fall.highest) / _weight(), high=1e-6)
-        hanging = drop(resolution, device, numerics, ceiling, wall="free-slip")
-        found.must_break("free-slip: mean way", float(hanging.fallen.mean()), low=0.5, unit="cells")
-        found.must_break("free-slip: lowest p over rho g H", hanging.lowest / _weight(), low=-0.1)
-        stuck = drop(resolution, device, numerics, ceiling, release=False)
-        found.add("wall's velocity kept: mean behind", stuck.expected - float(stuck.fallen.mean()), high=1.0, unit="cells")
-        found.must_break("wall's velocity kept: worst particle", stuck.worst, high=0.5, unit="cells")
-
-    return attempt("ceiling", f"{resolution} cells, {numerics.name}, {ceiling}", run)
+    fall = drop(resolution, device, numerics, ceiling)
+    found.add("expected way", fall.expected, low=8.0, unit="cells")
+    found.add("worst particle", fall.worst, high=0.5, unit="cells")
+    found.add("largest |p| over rho g H", max(abs(fall.lowest), fall.highest) / _weight(), high=1e-6)
+    hanging = drop(resolution, device, numerics, ceiling, wall="free-slip")
+    found.must_break("free-slip: mean way", float(hanging.fallen.mean()), low=0.5, unit="cells")
+    found.must_break("free-slip: lowest p over rho g H", hanging.lowest / _weight(), low=-0.1)
+    stuck = drop(resolution, device, numerics, ceiling, release=False)
+    found.add("wall's velocity kept: mean behind", stuck.expected - float(stuck.fallen.mean()), high=1.0, unit="cells")
+    found.must_break("wall's velocity kept: worst particle", stuck.worst, high=0.5, unit="cells")
 
 
 def drop(

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart, Lines
+from warp_lcp.benchmarks.harness.record import Chart, Lines
 from warp_lcp.benchmarks.validation.enclosed import filled_fraction
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
 from warp_lcp.benchmarks.validation.signals import best_pace, best_shift, front, relative_rms, stays, surface_height
 from warp_lcp.benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, Numerics, box, create, fill, positions, steps
 from warp_lcp.fluids import LiquidSimulation
@@ -34,19 +34,12 @@ H = np.array([0.94, 0.89, 0.83, 0.78, 0.72, 0.67, 0.61, 0.56, 0.50, 0.44, 0.39, 
 
 @dataclass(frozen=True)
 class Collapse:
-    """A collapse in the experiment's units.
+    """A collapse in the experiment's units."""
 
-    Attributes:
-        T: of the front's stays at its places, T = n t sqrt(g / a).
-        Z: these places over a.
-        tau: t sqrt(g / a) of every step.
-        H: height beside the wall over n^2 a.
-    """
-
-    T: np.ndarray
-    Z: np.ndarray
-    tau: np.ndarray
-    H: np.ndarray
+    T: np.ndarray  # of the front's stays at its places, T = n t sqrt(g / a)
+    Z: np.ndarray  # these places over a
+    tau: np.ndarray  # t sqrt(g / a) of every step
+    H: np.ndarray  # height beside the wall over n^2 a
 
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
@@ -54,42 +47,36 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     trials = [trial(n, device) for n in RESOLUTIONS]
     fronts = {"Martin & Moyce": (T.tolist(), Z.tolist())}
     heights = {"Martin & Moyce": (TAU.tolist(), H.tolist())}
-    for t in trials:
-        fronts |= {f"{t.resolution}{label[5:]}": curve for label, curve in t.curves.items() if label.startswith("front")}
-        heights |= {f"{t.resolution}{label[6:]}": curve for label, curve in t.curves.items() if label.startswith("height")}
-    linear = {"logarithmic_x": False, "logarithmic_y": False}
+    fronts, heights = fronts | curves_of(trials, "front"), heights | curves_of(trials, "height")
     data = frozenset({"Martin & Moyce"})
     return trials, [
-        Lines("dam-break-front", "Front of a collapsing column", "T = n t sqrt(g / a)", "Z = x / a", fronts, marked=data, **linear),
-        Lines("dam-break-height", "Height at the wall", "tau = t sqrt(g / a)", "H = y / (n^2 a)", heights, marked=data, **linear),
+        Lines("dam-break-front", "Front of a collapsing column", "T = n t sqrt(g / a)", "Z = x / a", fronts, marked=data, log=""),
+        Lines("dam-break-height", "Height at the wall", "tau = t sqrt(g / a)", "H = y / (n^2 a)", heights, marked=data, log=""),
     ]
 
 
-def trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+@check_at("dam break", "{cells} cells of a, {numerics.name}")
+def trial(found: Findings, cells: int, device: str, numerics: Numerics = SUB_CELL) -> None:
     """Compare a collapse with the data; the controls have another gravity than their time is measured in."""
-
-    def run(found: Findings) -> None:
-        limit = LIMITS[cells]
-        compared = (T >= FIRST) & (T <= LAST)
-        at, expected = T[compared], Z[compared]
-        c = collapse(cells, device, numerics)
-        shift, rms = best_shift(c.T, c.Z, at, expected, MAX_SHIFT)
-        found.add("RMS error of Z", 100.0 * relative_rms(c.T, c.Z, at, expected), high=20.0, unit="%")
-        found.add("RMS error of Z after the best shift", 100.0 * rms, high=limit, unit="%")
-        found.add("the best shift of T", shift, low=-MAX_SHIFT, high=MAX_SHIFT)
-        found.add("gravity that the front shows", shown_gravity(c), low=0.9, high=1.1, unit="g")
-        early = TAU <= TAU_LAST
-        found.add("largest |dH|", float(np.abs(np.interp(TAU[early], c.tau, c.H) - H[early]).max()), high=0.05)
-        found.curves["front"], found.curves["height"] = (c.T.tolist(), c.Z.tolist()), (c.tau.tolist(), c.H.tolist())
-        found.curves[f"front, shifted by {-shift:.2f}"] = ((c.T - shift).tolist(), c.Z.tolist())
-        for factor in WRONG_GRAVITY:
-            wrong = collapse(cells, device, numerics, gravity=factor * GRAVITY)
-            found.must_break(f"{factor:g} g: gravity that the front shows", shown_gravity(wrong), low=0.9, high=1.1, unit="g")
-            if factor == min(WRONG_GRAVITY):  # nearer ones a shift can hide
-                rms = 100.0 * best_shift(wrong.T, wrong.Z, at, expected, MAX_SHIFT)[1]
-                found.must_break(f"{factor:g} g: RMS error of Z after the best shift", rms, high=limit, unit="%")
-
-    return attempt("dam break", f"{cells} cells of a, {numerics.name}", run)
+    limit = LIMITS[cells]
+    compared = (T >= FIRST) & (T <= LAST)
+    at, expected = T[compared], Z[compared]
+    c = collapse(cells, device, numerics)
+    shift, rms = best_shift(c.T, c.Z, at, expected, MAX_SHIFT)
+    found.add("RMS error of Z", 100.0 * relative_rms(c.T, c.Z, at, expected), high=20.0, unit="%")
+    found.add("RMS error of Z after the best shift", 100.0 * rms, high=limit, unit="%")
+    found.add("the best shift of T", shift, low=-MAX_SHIFT, high=MAX_SHIFT)
+    found.add("gravity that the front shows", shown_gravity(c), low=0.9, high=1.1, unit="g")
+    early = TAU <= TAU_LAST
+    found.add("largest |dH|", float(np.abs(np.interp(TAU[early], c.tau, c.H) - H[early]).max()), high=0.05)
+    found.curves["front"], found.curves["height"] = (c.T.tolist(), c.Z.tolist()), (c.tau.tolist(), c.H.tolist())
+    found.curves[f"front, shifted by {-shift:.2f}"] = ((c.T - shift).tolist(), c.Z.tolist())
+    for factor in WRONG_GRAVITY:
+        wrong = collapse(cells, device, numerics, gravity=factor * GRAVITY)
+        found.must_break(f"{factor:g} g: gravity that the front shows", shown_gravity(wrong), low=0.9, high=1.1, unit="g")
+        if factor == min(WRONG_GRAVITY):  # nearer ones a shift can hide
+            rms = 100.0 * best_shift(wrong.T, wrong.Z, at, expected, MAX_SHIFT)[1]
+            found.must_break(f"{factor:g} g: RMS error of Z after the best shift", rms, high=limit, unit="%")
 
 
 def shown_gravity(c: Collapse) -> float:

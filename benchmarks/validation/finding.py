@@ -6,33 +6,28 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import wraps
+from inspect import signature
+from typing import Any
 
-from warp_lcp.benchmarks.record import Record, Table
-from warp_lcp.benchmarks.timing import Figure
+from warp_lcp.benchmarks.harness.record import Record, Table
+from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
-COLUMNS = ("check", "resolution", "figure", "measured", "bound", "as it must be?")
+Curve = tuple[Sequence[float], Sequence[float]]
+COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A figure and its bound.
+    """A figure and its bound."""
 
-    Args:
-        what: the figure, unique in its trial.
-        value: measured; NaN if it could not be.
-        low: the bound from below.
-        high: the bound from above.
-        unit: of value and bounds.
-        control: a negative control: it belongs to a set-up that is wrong on purpose, and must break the bound.
-    """
-
-    what: str
-    value: float
-    low: float = -math.inf
-    high: float = math.inf
-    unit: str = ""
-    control: bool = False
+    what: str  # the figure, unique in its trial
+    value: float  # measured; NaN if it could not be
+    low: float = -math.inf  # the bound from below
+    high: float = math.inf  # the bound from above
+    unit: str = ""  # of value and bounds
+    control: bool = False  # a negative control: it belongs to a set-up that is wrong on purpose, and must break the bound
 
     @property
     def passed(self) -> bool:
@@ -62,22 +57,14 @@ def control(finding: Finding) -> Finding:
 
 @dataclass(frozen=True)
 class Trial:
-    """A check at one resolution.
+    """A check at one resolution."""
 
-    Args:
-        check: its name.
-        resolution: in words.
-        findings: what was found.
-        seconds: wall time [s].
-        error: why it could not be finished; empty if it was.
-    """
-
-    check: str
-    resolution: str
-    findings: Sequence[Finding]
-    seconds: float = 0.0
-    error: str = ""
-    curves: dict[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
+    check: str  # its name
+    resolution: str  # in words
+    findings: Sequence[Finding]  # what was found
+    seconds: float = 0.0  # wall time [s]
+    error: str = ""  # why it could not be finished; empty if it was
+    curves: dict[str, Curve] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -112,6 +99,26 @@ class Trial:
         return lines
 
 
+def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Callable[..., Trial]]:
+    """Make a function that adds findings to its first argument one that returns them as a trial.
+
+    Args:
+        check: its name.
+        resolution: in words, with the function's arguments in braces.
+    """
+
+    def decorated(run: Callable[..., None]) -> Callable[..., Trial]:
+        @wraps(run)
+        def trial(*given: Any, **named: Any) -> Trial:
+            arguments = signature(run).bind(None, *given, **named)
+            arguments.apply_defaults()
+            return attempt(check, resolution.format(**arguments.arguments), lambda found: run(found, *given, **named))
+
+        return trial
+
+    return decorated
+
+
 def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Trial:
     """Run a check; a simulation that ends early is a failure of the check, not of the suite.
 
@@ -133,7 +140,7 @@ class Findings:
     """Collects what a check finds; `curves` are x and y of lines to draw, by label."""
 
     findings: list[Finding] = field(default_factory=list)
-    curves: dict[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
+    curves: dict[str, Curve] = field(default_factory=dict)
 
     def add(self, what: str, value: float, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> None:
         """Note a figure that must keep its bound."""
@@ -144,10 +151,13 @@ class Findings:
         self.findings.append(control(Finding(what, float(value), low, high, unit)))
 
 
-def table(trials: Sequence[Trial]) -> Table:
-    """Return all findings."""
-    rows = [[t.check, t.resolution, *f.row()] for t in trials for f in t.findings]
-    rows += [[t.check, t.resolution, "error", t.error, "none", "NO"] for t in trials if t.error]
-    wrong = sum(row[-1] == "NO" for row in rows)
-    remark = f"{len(rows)} figures in {sum(t.seconds for t in trials):.0f} s, {wrong} not as they must be."
-    return Table("Findings", COLUMNS, rows, remark + " A control is wrong on purpose: it must break its bound.")
+def curves_of(trials: Sequence[Trial], *labels: str) -> dict[str, Curve]:
+    """Return the curves of trials by resolution and label; those whose label begins with one of `labels`, if there are any."""
+    return {f"{t.resolution}: {k}": c for t in trials for k, c in t.curves.items() if not labels or k.startswith(labels)}
+
+
+def table(check: str, remark: str, trials: Sequence[Trial]) -> Table:
+    """Return all findings of a check; a control is wrong on purpose: it must break its bound."""
+    rows = [[t.name, *f.row()] for t in trials for f in sorted(t.findings, key=lambda f: f.control)]
+    rows += [[t.name, "error", t.error, "none", "NO"] for t in trials if t.error]
+    return Table(check, COLUMNS, rows, remark)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart
+from warp_lcp.benchmarks.harness.record import Chart
 from warp_lcp.benchmarks.validation import sand_pit, tank
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at
 from warp_lcp.benchmarks.validation.tank import GRAVITY, SUB_CELL, VOXEL, box
 
 RESOLUTIONS = (32, 64)  # cells along the domain
@@ -27,19 +27,14 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     return [trial(n, device) for n in RESOLUTIONS], []
 
 
-def trial(cells: int, device: str) -> Trial:
+@check_at("flight", "{cells} cells")
+def trial(found: Findings, cells: int, device: str) -> None:
     """Throw everything; in the controls gravity acts for a whole step before things move by it."""
-
-    def run(found: Findings) -> None:
-        for what in THROWN:
-            for cfl in CFL:
-                found.add(
-                    f"{what}, CFL {cfl:g}: off its parabola", off_its_parabola(what, cells, cfl, device), high=MOST, unit="of the way"
-                )
-                old = off_its_parabola(what, cells, cfl, device, whole_kicks=True)
-                found.must_break(f"{what}, CFL {cfl:g}, old gravity: off its parabola", old, high=MOST, unit="of the way")
-
-    return attempt("flight", f"{cells} cells", run)
+    for what in THROWN:
+        for cfl in CFL:
+            found.add(f"{what}, CFL {cfl:g}: off its parabola", off_its_parabola(what, cells, cfl, device), high=MOST, unit="of the way")
+            old = off_its_parabola(what, cells, cfl, device, whole_kicks=True)
+            found.must_break(f"{what}, CFL {cfl:g}, old gravity: off its parabola", old, high=MOST, unit="of the way")
 
 
 def off_its_parabola(what: str, cells: int, cfl: float, device: str = "cpu", *, whole_kicks: bool = False) -> float:

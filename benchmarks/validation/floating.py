@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at
 from warp_lcp.benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, box, create, steps
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import Window
@@ -30,20 +30,15 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     return [*trials, *(iterations(cells, device) for cells in (24, 32))], []
 
 
-def accelerations(dimension: int, cells: int, device: str) -> Trial:
+@check_at("floating", "{dimension}-D, {cells} cells a diameter")
+def accelerations(found: Findings, dimension: int, cells: int, device: str) -> None:
     """Compare the first acceleration of a disc or sphere with that of potential flow."""
-
-    def run(found: Findings) -> None:
-        for ratio in RATIOS[dimension]:
-            expected = acceleration(dimension, ratio)
-            found.add(
-                f"ratio {ratio:g}: a over expected", _first_acceleration(dimension, cells, ratio, device) / expected, low=0.95, high=1.05
-            )
-        light = min(RATIOS[dimension])
-        apart = _first_acceleration(dimension, cells, light, device, together=False) / acceleration(dimension, light)
-        found.must_break(f"solved one after the other, ratio {light:g}: a over expected", apart, low=0.95, high=1.05)
-
-    return attempt("floating", f"{dimension}-D, {cells} cells a diameter", run)
+    for ratio in RATIOS[dimension]:
+        expected = acceleration(dimension, ratio)
+        found.add(f"ratio {ratio:g}: a over expected", _first_acceleration(dimension, cells, ratio, device) / expected, low=0.95, high=1.05)
+    light = min(RATIOS[dimension])
+    apart = _first_acceleration(dimension, cells, light, device, together=False) / acceleration(dimension, light)
+    found.must_break(f"solved one after the other, ratio {light:g}: a over expected", apart, low=0.95, high=1.05)
 
 
 def acceleration(dimension: int, ratio: float) -> float:
@@ -71,29 +66,26 @@ def _first_acceleration(dimension: int, cells: int, ratio: float, device: str, *
     return float(simulation.step(STEP)["body0_vy"]) / (0.5 * STEP)  # type: ignore[arg-type]
 
 
-def displacement(dimension: int, cells: int, ratio: float, device: str) -> Trial:
+@check_at("floating", "{dimension}-D, {cells} cells, a box of {ratio:g} times the liquid's density")
+def displacement(found: Findings, dimension: int, cells: int, ratio: float, device: str) -> None:
     """Let a box bob, and compare the mean of what it displaces with its mass."""
-
-    def run(found: Findings) -> None:
-        width, height = BOX
-        side = 1.0 if dimension == 2 else 0.8
-        center, level = 0.5 * side, 0.45
-        bottom = level - 0.85 * ratio * height
-        low, high = [center - 0.5 * width, bottom, center - 0.5 * width], [center + 0.5 * width, bottom + height, center + 0.5 * width]
-        raft = box(low[:dimension], high[:dimension], density=DENSITY * ratio)
-        simulation = create(
-            SUB_CELL, size=[side] * dimension, resolution=cells, liquid=[box([0.0] * dimension, [side, level, side][:dimension])],
-            solid=[raft], density_correction={}, device=device, **_down(dimension),
-        )  # fmt: skip
-        depths = []
-        for row in steps(simulation, SETTLES[dimension]):
-            if simulation.time > 0.4 * SETTLES[dimension]:
-                depths.append(water_level(simulation, width) - (float(row["body0_y"]) - 0.5 * height))
-        draft = ratio * height
-        found.add("mean displacement over the box's mass", float(np.mean(depths)) / draft, low=0.98, high=1.02)
-        found.must_break("of a box a twentieth heavier", float(np.mean(depths)) / (1.05 * draft), low=0.98, high=1.02)
-
-    return attempt("floating", f"{dimension}-D, {cells} cells, a box of {ratio:g} times the liquid's density", run)
+    width, height = BOX
+    side = 1.0 if dimension == 2 else 0.8
+    center, level = 0.5 * side, 0.45
+    bottom = level - 0.85 * ratio * height
+    low, high = [center - 0.5 * width, bottom, center - 0.5 * width], [center + 0.5 * width, bottom + height, center + 0.5 * width]
+    raft = box(low[:dimension], high[:dimension], density=DENSITY * ratio)
+    simulation = create(
+        SUB_CELL, size=[side] * dimension, resolution=cells, liquid=[box([0.0] * dimension, [side, level, side][:dimension])],
+        solid=[raft], density_correction={}, device=device, **_down(dimension),
+    )  # fmt: skip
+    depths = []
+    for row in steps(simulation, SETTLES[dimension]):
+        if simulation.time > 0.4 * SETTLES[dimension]:
+            depths.append(water_level(simulation, width) - (float(row["body0_y"]) - 0.5 * height))
+    draft = ratio * height
+    found.add("mean displacement over the box's mass", float(np.mean(depths)) / draft, low=0.98, high=1.02)
+    found.must_break("of a box a twentieth heavier", float(np.mean(depths)) / (1.05 * draft), low=0.98, high=1.02)
 
 
 def water_level(simulation: LiquidSimulation, width: float) -> float:
@@ -111,18 +103,13 @@ def water_level(simulation: LiquidSimulation, width: float) -> float:
     return float(np.nanmean(heights))
 
 
-def momentum(dimension: int, device: str) -> Trial:
+@check_at("floating", "{dimension}-D, an impact")
+def momentum(found: Findings, dimension: int, device: str) -> None:
     """Let liquid fly against a body far from walls: what the body gains is what the liquid loses, whatever the solve leaves."""
-
-    def run(found: Findings) -> None:
-        for ratio in (0.01, 1.0, 100.0):
-            lost, exchanged = exchange(dimension, ratio, device)
-            found.add(f"ratio {ratio:g}: momentum lost over exchanged", lost / exchanged, high=1e-4)
-        found.must_break(
-            "solved one after the other: energy over that before", exchange(dimension, 0.01, device, together=False)[0], high=1.0
-        )
-
-    return attempt("floating", f"{dimension}-D, an impact", run)
+    for ratio in (0.01, 1.0, 100.0):
+        lost, exchanged = exchange(dimension, ratio, device)
+        found.add(f"ratio {ratio:g}: momentum lost over exchanged", lost / exchanged, high=1e-4)
+    found.must_break("solved one after the other: energy over that before", exchange(dimension, 0.01, device, together=False)[0], high=1.0)
 
 
 def exchange(dimension: int, ratio: float, device: str, *, together: bool = True) -> tuple[float, float]:
@@ -159,17 +146,14 @@ def exchange(dimension: int, ratio: float, device: str, *, together: bool = True
     return float(np.linalg.norm(total)), float(np.linalg.norm(gained))
 
 
-def iterations(cells: int, device: str) -> Trial:
+@check_at("floating", "{cells}^3 cells, bodies of all weights")
+def iterations(found: Findings, cells: int, device: str) -> None:
     """Count the iterations of the first step of bodies of all weights under water."""
-
-    def run(found: Findings) -> None:
-        counts = {ratio: _iterations(cells, ratio, device, corrected=True) for ratio in EXTREMES}
-        for ratio, count in counts.items():
-            found.add(f"ratio {ratio:g}: iterations over those at 1", count / counts[1.0], high=1.5)
-        plain = _iterations(cells, min(EXTREMES), device, corrected=False)
-        found.must_break(f"uncorrected, ratio {min(EXTREMES):g}: iterations over those at 1", plain / counts[1.0], high=1.5)
-
-    return attempt("floating", f"{cells}^3 cells, bodies of all weights", run)
+    counts = {ratio: _iterations(cells, ratio, device, corrected=True) for ratio in EXTREMES}
+    for ratio, count in counts.items():
+        found.add(f"ratio {ratio:g}: iterations over those at 1", count / counts[1.0], high=1.5)
+    plain = _iterations(cells, min(EXTREMES), device, corrected=False)
+    found.must_break(f"uncorrected, ratio {min(EXTREMES):g}: iterations over those at 1", plain / counts[1.0], high=1.5)
 
 
 def _iterations(cells: int, ratio: float, device: str, *, corrected: bool) -> int:

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
 from warp_lcp.granular.materials import MATERIALS
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
@@ -46,75 +46,66 @@ SETS_IN, OFF = 0.9, 0.8  # [s] until it is steady; what of the profile it starts
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [trial(n, device) for trial in (layer, slab, bagnold) for n in RESOLUTIONS]
-    curves = {f"{t.resolution}: {label}": curve for t in trials if t.check == "inclined layer" for label, curve in t.curves.items()}
+    curves = curves_of([t for t in trials if t.check == "inclined layer"])
     exact = [(math.degrees(a), accelerates(math.degrees(a)) / GRAVITY) for a in np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20)]
     curves["sin - cos / 2"] = ([x for x, _ in exact], [y for _, y in exact])
     title = "Acceleration of a layer that runs"
-    profiles = {f"{t.resolution}: {label}": c for t in trials if t.check == BAGNOLD for label, c in t.curves.items()}
+    profiles = curves_of([t for t in trials if t.check == BAGNOLD])
     y = np.linspace(0.0, DEPTH, 40)
     profiles |= {f"Bagnold, {a:g} degrees": ((y / DEPTH).tolist(), bagnold_profile(y, a).tolist()) for a in STEADY}
     return trials, [
-        Lines("inclined-layer", title, "slope [degrees]", "a / g", curves, logarithmic_x=False, logarithmic_y=False),
-        Lines("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", profiles, logarithmic_x=False, logarithmic_y=False),
+        Lines("inclined-layer", title, "slope [degrees]", "a / g", curves, log=""),
+        Lines("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", profiles, log=""),
     ]
 
 
-def layer(cells: int, device: str = "cpu", angles: tuple[float, ...] = ANGLES) -> Trial:
+@check_at("inclined layer", "{cells} cells of depth")
+def layer(found: Findings, cells: int, device: str = "cpu", angles: tuple[float, ...] = ANGLES) -> None:
     """Let sand rest and run on a rough slope; the control is the box of Narain et al., which gives way where sand should rest."""
-
-    def run(found: Findings) -> None:
-        whole, late = rests(cells, REST, device)
-        found.add(f"{REST:g} degrees, settled: |mean acceleration|", abs(late), high=0.01, unit="g")
-        found.add(f"{REST:g} degrees, settled: speed in the end over g t", abs(whole), high=1e-3)
-        ratios = []
-        for angle in angles:
-            ratio = runs(cells, angle, device) / accelerates(angle)
-            stuck = 1.0 / cells  # of the mean, the share of the row that the floor holds
-            found.add(f"{angle:g} degrees, running: acceleration over expected", ratio, low=0.94 - stuck, high=1.06 + stuck)
-            ratios.append(ratio * accelerates(angle) / GRAVITY)
-        found.curves["layer"] = (list(angles), ratios)
-        _, flows = rests(cells, BOX_FLOWS, device, friction={"model": "box"})
-        found.must_break(f"box, {BOX_FLOWS:g} degrees, settled: mean acceleration", flows, high=0.01, unit="g")
-
-    return attempt("inclined layer", f"{cells} cells of depth", run)
+    whole, late = rests(cells, REST, device)
+    found.add(f"{REST:g} degrees, settled: |mean acceleration|", abs(late), high=0.01, unit="g")
+    found.add(f"{REST:g} degrees, settled: speed in the end over g t", abs(whole), high=1e-3)
+    ratios = []
+    for angle in angles:
+        ratio = runs(cells, angle, device) / accelerates(angle)
+        stuck = 1.0 / cells  # of the mean, the share of the row that the floor holds
+        found.add(f"{angle:g} degrees, running: acceleration over expected", ratio, low=0.94 - stuck, high=1.06 + stuck)
+        ratios.append(ratio * accelerates(angle) / GRAVITY)
+    found.curves["layer"] = (list(angles), ratios)
+    _, flows = rests(cells, BOX_FLOWS, device, friction={"model": "box"})
+    found.must_break(f"box, {BOX_FLOWS:g} degrees, settled: mean acceleration", flows, high=0.01, unit="g")
 
 
-def slab(cells: int, device: str = "cpu", angles: tuple[float, ...] = SLIDES) -> Trial:
+@check_at("sliding slab", "{cells} cells of depth")
+def slab(found: Findings, cells: int, device: str = "cpu", angles: tuple[float, ...] = SLIDES) -> None:
     """Let stiff sand rest and slide on a smooth slope; the control is a floor without friction."""
     tables = {"material": {"friction_angle": STIFF}, "floor": SMOOTH}
-
-    def run(found: Findings) -> None:
-        _, late = rests(cells, SLAB_REST, device, **tables)
-        found.add(f"{SLAB_REST:g} degrees: |mean acceleration|", abs(late), high=0.01, unit="g")
-        for angle in angles:
-            ratio = runs(cells, angle, device, speed=0.0, **tables) / accelerates(angle)
-            found.add(f"{angle:g} degrees: acceleration over expected", ratio, low=0.94, high=1.06)
-        _, slips = rests(cells, SLAB_REST, device, material={"friction_angle": STIFF}, floor=0.0)
-        found.must_break("smooth floor: mean acceleration", slips, high=0.01, unit="g")
-
-    return attempt("sliding slab", f"{cells} cells of depth", run)
+    _, late = rests(cells, SLAB_REST, device, **tables)
+    found.add(f"{SLAB_REST:g} degrees: |mean acceleration|", abs(late), high=0.01, unit="g")
+    for angle in angles:
+        ratio = runs(cells, angle, device, speed=0.0, **tables) / accelerates(angle)
+        found.add(f"{angle:g} degrees: acceleration over expected", ratio, low=0.94, high=1.06)
+    _, slips = rests(cells, SLAB_REST, device, material={"friction_angle": STIFF}, floor=0.0)
+    found.must_break("smooth floor: mean acceleration", slips, high=0.01, unit="g")
 
 
-def bagnold(cells: int, device: str = "cpu", angles: tuple[float, ...] = STEADY) -> Trial:
+@check_at(BAGNOLD, "{cells} cells of depth")
+def bagnold(found: Findings, cells: int, device: str = "cpu", angles: tuple[float, ...] = STEADY) -> None:
     """Let sand whose friction grows with the rate of shear run to its steady speed; the control is friction that does not grow."""
     beads: dict[str, Any] = {"material": {"friction_angle": STATIC}}
     growing = beads | {"friction": {"dynamic_angle": DYNAMIC, "grain_size": GRAIN, "inertial_number": INERTIAL}}
-
-    def run(found: Findings) -> None:
-        for angle in angles:
-            y, u = steady(cells, angle, device, **growing)
-            expected, most = bagnold_profile(y, angle), float(bagnold_profile(np.array([DEPTH]), angle)[0])
-            found.add(f"{angle:g} degrees: mean speed over Bagnold's", u.mean() / expected.mean(), low=0.95, high=1.05)
-            off = np.abs(u - expected).max() / most
-            found.add(f"{angle:g} degrees: farthest from Bagnold's profile, over its surface's speed", off, high=0.05)
-            found.curves[f"{angle:g} degrees"] = ((y / DEPTH).tolist(), u.tolist())
-        _, mean = _watch(_create(cells, BELOW, device, CREEPS, **growing), cells, STOPPED)
-        found.add(f"{BELOW:g} degrees: speed in the end over that at the start", abs(mean[-1]) / CREEPS, high=0.01)
-        y, u = steady(cells, angles[0], device, **beads)
-        ratio = u.mean() / bagnold_profile(y, angles[0]).mean()
-        found.must_break(f"friction that does not grow, {angles[0]:g} degrees: mean speed over Bagnold's", ratio, low=0.95, high=1.05)
-
-    return attempt(BAGNOLD, f"{cells} cells of depth", run)
+    for angle in angles:
+        y, u = steady(cells, angle, device, **growing)
+        expected, most = bagnold_profile(y, angle), float(bagnold_profile(np.array([DEPTH]), angle)[0])
+        found.add(f"{angle:g} degrees: mean speed over Bagnold's", u.mean() / expected.mean(), low=0.95, high=1.05)
+        off = np.abs(u - expected).max() / most
+        found.add(f"{angle:g} degrees: farthest from Bagnold's profile, over its surface's speed", off, high=0.05)
+        found.curves[f"{angle:g} degrees"] = ((y / DEPTH).tolist(), u.tolist())
+    _, mean = _watch(_create(cells, BELOW, device, CREEPS, **growing), cells, STOPPED)
+    found.add(f"{BELOW:g} degrees: speed in the end over that at the start", abs(mean[-1]) / CREEPS, high=0.01)
+    y, u = steady(cells, angles[0], device, **beads)
+    ratio = u.mean() / bagnold_profile(y, angles[0]).mean()
+    found.must_break(f"friction that does not grow, {angles[0]:g} degrees: mean speed over Bagnold's", ratio, low=0.95, high=1.05)
 
 
 def bagnold_profile(y: np.ndarray, angle: float) -> np.ndarray:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
 from warp_lcp.benchmarks.validation.sand_pit import (
     FLOOR,
     FRICTION_ANGLE,
@@ -45,23 +45,14 @@ CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m]: of the domain, and of the cube that
 
 @dataclass(frozen=True)
 class Collapse:
-    """What a column has become.
+    """What a column has become."""
 
-    Attributes:
-        runout: of the front, in widths.
-        height: of the pile, in widths.
-        moved: how far the front went in the end of the run, in widths.
-        energy: kinetic, at the end, over the largest.
-        solved: share of the steps whose stresses are within the tolerance [%].
-        outline: x and y of the pile's surface, in widths.
-    """
-
-    runout: float
-    height: float
-    moved: float
-    energy: float
-    solved: float
-    outline: tuple[list[float], list[float]]
+    runout: float  # of the front, in widths
+    height: float  # of the pile, in widths
+    moved: float  # how far the front went in the end of the run, in widths
+    energy: float  # kinetic, at the end, over the largest
+    solved: float  # share of the steps whose stresses are within the tolerance [%]
+    outline: tuple[list[float], list[float]]  # x and y of the pile's surface, in widths
 
 
 def lube(aspect: float) -> float:
@@ -93,51 +84,44 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     curves: dict[str, Any] = {name: (a.tolist(), [law(x) for x in a]) for name, law in laws.items()}
     for label, side in (("20 % below both", 0), ("20 % above both", 1)):
         curves[label] = (a.tolist(), [envelope(x)[side] for x in a])
-    shapes: dict[str, Any] = {}
-    for t in trials[:-1]:
-        curves[t.resolution] = t.curves.get("runout", ([], []))
-        shapes |= {f"{t.resolution}: {label}": c for label, c in t.curves.items() if label.startswith("a = ")}
+    curves |= {t.resolution: t.curves.get("runout", ([], [])) for t in trials[:-1]}
+    marked, title = frozenset(t.resolution for t in trials), "Runout of collapsing columns"
     return trials, [
-        Lines(
-            "sand-runout", "Runout of collapsing columns", "a = height / width", "runout / width", curves,
-            marked=frozenset(t.resolution for t in trials),
-        ),
-        Lines("sand-piles", "Piles", "x / width", "y / width", shapes, logarithmic_x=False, logarithmic_y=False),
-    ]  # fmt: skip
+        Lines("sand-runout", title, "a = height / width", "runout / width", curves, marked=marked),
+        Lines("sand-piles", "Piles", "x / width", "y / width", curves_of(trials, "a = "), log=""),
+    ]
 
 
-def trial(cells: int, device: str = "cpu", aspects: tuple[float, ...] = (), *, controls: bool = True) -> Trial:
+@check_at("sand collapse", "{cells} cells of width")
+def trial(found: Findings, cells: int, device: str = "cpu", aspects: tuple[float, ...] = (), *, controls: bool = True) -> None:
     """Compare runouts and heights with the experiments; the controls have half of their friction, and the most that a cone may have.
 
     Args:
+        found: takes the figures.
         cells: of a column's width.
         device: where it runs.
         aspects: height over width; those of the check without any.
         controls: run the negative controls too.
     """
-
-    def run(found: Findings) -> None:
-        chosen, ways = aspects or CASES[cells], []
-        for aspect in chosen:
-            low, high = envelope(aspect)
-            c = collapse(aspect, cells, device)
-            ways.append(c.runout)
-            found.add(f"a = {aspect:g}: runout", c.runout, low=low, high=high, unit="widths")
-            found.add(f"a = {aspect:g}: height over Lube's", c.height / lube_height(aspect), low=1.0 - HEIGHT, high=1.0 + HEIGHT)
-            found.add(f"a = {aspect:g}: way of the front in the last {STAYS:g} s", abs(c.moved), high=0.02, unit="widths")
-            found.add(f"a = {aspect:g}: kinetic energy in the end over the largest", c.energy, high=1e-3)
-            found.add(f"a = {aspect:g}: steps with stresses to 1e-3", c.solved, low=95.0, unit="%")
-            found.curves[f"a = {aspect:g}"] = c.outline
-        found.curves["runout"] = (list(chosen), ways)
-        low, high = envelope(CONTROLLED)
-        slope = math.tan(math.radians(FRICTION_ANGLE))
-        for angle in (math.degrees(math.atan(0.5 * slope)), STEEPEST) if controls else ():
-            c = collapse(CONTROLLED, cells, device, length=12.0, angle=angle, floor=math.tan(math.radians(angle)))
-            found.must_break(f"{angle:.0f} degrees, a = {CONTROLLED:g}: runout", c.runout, low=low, high=high, unit="widths")
-            ratio = c.height / lube_height(CONTROLLED)
-            found.must_break(f"{angle:.0f} degrees, a = {CONTROLLED:g}: height over Lube's", ratio, low=1.0 - HEIGHT, high=1.0 + HEIGHT)
-
-    return attempt("sand collapse", f"{cells} cells of width", run)
+    chosen, ways = aspects or CASES[cells], []
+    for aspect in chosen:
+        low, high = envelope(aspect)
+        c = collapse(aspect, cells, device)
+        ways.append(c.runout)
+        found.add(f"a = {aspect:g}: runout", c.runout, low=low, high=high, unit="widths")
+        found.add(f"a = {aspect:g}: height over Lube's", c.height / lube_height(aspect), low=1.0 - HEIGHT, high=1.0 + HEIGHT)
+        found.add(f"a = {aspect:g}: way of the front in the last {STAYS:g} s", abs(c.moved), high=0.02, unit="widths")
+        found.add(f"a = {aspect:g}: kinetic energy in the end over the largest", c.energy, high=1e-3)
+        found.add(f"a = {aspect:g}: steps with stresses to 1e-3", c.solved, low=95.0, unit="%")
+        found.curves[f"a = {aspect:g}"] = c.outline
+    found.curves["runout"] = (list(chosen), ways)
+    low, high = envelope(CONTROLLED)
+    slope = math.tan(math.radians(FRICTION_ANGLE))
+    for angle in (math.degrees(math.atan(0.5 * slope)), STEEPEST) if controls else ():
+        c = collapse(CONTROLLED, cells, device, length=12.0, angle=angle, floor=math.tan(math.radians(angle)))
+        found.must_break(f"{angle:.0f} degrees, a = {CONTROLLED:g}: runout", c.runout, low=low, high=high, unit="widths")
+        ratio = c.height / lube_height(CONTROLLED)
+        found.must_break(f"{angle:.0f} degrees, a = {CONTROLLED:g}: height over Lube's", ratio, low=1.0 - HEIGHT, high=1.0 + HEIGHT)
 
 
 def collapse(aspect: float, cells: int, device: str = "cpu", *, length: float = 0.0, **tables: Any) -> Collapse:
@@ -164,45 +148,39 @@ def collapse(aspect: float, cells: int, device: str = "cpu", *, length: float = 
     return Collapse(way, height(simulation), way - before, energies[-1] / max(energies), share_solved(rows), surface)
 
 
-def growing(device: str = "cpu", cells: int = GROWTH[0], aspects: tuple[float, ...] = GROWTH[1]) -> Trial:
+@check_at("sand collapse", "mu(I), {cells} cells of width")
+def growing(found: Findings, device: str = "cpu", cells: int = GROWTH[0], aspects: tuple[float, ...] = GROWTH[1]) -> None:
     """Compare columns whose friction grows with the rate of shear by as much as that of glass beads."""
-
-    def run(found: Findings) -> None:
-        ways = {}
-        for aspect in aspects:
-            c = collapse(aspect, cells, device, friction={"dynamic_angle": DYNAMIC, "grain_size": GRAIN})
-            low, high = envelope(aspect) if aspect < TALL else (lube(aspect), lajeunesse(aspect))
-            ways[aspect] = c.runout
-            found.add(f"a = {aspect:g}: runout", c.runout, low=low, high=high, unit="widths")
-            found.add(f"a = {aspect:g}: height over Lube's", c.height / lube_height(aspect), low=1.0 - HEIGHT, high=1.0 + HEIGHT)
-        found.curves["runout"] = (list(ways), list(ways.values()))
-
-    return attempt("sand collapse", f"mu(I), {cells} cells of width", run)
+    ways = {}
+    for aspect in aspects:
+        c = collapse(aspect, cells, device, friction={"dynamic_angle": DYNAMIC, "grain_size": GRAIN})
+        low, high = envelope(aspect) if aspect < TALL else (lube(aspect), lajeunesse(aspect))
+        ways[aspect] = c.runout
+        found.add(f"a = {aspect:g}: runout", c.runout, low=low, high=high, unit="widths")
+        found.add(f"a = {aspect:g}: height over Lube's", c.height / lube_height(aspect), low=1.0 - HEIGHT, high=1.0 + HEIGHT)
+    found.curves["runout"] = (list(ways), list(ways.values()))
 
 
-def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
+@check_at("sand collapse", "3-D, {cells} cells")
+def cube(found: Findings, device: str = "cpu", cells: int = CUBE) -> None:
     """Let a square column collapse in 3-D: it must stop, as a round pile that reaches as far as those of round columns do.
 
     The controls are the cube itself, and sand of nearly the steepest cone. Sand with half of the friction would meet the walls.
     """
-
-    def run(found: Findings) -> None:
-        material = {"friction_angle": FRICTION_ANGLE}
-        start, x, rows = _falling_cube(material, WALL_FRICTION, cells, device)
-        energies = [row["kinetic_energy"] for row in rows]
-        found.add("kinetic energy in the end over the largest", energies[-1] / max(energies), high=1e-3)
-        found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
-        found.add("|mean of exp(4 i angle)| of the 5 % farthest", _squareness(x), high=0.5)
-        found.must_break("before it falls: |mean of exp(4 i angle)|", _squareness(start), high=0.5)
-        radius = CUBE_WIDTH / math.sqrt(math.pi)  # of a round column of the same area
-        aspect = CUBE_WIDTH / radius
-        low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)  # [Lube2004], [Lajeunesse2004]
-        found.add(f"a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
-        found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J")
-        _, x, _ = _falling_cube({"friction_angle": STEEP}, math.tan(math.radians(STEEP)), cells, device)
-        found.must_break(f"{STEEP:g} degrees, a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
-
-    return attempt("sand collapse", f"3-D, {cells} cells", run)
+    material = {"friction_angle": FRICTION_ANGLE}
+    start, x, rows = _falling_cube(material, WALL_FRICTION, cells, device)
+    energies = [row["kinetic_energy"] for row in rows]
+    found.add("kinetic energy in the end over the largest", energies[-1] / max(energies), high=1e-3)
+    found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
+    found.add("|mean of exp(4 i angle)| of the 5 % farthest", _squareness(x), high=0.5)
+    found.must_break("before it falls: |mean of exp(4 i angle)|", _squareness(start), high=0.5)
+    radius = CUBE_WIDTH / math.sqrt(math.pi)  # of a round column of the same area
+    aspect = CUBE_WIDTH / radius
+    low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)  # [Lube2004], [Lajeunesse2004]
+    found.add(f"a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
+    found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J")
+    _, x, _ = _falling_cube({"friction_angle": STEEP}, math.tan(math.radians(STEEP)), cells, device)
+    found.must_break(f"{STEEP:g} degrees, a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
 
 
 def _falling_cube(material: Row, walls: float, cells: int, device: str) -> tuple[np.ndarray, np.ndarray, list[Row]]:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from warp_lcp.benchmarks.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt, check_at, curves_of
 from warp_lcp.benchmarks.validation.sand_pit import create, positions, share_solved, steps
 from warp_lcp.granular.simulator import SandSimulation
 
@@ -36,23 +36,14 @@ Outline = tuple[np.ndarray, np.ndarray]  # x and y [m]
 
 @dataclass(frozen=True)
 class Heap:
-    """What has been poured.
+    """What has been poured."""
 
-    Attributes:
-        angle: of the wedge that fits best [degrees], a while after the pouring has ended.
-        creep: by how much it falls from then on [degrees/s].
-        wedge: distance of the outline from that wedge, root mean square, over its height.
-        dome: from the parabola that fits best, over the same height.
-        solved: share of the steps whose stresses are within the tolerance [%].
-        outline: at the end.
-    """
-
-    angle: float
-    creep: float
-    wedge: float
-    dome: float
-    solved: float
-    outline: Outline
+    angle: float  # of the wedge that fits best [degrees], a while after the pouring has ended
+    creep: float  # by how much it falls from then on [degrees/s]
+    wedge: float  # distance of the outline from that wedge, root mean square, over its height
+    dome: float  # from the parabola that fits best, over the same height
+    solved: float  # share of the steps whose stresses are within the tolerance [%]
+    outline: Outline  # at the end
 
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
@@ -71,47 +62,42 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
             )
 
     trials.append(attempt("sand heap", "both", compare))
-    curves: dict[str, Any] = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
-    return trials, [Lines("sand-heaps", "Heaps and wedges", "x [m]", "y [m]", curves, logarithmic_x=False, logarithmic_y=False)]
+    curves: dict[str, Any] = curves_of(trials)
+    return trials, [Lines("sand-heaps", "Heaps and wedges", "x [m]", "y [m]", curves, log="")]
 
 
-def heaps(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES, *, controls: bool = True) -> Trial:
+@check_at("sand heap", "{cells} cells of length")
+def heaps(found: Findings, cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES, *, controls: bool = True) -> None:
     """Pour heaps; the control has half the friction.
 
     Args:
+        found: takes the figures.
         cells: of the domain's length.
         device: where it runs.
         angles: at which layers stop [degrees].
         controls: run the negative control too, at the least resolution.
     """
-
-    def run(found: Findings) -> None:
-        for angle in angles:
-            heap = pour(cells, angle, device)
-            low, high = angle - NEAR, angle + NEAR
-            found.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
-            found.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
-            found.add(f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08)
-            found.add(f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%")
-            found.curves[f"{angle:g} degrees"] = (heap.outline[0].tolist(), heap.outline[1].tolist())
-        if controls and cells == RESOLUTIONS[0]:
-            low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
-            flat = pour(cells, half_as_steep(CONTROLLED), device, lasts=SETTLES).angle
-            found.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
-
-    return attempt("sand heap", f"{cells} cells of length", run)
+    for angle in angles:
+        heap = pour(cells, angle, device)
+        low, high = angle - NEAR, angle + NEAR
+        found.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
+        found.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
+        found.add(f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08)
+        found.add(f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%")
+        found.curves[f"{angle:g} degrees"] = (heap.outline[0].tolist(), heap.outline[1].tolist())
+    if controls and cells == RESOLUTIONS[0]:
+        low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
+        flat = pour(cells, half_as_steep(CONTROLLED), device, lasts=SETTLES).angle
+        found.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
 
 
-def wedges(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES) -> Trial:
+@check_at("sand wedge", "{cells} cells of length")
+def wedges(found: Findings, cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES) -> None:
     """Let wedges stand that are flatter than a layer that stops; the control has half the friction."""
-
-    def run(found: Findings) -> None:
-        for angle in angles:
-            found.add(f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle, device), high=SHRINKS)
-        flows = lost(cells, CONTROLLED, device, duration=SETTLES, material={"friction_angle": half_as_steep(CONTROLLED)})
-        found.must_break(f"half the friction, {CONTROLLED - BELOW:g} degrees: height lost", flows, high=SHRINKS)
-
-    return attempt("sand wedge", f"{cells} cells of length", run)
+    for angle in angles:
+        found.add(f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle, device), high=SHRINKS)
+    flows = lost(cells, CONTROLLED, device, duration=SETTLES, material={"friction_angle": half_as_steep(CONTROLLED)})
+    found.must_break(f"half the friction, {CONTROLLED - BELOW:g} degrees: height lost", flows, high=SHRINKS)
 
 
 def half_as_steep(angle: float) -> float:

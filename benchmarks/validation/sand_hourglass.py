@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart, Lines
+from warp_lcp.benchmarks.harness.record import Chart, Lines
 from warp_lcp.benchmarks.validation import tank
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt, curves_of
 from warp_lcp.benchmarks.validation.sand_pit import CORRECTED, GRAVITY, Row, create, positions, share_solved, steps
 
 OPENINGS = {1: (8, 12, 16), 2: (16,)}  # cells, by refinement
@@ -30,17 +30,11 @@ DENSITY = 1600.0  # [kg/m^3]
 
 @dataclass(frozen=True)
 class Discharge:
-    """What has left a bin.
+    """What has left a bin."""
 
-    Attributes:
-        fill: in the middle of each part of the range [widths].
-        rate: in each part [m^2/s].
-        solved: share of the steps whose stresses are within the tolerance [%].
-    """
-
-    fill: np.ndarray
-    rate: np.ndarray
-    solved: float = math.nan
+    fill: np.ndarray  # in the middle of each part of the range [widths]
+    rate: np.ndarray  # in each part [m^2/s]
+    solved: float = math.nan  # share of the steps whose stresses are within the tolerance [%]
 
     @property
     def spread(self) -> float:
@@ -51,19 +45,13 @@ class Discharge:
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [trial(refinement, device) for refinement in OPENINGS]
-    rates: dict[str, Any] = {f"{t.resolution}: {k}": c for t in trials for k, c in t.curves.items() if k != "law"}
     laws: dict[str, Any] = {t.resolution: t.curves["law"] for t in trials if "law" in t.curves}
     laws["rate = sqrt(g D^3)"] = ([0.0, 0.09], [0.0, 0.09 * GRAVITY ** (1.0 / 3.0)])
+    rates, marked = curves_of(trials, "D = ", "liquid"), frozenset(t.resolution for t in trials)
     return trials, [
-        Lines(
-            "sand-discharge", "Discharge of a bin over its fill", "fill / width", "rate / first rate", rates,
-            logarithmic_x=False, logarithmic_y=False,
-        ),
-        Lines(
-            "sand-slot", "Discharge over the slot", "D [m]", "(rate)^(2/3) [m^(4/3) / s^(2/3)]", laws,
-            logarithmic_x=False, logarithmic_y=False, marked=frozenset(t.resolution for t in trials),
-        ),
-    ]  # fmt: skip
+        Lines("sand-discharge", "Discharge of a bin over its fill", "fill / width", "rate / first rate", rates, log=""),
+        Lines("sand-slot", "Discharge over the slot", "D [m]", "(rate)^(2/3) [m^(4/3) / s^(2/3)]", laws, log="", marked=marked),
+    ]
 
 
 def trial(refinement: int, device: str = "cpu", openings: tuple[int, ...] = ()) -> Trial:

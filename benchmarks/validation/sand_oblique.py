@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at
 from warp_lcp.benchmarks.validation.sand_pit import CORRECTED, GRAVITY, create, steps
 from warp_lcp.benchmarks.validation.tank import box
 from warp_lcp.granular.simulator import SandSimulation
@@ -33,43 +33,37 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     return [*(planes(cells, device) for cells in RESOLUTIONS), hopper(device)], []
 
 
-def planes(cells: int, device: str = "cpu", cases: tuple[tuple[float, float], ...] = PLANES) -> Trial:
+@check_at("sand oblique", "{cells} cells of height")
+def planes(found: Findings, cells: int, device: str = "cpu", cases: tuple[tuple[float, float], ...] = PLANES) -> None:
     """Let a block slide down planes, and rest on rougher ones."""
-
-    def run(found: Findings) -> None:
-        for angle, friction in cases:
-            t = math.radians(angle)
-            drive = GRAVITY * math.sin(t)
-            measured = acceleration(angle, friction, cells, device=device)
-            off = 100.0 * (measured - drive + friction * GRAVITY * math.cos(t)) / drive
-            found.add(f"{angle:g} degrees, friction {friction:g}: acceleration off Coulomb's, of g sin", abs(off), high=2.0, unit="%")
-            held = acceleration(angle, 1.2 * math.tan(t), cells, device=device)
-            found.add(f"{angle:g} degrees, friction 1.2 tan: acceleration of g sin", 100.0 * abs(held) / drive, high=0.5, unit="%")
-        angle, friction = cases[len(cases) // 2]
-        drive = GRAVITY * math.sin(math.radians(angle))
-        exact = drive - friction * GRAVITY * math.cos(math.radians(angle))
-        stairs = acceleration(angle, friction, cells, device=device, whole=True)
-        found.must_break("whole cells: acceleration off Coulomb's, of g sin", 100.0 * abs(stairs - exact) / drive, high=2.0, unit="%")
-
-    return attempt("sand oblique", f"{cells} cells of height", run)
+    for angle, friction in cases:
+        t = math.radians(angle)
+        drive = GRAVITY * math.sin(t)
+        measured = acceleration(angle, friction, cells, device=device)
+        off = 100.0 * (measured - drive + friction * GRAVITY * math.cos(t)) / drive
+        found.add(f"{angle:g} degrees, friction {friction:g}: acceleration off Coulomb's, of g sin", abs(off), high=2.0, unit="%")
+        held = acceleration(angle, 1.2 * math.tan(t), cells, device=device)
+        found.add(f"{angle:g} degrees, friction 1.2 tan: acceleration of g sin", 100.0 * abs(held) / drive, high=0.5, unit="%")
+    angle, friction = cases[len(cases) // 2]
+    drive = GRAVITY * math.sin(math.radians(angle))
+    exact = drive - friction * GRAVITY * math.cos(math.radians(angle))
+    stairs = acceleration(angle, friction, cells, device=device, whole=True)
+    found.must_break("whole cells: acceleration off Coulomb's, of g sin", 100.0 * abs(stairs - exact) / drive, high=2.0, unit="%")
 
 
-def hopper(device: str = "cpu", cells: int = HOPPER, shifts: tuple[float, ...] = SHIFTS) -> Trial:
+@check_at("sand oblique", "hopper of {cells} cells")
+def hopper(found: Findings, device: str = "cpu", cells: int = HOPPER, shifts: tuple[float, ...] = SHIFTS) -> None:
     """Let sand run from a hopper whose place in the grid differs."""
+    cut, stairs = (np.array([discharge(shift, cells, device=device, whole=whole) for shift in shifts]) for whole in (False, True))
 
-    def run(found: Findings) -> None:
-        cut, stairs = (np.array([discharge(shift, cells, device=device, whole=whole) for shift in shifts]) for whole in (False, True))
+    def spread(rates: np.ndarray) -> float:
+        return 100.0 * float(np.ptp(rates.mean(axis=1)) / rates.mean())
 
-        def spread(rates: np.ndarray) -> float:
-            return 100.0 * float(np.ptp(rates.mean(axis=1)) / rates.mean())
-
-        found.add("spread of the rate over places in the grid", spread(cut), high=6.0, unit="%")
-        growth = 100.0 * float(np.abs(cut[:, -1] / cut[:, 0] - 1.0).max())
-        found.add("growth of the rate as the hopper empties", growth, high=10.0, unit="%")
-        found.add("rate / sqrt(g D^3)", float(cut.mean()), low=0.7, high=2.0)
-        found.must_break("whole cells: spread of the rate over places in the grid", spread(stairs), high=6.0, unit="%")
-
-    return attempt("sand oblique", f"hopper of {cells} cells", run)
+    found.add("spread of the rate over places in the grid", spread(cut), high=6.0, unit="%")
+    growth = 100.0 * float(np.abs(cut[:, -1] / cut[:, 0] - 1.0).max())
+    found.add("growth of the rate as the hopper empties", growth, high=10.0, unit="%")
+    found.add("rate / sqrt(g D^3)", float(cut.mean()), low=0.7, high=2.0)
+    found.must_break("whole cells: spread of the rate over places in the grid", spread(stairs), high=6.0, unit="%")
 
 
 def acceleration(angle: float, friction: float, cells: int, *, device: str = "cpu", whole: bool = False, shift: float = 0.0) -> float:

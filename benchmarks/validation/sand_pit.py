@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from warp_lcp.benchmarks.validation.tank import GRAVITY, positions, steps
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
 
-GRAVITY = 9.81  # [m/s^2]
 FRICTION_ANGLE = 30.0  # degrees
 WALL_FRICTION = math.tan(math.radians(FRICTION_ANGLE))
 WIDTH = 0.2  # [m]: of a column
 FLOOR = 2  # cells of the solid that columns stand on
 HEADROOM = 4  # cells above a column
-SHORTEST = 1e-9  # [s]: what rounding may leave before a time to reach
 CORRECTED: dict[str, Any] = {"density_correction": {}}
 TOLERANCE = 1e-3  # of the stresses [rho g dx]
 FRONT = 99.0  # percentile of the particles that is the front
 FULL = 0.5  # fraction of a cell that is part of a pile
 
 Row = dict[str, Any]
+__all__ = ["GRAVITY", "positions", "steps"]  # of all materials
 
 
 def create(
@@ -73,20 +73,6 @@ def column(
     ground = {"shape": "box", "min": [-1.0, -1.0], "max": [length * WIDTH + 1.0, FLOOR * dx], "friction": floor}
     tables = CORRECTED | {"material": {"friction_angle": angle}} | tables
     return create([nx * dx, ny * dx], max(nx, ny), [sand], [ground], device=device, **tables)
-
-
-def steps(simulation: SandSimulation, until: float) -> Iterator[Row]:
-    """Step to a time [s] and yield the rows of the log with `time` and `dt`."""
-    longest = simulation.scene.time.dt_max
-    while simulation.time < until - SHORTEST:
-        dt = min(simulation.stable_dt(), longest, until - simulation.time)
-        row = simulation.step(dt)
-        yield {"time": simulation.time, "dt": dt, **row}
-
-
-def positions(simulation: SandSimulation) -> np.ndarray:
-    """Return x and y [m] of the particles, shape (n, 2)."""
-    return np.array(simulation.particles.position.numpy()[:, :2], dtype=np.float64)
 
 
 def runout(simulation: SandSimulation) -> float:

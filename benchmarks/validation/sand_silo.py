@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
 from warp_lcp.benchmarks.validation.sand_pit import GRAVITY, Row, create
 from warp_lcp.granular.simulator import SandSimulation
 
@@ -41,21 +41,13 @@ Step = Callable[[SandSimulation, float], None]
 
 @dataclass(frozen=True)
 class Silo:
-    """What a silo bears.
+    """What a silo bears."""
 
-    Attributes:
-        depth: of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,).
-        load: the vertical stress there [rho g W], shape (rows,).
-        shear: what walls bear, upward, over the load, shape (rows,).
-        fell: how far the center of mass has gone at most, over the height.
-        rows: of the log.
-    """
-
-    depth: np.ndarray
-    load: np.ndarray
-    shear: np.ndarray
-    fell: float
-    rows: list[Row]
+    depth: np.ndarray  # of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,)
+    load: np.ndarray  # the vertical stress there [rho g W], shape (rows,)
+    shear: np.ndarray  # what walls bear, upward, over the load, shape (rows,)
+    fell: float  # how far the center of mass has gone at most, over the height
+    rows: list[Row]  # of the log
 
     def at(self, depth: float) -> float:
         """Return the vertical stress [rho g W] at a depth [widths]."""
@@ -72,64 +64,57 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [trial(n, dimension, device) for dimension, cells in RESOLUTIONS.items() for n in cells]
     trials += [slot(n, device) for n in RESOLUTIONS[2]] + [controls(RESOLUTIONS[2][0], device)]
-    curves: dict[str, Any] = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
+    curves: dict[str, Any] = curves_of(trials)
     depths = np.linspace(0.0, DEEP[2], 40).tolist()
     for ratio in RATIOS:
         curves[f"Janssen, mu = 0.5, K = {ratio:.2g}"] = (depths, [janssen(z, 0.5, ratio) for z in depths])
     title = "Vertical stress in a silo"
-    return trials, [Lines("sand-silo", title, "z / W", "sigma / (rho g W)", curves, logarithmic_x=False, logarithmic_y=False)]
+    return trials, [Lines("sand-silo", title, "z / W", "sigma / (rho g W)", curves, log="")]
 
 
-def trial(cells: int, dimension: int = 2, device: str = "cpu", frictions: tuple[float, ...] = FRICTIONS, deep: float = 0.0) -> Trial:
+@check_at("sand silo", "{cells} cells of width, {dimension}-D")
+def trial(
+    found: Findings, cells: int, dimension: int = 2, device: str = "cpu", frictions: tuple[float, ...] = FRICTIONS, deep: float = 0.0
+) -> None:
     """Compare what a silo bears with Janssen's law: as it is, with short steps, under a lid, and between walls without friction."""
-
-    def run(found: Findings) -> None:
-        more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3, "device": device}
-        depths = range(1, math.ceil(more["deep"]))
-        for friction in frictions:
-            bears(found, f"mu = {friction:g}", rest(fill(cells, friction, **more)), friction, depths, walls=2 * dimension - 2)
-        friction = frictions[len(frictions) // 2]
-        plain, short = (rest(fill(cells, friction, **more), tiny=tiny) for tiny in (0.0, TINY))
-        found.add(f"a step of {TINY:g} s every {PERIOD}: largest change of a load", change(plain, short, depths), high=0.02)
-        lid = rest(fill(cells, friction, lid=LOAD, **more))
-        left = np.array([lid.at(z) - plain.at(z) for z in depths])
-        found.add("a lid: what a width leaves of its load, at most", float((left[1:] / left[:-1]).max()), high=1.0)
-        found.add("a lid: what is left of its load one width down", left[0] / LOAD, low=0.0, high=1.0)
-        level = rest(fill(cells, 0.0, **more))
-        found.add("mu = 0: largest load off the weight above", max(abs(level.at(z) / z - 1.0) for z in depths), high=0.02)
-
-    return attempt("sand silo", f"{cells} cells of width, {dimension}-D", run)
+    more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3, "device": device}
+    depths = range(1, math.ceil(more["deep"]))
+    for friction in frictions:
+        bears(found, f"mu = {friction:g}", rest(fill(cells, friction, **more)), friction, depths, walls=2 * dimension - 2)
+    friction = frictions[len(frictions) // 2]
+    plain, short = (rest(fill(cells, friction, **more), tiny=tiny) for tiny in (0.0, TINY))
+    found.add(f"a step of {TINY:g} s every {PERIOD}: largest change of a load", change(plain, short, depths), high=0.02)
+    lid = rest(fill(cells, friction, lid=LOAD, **more))
+    left = np.array([lid.at(z) - plain.at(z) for z in depths])
+    found.add("a lid: what a width leaves of its load, at most", float((left[1:] / left[:-1]).max()), high=1.0)
+    found.add("a lid: what is left of its load one width down", left[0] / LOAD, low=0.0, high=1.0)
+    level = rest(fill(cells, 0.0, **more))
+    found.add("mu = 0: largest load off the weight above", max(abs(level.at(z) / z - 1.0) for z in depths), high=0.02)
 
 
-def slot(cells: int, device: str = "cpu") -> Trial:
+@check_at("sand silo", "{cells} cells between two walls, 3-D")
+def slot(found: Findings, cells: int, device: str = "cpu") -> None:
     """Compare a silo of two walls in 3-D with Janssen's law."""
-
-    def run(found: Findings) -> None:
-        bears(found, "mu = 0.5", rest(fill(cells, 0.5, deep=DEEP[3], deeper=SLOT, device=device)), 0.5, range(1, math.ceil(DEEP[3])))
-
-    return attempt("sand silo", f"{cells} cells between two walls, 3-D", run)
+    bears(found, "mu = 0.5", rest(fill(cells, 0.5, deep=DEEP[3], deeper=SLOT, device=device)), 0.5, range(1, math.ceil(DEEP[3])))
 
 
-def controls(cells: int, device: str = "cpu") -> Trial:
+@check_at("sand silo, wrong", "{cells} cells of width, 2-D")
+def controls(found: Findings, cells: int, device: str = "cpu") -> None:
     """Push sand up, which turns the walls' friction over, and pack and start solves as was done before: all must miss the law."""
-
-    def run(found: Findings) -> None:
-        depths = range(1, 6)
-        plain = rest(fill(cells, 0.5, device=device))
-        for label, silo in (
-            ("a floor that rises", rest(fill(cells, 0.5, rise=RISE, device=device))),
-            ("sand that is too dense is pushed out", rest(fill(cells, 0.5, device=device), each=_pack_as_before)),
-        ):
-            most = max(silo.at(z) / janssen(z, 0.5, RATIOS[0]) for z in depths)
-            found.must_break(f"{label}: largest load over that of K = 1/3", most, high=1.0 + BEYOND)
-            found.must_break(f"{label}: least shear of the walls, upward", float(silo.shear[silo.depth > NEAR].min()), low=0.0)
-            found.curves[label] = (silo.depth.tolist(), silo.load.tolist())
-        gaps = rest(fill(cells, 0.5, device=device), each=_close_all_gaps)
-        found.must_break("gaps of the sampling close: way of the center of mass over the height", gaps.fell, high=2e-4)
-        short = rest(fill(cells, 0.5, device=device), tiny=TINY, each=_keep_impulses)
-        found.must_break("impulses of steps of other lengths: largest change of a load", change(plain, short, depths), high=0.02)
-
-    return attempt("sand silo, wrong", f"{cells} cells of width, 2-D", run)
+    depths = range(1, 6)
+    plain = rest(fill(cells, 0.5, device=device))
+    for label, silo in (
+        ("a floor that rises", rest(fill(cells, 0.5, rise=RISE, device=device))),
+        ("sand that is too dense is pushed out", rest(fill(cells, 0.5, device=device), each=_pack_as_before)),
+    ):
+        most = max(silo.at(z) / janssen(z, 0.5, RATIOS[0]) for z in depths)
+        found.must_break(f"{label}: largest load over that of K = 1/3", most, high=1.0 + BEYOND)
+        found.must_break(f"{label}: least shear of the walls, upward", float(silo.shear[silo.depth > NEAR].min()), low=0.0)
+        found.curves[label] = (silo.depth.tolist(), silo.load.tolist())
+    gaps = rest(fill(cells, 0.5, device=device), each=_close_all_gaps)
+    found.must_break("gaps of the sampling close: way of the center of mass over the height", gaps.fell, high=2e-4)
+    short = rest(fill(cells, 0.5, device=device), tiny=TINY, each=_keep_impulses)
+    found.must_break("impulses of steps of other lengths: largest change of a load", change(plain, short, depths), high=0.02)
 
 
 def bears(found: Findings, label: str, silo: Silo, friction: float, depths: range, walls: int = 2) -> None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at
 from warp_lcp.benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, box, create, positions, steps, velocities
 
 RESOLUTIONS = (10, 20)  # cells of the layer's depth
@@ -21,17 +21,11 @@ SIZE = [1.4, 1.0]  # [m]
 
 @dataclass(frozen=True)
 class Slide:
-    """What became of a layer.
+    """What became of a layer."""
 
-    Attributes:
-        loss: of momentum along the wall, over the momentum at the start.
-        lift: mean way off the wall [cells].
-        way: mean way along the wall [cells].
-    """
-
-    loss: float
-    lift: float
-    way: float
+    loss: float  # of momentum along the wall, over the momentum at the start
+    lift: float  # mean way off the wall [cells]
+    way: float  # mean way along the wall [cells]
 
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
@@ -39,19 +33,16 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     return [trial(n, device) for n in RESOLUTIONS], []
 
 
-def trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+@check_at("slope", "{cells} cells of depth, {numerics.name}")
+def trial(found: Findings, cells: int, device: str, numerics: Numerics = SUB_CELL) -> None:
     """Let a layer slide on both kinds of wall; the control is a free-slip wall of whole cells, whose stairs stop it."""
-
-    def run(found: Findings) -> None:
-        for wall in ("separating", "free-slip"):
-            slide = along(cells, device, numerics, wall)
-            found.add(f"{wall}: way", slide.way, low=0.98 * WAY_IN_DEPTHS * cells, unit="cells")
-            found.add(f"{wall}: loss of momentum", 100.0 * slide.loss, high=0.1, unit="%")
-            found.add(f"{wall}: lift", abs(slide.lift), high=0.05, unit="cells")
-        stairs = along(cells, device, VOXEL, "free-slip")
-        found.must_break("whole cells, free-slip: loss of momentum", 100.0 * stairs.loss, high=0.1, unit="%")
-
-    return attempt("slope", f"{cells} cells of depth, {numerics.name}", run)
+    for wall in ("separating", "free-slip"):
+        slide = along(cells, device, numerics, wall)
+        found.add(f"{wall}: way", slide.way, low=0.98 * WAY_IN_DEPTHS * cells, unit="cells")
+        found.add(f"{wall}: loss of momentum", 100.0 * slide.loss, high=0.1, unit="%")
+        found.add(f"{wall}: lift", abs(slide.lift), high=0.05, unit="cells")
+    stairs = along(cells, device, VOXEL, "free-slip")
+    found.must_break("whole cells, free-slip: loss of momentum", 100.0 * stairs.loss, high=0.1, unit="%")
 
 
 def along(cells: int, device: str, numerics: Numerics, wall: str) -> Slide:

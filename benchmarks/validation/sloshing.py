@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt, check_at
 from warp_lcp.benchmarks.validation.signals import mode, period
 from warp_lcp.benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, VOXEL, Numerics, create, positions, steps
 
@@ -37,7 +37,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     curves = {"linear theory": (time.tolist(), np.cos(2.0 * math.pi * time / PERIOD).tolist())}
     for t in trials:
         curves |= t.curves
-    chart = Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, logarithmic_x=False, logarithmic_y=False)
+    chart = Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, log="")
     return [*trials, comparison], [chart]
 
 
@@ -46,23 +46,20 @@ def _error(trial: Trial, *, control: bool) -> float:
     return next((f.value for f in trial.findings if f.control is control), math.nan)
 
 
-def trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+@check_at("sloshing", "{cells} cells of depth, {numerics.name}")
+def trial(found: Findings, cells: int, device: str, numerics: Numerics = SUB_CELL) -> None:
     """Measure the period, the worst of some samples; the control is a surface of whole cells, which follows waves in stairs."""
-
-    def run(found: Findings) -> None:
-        for each in (numerics, VOXEL):
-            waves = [slosh(cells, device, each, seed) for seed in SEEDS]
-            periods = [period(*wave) for wave in waves]
-            worst = int(np.argmax(np.abs(np.array(periods) - PERIOD)))
-            error = 100.0 * abs(periods[worst] / PERIOD - 1.0)
-            time, elevation = waves[worst]
-            found.curves[f"{cells} cells, {each.name}, {periods[worst]:.4f} s"] = (time.tolist(), (elevation / AMPLITUDE).tolist())
-            if each is numerics:
-                found.add("error of the period", error, high=3.0, unit="%")
-            else:
-                found.must_break("whole cells: error of the period", error, high=8.0, unit="%")
-
-    return attempt("sloshing", f"{cells} cells of depth, {numerics.name}", run)
+    for each in (numerics, VOXEL):
+        waves = [slosh(cells, device, each, seed) for seed in SEEDS]
+        periods = [period(*wave) for wave in waves]
+        worst = int(np.argmax(np.abs(np.array(periods) - PERIOD)))
+        error = 100.0 * abs(periods[worst] / PERIOD - 1.0)
+        time, elevation = waves[worst]
+        found.curves[f"{cells} cells, {each.name}, {periods[worst]:.4f} s"] = (time.tolist(), (elevation / AMPLITUDE).tolist())
+        if each is numerics:
+            found.add("error of the period", error, high=3.0, unit="%")
+        else:
+            found.must_break("whole cells: error of the period", error, high=8.0, unit="%")
 
 
 def slosh(cells: int, device: str, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndarray, np.ndarray]:

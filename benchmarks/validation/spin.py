@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at
 from warp_lcp.benchmarks.validation.tank import GRAVITY, SUB_CELL, create, positions, steps
 from warp_lcp.benchmarks.validation.transfers import angular_momentum
 from warp_lcp.fluids import LiquidSimulation
@@ -60,35 +60,30 @@ def turning(simulation: LiquidSimulation) -> float:
     return whole - float(mean[0] * v[:, 1].sum() - mean[1] * v[:, 0].sum())
 
 
-def spinning(n: int, device: str) -> Trial:
+@check_at("spin", "spinning drop, {n} cells a meter")
+def spinning(found: Findings, n: int, device: str) -> None:
     """Let drops spin without gravity; the control has no law of bodies in flight."""
-
-    def run(found: Findings) -> None:
-        for transfer in TRANSFERS:
-            simulation = drop(n, device, transfer=transfer)
-            start, middle = turning(simulation), positions(simulation).mean(axis=0)
-            rows = [(row["time"], turning(simulation) / start, row["kinetic_energy"]) for row in steps(simulation, FLIGHT)]
-            times, kept, energies = np.array(rows).T
-            name = transfer.upper()
-            found.curves[f"{name}, {n} cells a meter"] = (times.tolist(), kept.tolist())
-            found.add(f"{name}: angular momentum after {FLIGHT} s, of that at the start", float(kept[-1]), low=KEPT[n], high=2.0 - KEPT[n])
-            found.add(
-                f"{name}: way of the center of mass",
-                float(np.linalg.norm(positions(simulation).mean(axis=0) - middle)),
-                high=1e-5,
-                unit="m",
-            )
-            found.add(f"{name}: largest rise of the kinetic energy in a step", float(np.diff(energies).max() / energies[0]), high=1e-3)
-        wrong = drop(n, device, keeps=False)
-        start = turning(wrong)
-        times, kept = np.array([(row["time"], turning(wrong) / start) for row in steps(wrong, FLIGHT)]).T
-        found.curves["APIC, control"] = (times.tolist(), kept.tolist())
-        found.must_break("APIC: angular momentum, bodies in flight left alone", float(kept[-1]), low=KEPT[n])
-
-    return attempt("spin", f"spinning drop, {n} cells a meter", run)
+    for transfer in TRANSFERS:
+        simulation = drop(n, device, transfer=transfer)
+        start, middle = turning(simulation), positions(simulation).mean(axis=0)
+        rows = [(row["time"], turning(simulation) / start, row["kinetic_energy"]) for row in steps(simulation, FLIGHT)]
+        times, kept, energies = np.array(rows).T
+        name = transfer.upper()
+        found.curves[f"{name}, {n} cells a meter"] = (times.tolist(), kept.tolist())
+        found.add(f"{name}: angular momentum after {FLIGHT} s, of that at the start", float(kept[-1]), low=KEPT[n], high=2.0 - KEPT[n])
+        found.add(
+            f"{name}: way of the center of mass", float(np.linalg.norm(positions(simulation).mean(axis=0) - middle)), high=1e-5, unit="m"
+        )
+        found.add(f"{name}: largest rise of the kinetic energy in a step", float(np.diff(energies).max() / energies[0]), high=1e-3)
+    wrong = drop(n, device, keeps=False)
+    start = turning(wrong)
+    times, kept = np.array([(row["time"], turning(wrong) / start) for row in steps(wrong, FLIGHT)]).T
+    found.curves["APIC, control"] = (times.tolist(), kept.tolist())
+    found.must_break("APIC: angular momentum, bodies in flight left alone", float(kept[-1]), low=KEPT[n])
 
 
-def parabolas(n: int, device: str) -> Trial:
+@check_at("spin", "thrown spinning drop, {n} cells a meter")
+def parabolas(found: Findings, n: int, device: str) -> None:
     """Throw drops that spin; the control has no law of bodies in flight."""
 
     def off(cfl: float, *, keeps: bool = True) -> float:
@@ -99,9 +94,6 @@ def parabolas(n: int, device: str) -> Trial:
         way = FLIGHT * LAUNCH - [0.0, 0.5 * GRAVITY * FLIGHT**2]
         return float(np.linalg.norm(positions(simulation).mean(axis=0) - start - way) / np.linalg.norm(way))
 
-    def run(found: Findings) -> None:
-        for cfl in (2.0, 8.0):
-            found.add(f"CFL {cfl:g}: center of mass off its parabola, of its way", off(cfl), high=1e-4)
-        found.must_break("CFL 2: the same, bodies in flight left alone", off(2.0, keeps=False), high=1e-4)
-
-    return attempt("spin", f"thrown spinning drop, {n} cells a meter", run)
+    for cfl in (2.0, 8.0):
+        found.add(f"CFL {cfl:g}: center of mass off its parabola, of its way", off(cfl), high=1e-4)
+    found.must_break("CFL 2: the same, bodies in flight left alone", off(2.0, keeps=False), high=1e-4)

@@ -1,4 +1,4 @@
-"""Small liquids in two dimensions: their scenes, and how they are stepped and looked at."""
+"""Small liquids in two dimensions: their scenes, and how they, and sand, are stepped and looked at."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.fluids import FluidsSimulator, LiquidScene, LiquidSimulation
+from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.simulation import Cells
 
 GRAVITY = 9.81  # [m/s^2]
@@ -78,15 +79,16 @@ def tilted(degrees: float) -> dict[str, list[float]]:
     return {"gravity": [GRAVITY * math.sin(angle), -GRAVITY * math.cos(angle)]}
 
 
-def steps(simulation: LiquidSimulation, until: float) -> Iterator[dict[str, Any]]:
+def steps(simulation: LiquidSimulation | SandSimulation, until: float) -> Iterator[dict[str, Any]]:
     """Step to a time [s] and yield the rows of the log with `time` and `dt`."""
+    longest = simulation.scene.time.dt_max
     while simulation.time < until - SHORTEST:
-        dt = min(simulation.stable_dt(), DT_MAX, until - simulation.time)
+        dt = min(simulation.stable_dt(), longest, until - simulation.time)
         row = simulation.step(dt)
         yield {"time": simulation.time, "dt": dt, **row}
 
 
-def positions(simulation: LiquidSimulation) -> np.ndarray:
+def positions(simulation: LiquidSimulation | SandSimulation) -> np.ndarray:
     """Return x and y [m] of the particles, shape (n, 2)."""
     return simulation.particles.position.numpy()[:, :2].astype(np.float64)
 

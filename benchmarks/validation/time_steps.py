@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.energy import Ledger
-from warp_lcp.benchmarks.record import Chart, Lines
+from warp_lcp.benchmarks.harness.record import Chart, Lines
 from warp_lcp.benchmarks.validation import sand_pit, tank
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.energy import Ledger
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
 from warp_lcp.benchmarks.validation.tank import SUB_CELL, VOXEL, box
 from warp_lcp.operators.grid_poisson import FLUID
 
@@ -28,29 +28,26 @@ Watched = Callable[[Any], None]
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [trial(n, device, what) for n in RESOLUTIONS for what in LONGEST]
-    curves = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
+    curves = curves_of(trials)
     title = "Energy of a collapse by the length of steps"
-    return trials, [Lines("time-steps", title, "t [s]", "energy / start", curves, logarithmic_x=False, logarithmic_y=False)]
+    return trials, [Lines("time-steps", title, "t [s]", "energy / start", curves, log="")]
 
 
-def trial(cells: int, device: str, what: str) -> Trial:
+@check_at("time steps", "{what}, {cells} cells")
+def trial(found: Findings, cells: int, device: str, what: str) -> None:
     """Halve the steps of a collapse; the controls push crowds apart within the step, and let gravity act for whole steps."""
-
-    def run(found: Findings) -> None:
-        lengths = LONGEST[what] * 0.5 ** np.arange(HALVINGS + 1)
-        runs = [collapse(what, cells, dt, device) for dt in lengths]
-        changes = [float(np.abs(a - b).max()) for (a, _), (b, _) in pairwise(runs)]
-        found.add("most that a step adds", max(gained for _, gained in runs), high=MOST, unit="of the total")
-        found.add("highest energy over that at the start", max(float(E.max()) for E, _ in runs), high=1.0 + MOST)
-        found.add("change by the last halving", changes[-1], high=CHANGE, unit="of the total")
-        found.add("change by the last halving over that by the first", changes[-1] / changes[0], high=1.0)
-        for dt, (energy, _) in zip(lengths, runs, strict=True):
-            found.curves[f"{what}, {1e3 * dt:g} ms"] = (MOMENTS.tolist(), energy.tolist())
-        if what in PUSHED_APART:
-            _, gained = collapse(what, cells, lengths[-1], device, change=PUSHED_APART[what])
-            found.must_break("old relaxation: most that a step adds", gained, high=MOST, unit="of the total")
-
-    return attempt("time steps", f"{what}, {cells} cells", run)
+    lengths = LONGEST[what] * 0.5 ** np.arange(HALVINGS + 1)
+    runs = [collapse(what, cells, dt, device) for dt in lengths]
+    changes = [float(np.abs(a - b).max()) for (a, _), (b, _) in pairwise(runs)]
+    found.add("most that a step adds", max(gained for _, gained in runs), high=MOST, unit="of the total")
+    found.add("highest energy over that at the start", max(float(E.max()) for E, _ in runs), high=1.0 + MOST)
+    found.add("change by the last halving", changes[-1], high=CHANGE, unit="of the total")
+    found.add("change by the last halving over that by the first", changes[-1] / changes[0], high=1.0)
+    for dt, (energy, _) in zip(lengths, runs, strict=True):
+        found.curves[f"{what}, {1e3 * dt:g} ms"] = (MOMENTS.tolist(), energy.tolist())
+    if what in PUSHED_APART:
+        _, gained = collapse(what, cells, lengths[-1], device, change=PUSHED_APART[what])
+        found.must_break("old relaxation: most that a step adds", gained, high=MOST, unit="of the total")
 
 
 def collapse(

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt, check_at
 from warp_lcp.benchmarks.validation.signals import order
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -104,19 +104,16 @@ def cloud(n: int, real: str, device: str, *, affine: bool) -> Cloud:
     return Cloud(grid, position, velocity, gradients, grid.faces(scalar), grid.faces(scalar))
 
 
-def round_trip(n: int, device: str) -> Trial:
+@check_at("transfers", "{n} cells")
+def round_trip(found: Findings, n: int, device: str) -> None:
     """Transfer to the grid and back; the control is PIC, which loses angular momentum."""
-
-    def run(found: Findings) -> None:
-        for real, (*_, limit) in REALS.items():
-            linear, angular = changes(cloud(n, real, device, affine=True))
-            found.add(f"APIC, {real}: change of momentum", linear, high=limit)
-            found.add(f"APIC, {real}: change of angular momentum", angular, high=limit)
-        linear, angular = changes(cloud(n, "float64", device, affine=False))
-        found.add("PIC, float64: change of momentum", linear, high=1e-12)
-        found.must_break("PIC, float64: change of angular momentum", angular, high=1e-5)
-
-    return attempt("transfers", f"{n} cells", run)
+    for real, (*_, limit) in REALS.items():
+        linear, angular = changes(cloud(n, real, device, affine=True))
+        found.add(f"APIC, {real}: change of momentum", linear, high=limit)
+        found.add(f"APIC, {real}: change of angular momentum", angular, high=limit)
+    linear, angular = changes(cloud(n, "float64", device, affine=False))
+    found.add("PIC, float64: change of momentum", linear, high=1e-12)
+    found.must_break("PIC, float64: change of angular momentum", angular, high=1e-5)
 
 
 def changes(c: Cloud) -> tuple[float, float]:

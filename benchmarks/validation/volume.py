@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.record import Chart, Lines
+from warp_lcp.benchmarks.harness.record import Chart, Lines
 from warp_lcp.benchmarks.validation import dam_break
 from warp_lcp.benchmarks.validation.enclosed import enclosed_cells
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
 from warp_lcp.benchmarks.validation.tank import PER_AXIS, SUB_CELL, Numerics, box, create, positions, steps
 from warp_lcp.fluids import LiquidSimulation
 
@@ -23,42 +23,36 @@ DAM_DURATION, DAM_AVERAGED = 3.0, 0.3  # [s]: the column of the dam break fills 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [*(trial(n, device) for n in RESOLUTIONS), *(dam_trial(n, device) for n in dam_break.RESOLUTIONS)]
-    curves = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
+    curves = curves_of(trials)
     title = "Volume of two columns that collapse"
-    return trials, [Lines("volume", title, "t [s]", "volume / start", curves, logarithmic_x=False, logarithmic_y=False)]
+    return trials, [Lines("volume", title, "t [s]", "volume / start", curves, log="")]
 
 
-def trial(resolution: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+@check_at("volume", "{resolution} cells, {numerics.name}")
+def trial(found: Findings, resolution: int, device: str, numerics: Numerics = SUB_CELL) -> None:
     """Compare the volume inside the surface with the one at the start; the control goes without the correction, which acts by itself."""
-
-    def run(found: Findings) -> None:
-        time, volume, density = collapse(resolution, device, numerics)
-        found.add("volume of the last 2 s over that at the start", _late(time, volume), low=0.98, high=1.02)
-        # of single cells, which a correction that acts where a thousandth of the liquid crowds leaves to themselves
-        found.add("mean of the largest densities", float(density.mean()), high=1.5)
-        found.curves["as it comes"] = (time.tolist(), volume.tolist())
-        time, volume, _ = collapse(resolution, device, numerics, **UNCORRECTED)
-        found.must_break("no correction: volume of the last 2 s over that at the start", _late(time, volume), low=0.8)
-        found.curves["no correction"] = (time.tolist(), volume.tolist())
-
-    return attempt("volume", f"{resolution} cells, {numerics.name}", run)
+    time, volume, density = collapse(resolution, device, numerics)
+    found.add("volume of the last 2 s over that at the start", _late(time, volume), low=0.98, high=1.02)
+    # of single cells, which a correction that acts where a thousandth of the liquid crowds leaves to themselves
+    found.add("mean of the largest densities", float(density.mean()), high=1.5)
+    found.curves["as it comes"] = (time.tolist(), volume.tolist())
+    time, volume, _ = collapse(resolution, device, numerics, **UNCORRECTED)
+    found.must_break("no correction: volume of the last 2 s over that at the start", _late(time, volume), low=0.8)
+    found.curves["no correction"] = (time.tolist(), volume.tolist())
 
 
-def dam_trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+@check_at("volume of the dam break", "{cells} cells of a, {numerics.name}")
+def dam_trial(found: Findings, cells: int, device: str, numerics: Numerics = SUB_CELL) -> None:
     """Compare the volume of Martin & Moyce's column when it has come to the far wall and back; the control goes without the correction."""
-
-    def run(found: Findings) -> None:
-        size, column = [dam_break.LENGTH * dam_break.A, dam_break.HEIGHT * dam_break.A], [dam_break.A, dam_break.N2 * dam_break.A]
-        for name, tables in (("", {}), ("no correction: ", UNCORRECTED)):
-            made = create(
-                numerics, size=size, resolution=round(dam_break.LENGTH * cells), liquid=[box([0.0, 0.0], column)], device=device, **tables
-            )  # fmt: skip
-            time, volume, _ = watch(made, DAM_DURATION)
-            judge = found.must_break if tables else found.add
-            late = float(volume[time > DAM_DURATION - DAM_AVERAGED].mean())
-            judge(f"{name}volume of the last .3 s over that at the start", late, low=0.98, high=1.02)
-
-    return attempt("volume of the dam break", f"{cells} cells of a, {numerics.name}", run)
+    size, column = [dam_break.LENGTH * dam_break.A, dam_break.HEIGHT * dam_break.A], [dam_break.A, dam_break.N2 * dam_break.A]
+    for name, tables in (("", {}), ("no correction: ", UNCORRECTED)):
+        made = create(
+            numerics, size=size, resolution=round(dam_break.LENGTH * cells), liquid=[box([0.0, 0.0], column)], device=device, **tables
+        )  # fmt: skip
+        time, volume, _ = watch(made, DAM_DURATION)
+        judge = found.must_break if tables else found.add
+        late = float(volume[time > DAM_DURATION - DAM_AVERAGED].mean())
+        judge(f"{name}volume of the last .3 s over that at the start", late, low=0.98, high=1.02)
 
 
 def collapse(resolution: int, device: str, numerics: Numerics, **tables: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from typing import Any
 
 from PIL import Image
 
-from warp_lcp.benchmarks.machine import cpu_model
+from warp_lcp.benchmarks.harness.machine import cpu_model
 
 DOCS = Path(__file__).parents[1]
 PAGE, FOLDER = DOCS / "gallery.md", DOCS / "gallery"

@@ -1,14 +1,16 @@
 """The account of a step's energy against what is known by hand, and steps of any length in the middle of small scenes."""
 
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from warp_lcp.benchmarks import short_steps
-from warp_lcp.benchmarks.energy import Ledger
 from warp_lcp.benchmarks.validation import flight, sand_pit, tank, time_steps
+from warp_lcp.benchmarks.validation.energy import Ledger
 from warp_lcp.benchmarks.validation.tank import DENSITY, SUB_CELL, VOXEL, box
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.simulator import simulators
 
 LENGTHS = (0.02, 1e-6, 0.013, 1e-4, 1e-4, 0.02)  # [s]
 STILL = {"gravity": [0.0, 0.0]}
@@ -54,6 +56,53 @@ def test_the_work_of_a_wall_that_sets_a_plug_in_motion_is_its_momentum_times_its
 TAP = {"shape": "box", "min": [0.0, 0.5], "max": [0.125, 0.625], "velocity": [1.5, 0.0]}
 
 
+SCENES = {  # cells along the longest side, and the time [s] whose parts are the moments
+    "balls-on-sand-2d": (48, 0.6), "carried-box-2d": (48, 0.7), "ceiling-drop": (32, 0.8), "column-collapse-2d": (48, 0.7),
+    "column-collapse": (24, 0.5), "dam-break-2d": (48, 1.2), "dam-break": (32, 0.8), "floating-bodies-2d": (64, 1.2),
+    "floating-bodies": (32, 0.8), "hourglass-2d": (48, 0.6), "hourglass": (28, 0.4), "inclined-layer": (32, 0.8),
+    "mesh-obstacle": (30, 0.6), "pouring-pile": (24, 1.2), "retracting-wall": (60, 1.8), "sand-on-mesh": (24, 0.4),
+    "sliding-slab": (32, 0.8), "splash-in-circle": (40, 1.2), "splash-in-square": (40, 1.0), "splash-unilateral": (80, 0.8),
+    "stirred-tank": (24, 0.8), "tap-and-drain": (32, 1.6), "water-labyrinth": (48, 1.6), "wave-maker": (120, 2.4),
+}  # fmt: skip
+SHORTER = (1e-6, 1e-5, 1e-4, 1e-3)  # [s], than the normal step
+MOST = 1e-3  # of the total that a step may add
+
+
+class Rise(NamedTuple):
+    """The energy that a step of a length [s] made, and what of it the density correction lifted, over the total."""
+
+    length: float
+    gained: float
+    displaced: float
+
+
+def along(ledger: Ledger, moments: list[float], dt_max: float) -> list[Rise]:
+    """Step from moment to moment, and try all lengths, and rows of short and normal steps in turns, at each."""
+    simulation, rises = ledger.simulation, list[Rise]()
+    for moment in moments:
+        while simulation.time < moment or simulation.step_count == 0:
+            ledger.step(min(simulation.stable_dt(), dt_max))
+        state, energy, total = simulation.state(), ledger.now, ledger.total()
+        normal = min(simulation.stable_dt(), dt_max)
+        rows: list[tuple[float, ...]] = [(length,) for length in (*(t for t in SHORTER if t < normal), normal)]
+        for row in [*rows, (0.0, 1e-6) * 2, (0.0, 1e-4) * 2]:
+            for length in row:
+                done = ledger.step(length or min(simulation.stable_dt(), dt_max))
+                rises.append(Rise(length, done.gained / total, done.displaced / total))
+            ledger.set_back(state, energy)
+    return rises
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
+def test_no_step_in_the_middle_of_a_scene_makes_energy(name: str) -> None:
+    cells, time = SCENES[name]
+    scene = load_scene(name, [f"domain.resolution={cells}"])
+    simulation: Any = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+    rises = along(Ledger(simulation), [0.05 * time, 0.5 * time, time], scene.time.dt_max)
+    assert max(rise.gained for rise in rises) < MOST
+
+
 @pytest.mark.parametrize("what", ["liquid and a tap", "unilateral", "sand"])
 def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
     """But for what the density correction lifts, which is a matter of positions and the same whatever the step."""
@@ -63,10 +112,9 @@ def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
     else:
         tables: dict[str, Any] = {"source": [TAP]} if what == "liquid and a tap" else {"pressure": {"model": "unilateral"}}
         simulation = tank.create(VOXEL, size=[1.0, 0.75], resolution=16, liquid=[box([0.0, 0.0], [0.375, 0.5])], **tables)
-    found = short_steps.along(Ledger(simulation), (0.02, 0.2), simulation.scene.time.dt_max)
+    found = along(Ledger(simulation), [0.02, 0.2], simulation.scene.time.dt_max)
     assert len(found) > 20
-    assert min(rise.length for rise in found) == 1e-6
-    assert max(rise.gained - rise.displaced for rise in found) < short_steps.MOST
+    assert max(rise.gained - rise.displaced for rise in found) < MOST
 
 
 @pytest.mark.parametrize("what", ["liquid, unilateral", "sand"])

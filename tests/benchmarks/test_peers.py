@@ -1,45 +1,44 @@
 """Peers: the same residual for all, the exchange with other interpreters, and what is said where one is missing."""
 
 import json
-import shutil
 import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import warp_lcp as wl
-from warp_lcp.benchmarks import chart
-from warp_lcp.benchmarks.implicit_mpm import NEWTON
-from warp_lcp.benchmarks.peers import foreign, linear, quadratic, suite
-from warp_lcp.benchmarks.peers.foreign import Home, PeerFailed, Worker
-from warp_lcp.benchmarks.peers.peer import Answer, Peer, Question
-from warp_lcp.benchmarks.peers.roster import PETSC, roster
+from warp_lcp.benchmarks import peers as suite
+from warp_lcp.benchmarks.peers import libraries, petsc
+from warp_lcp.benchmarks.peers.peer import Answer, Peer, PeerFailed, Question
+from warp_lcp.benchmarks.peers.petsc import Worker
+from warp_lcp.benchmarks.peers.roster import roster
 from warp_lcp.benchmarks.problems import splash
-from warp_lcp.benchmarks.record import Record, read_json, write_json
-from warp_lcp.benchmarks.suite import Suite
-from warp_lcp.benchmarks.timing import Figure
-from warp_lcp.benchmarks.workers import exchange
 from warp_lcp.cli import commands as cli
 
 STUB = """
 import os
-from warp_lcp.benchmarks.workers.exchange import serve
+import sys
+import types
+
+sys.modules["petsc4py"] = types.SimpleNamespace(PETSc=None)  # which the program imports, and `serve` does not use
+sys.path.append(sys.argv[1])
+from petsc_worker import serve
+
 
 def double(request):
     print("a library prints")
     os.system("echo and so does its C code")
     return {"x": 2 * request["x"]}
 
+
 def fail(request):
     raise ValueError("first line\\nsingular matrix")
 
-def end(request):
-    os._exit(7)
 
-def main():
-    serve("1.2", {"double": double, "fail": fail, "end": end}, (ValueError,))
+serve("1.2", {"double": double, "fail": fail, "end": lambda request: os._exit(7)}, (ValueError,))
 """
 
 
@@ -76,7 +75,7 @@ def test_question_is_the_problem(question):
 def test_peers_of_the_linear_solve_find_its_solution():
     question = Question(splash(12), "linear")
     x = np.linalg.solve(question.matrix.toarray(), -question.b)
-    for solve in (linear.pyamg_aggregation, linear.pyamg_classical, linear.scipy_cg, partial(linear.warp_cg, device="cpu")):
+    for solve in (libraries.pyamg_aggregation, libraries.pyamg_classical, libraries.scipy_cg, partial(libraries.warp_cg, device="cpu")):
         answer = solve(question, 1e-9)
         assert np.allclose(answer.x, x, atol=1e-7 * np.abs(x).max())
         assert answer.iterations > 0
@@ -86,7 +85,7 @@ def test_peers_of_the_linear_solve_find_its_solution():
 @pytest.mark.parametrize("name", ["osqp", "piqp", "clarabel"])
 def test_quadratic_programs_find_the_solution(name, question):
     pytest.importorskip(name)
-    answer = getattr(quadratic, name)(question, 1e-9)
+    answer = getattr(libraries, name)(question, 1e-9)
     x = dense_solution(question)
     assert question.residual(x) < 1e-12
     assert np.allclose(answer.x, x, atol=1e-4 * np.abs(x).max())
@@ -95,10 +94,10 @@ def test_quadratic_programs_find_the_solution(name, question):
 def test_amgcl_finds_the_solution():
     pytest.importorskip("pyamgcl")
     question = Question(splash(12), "linear")
-    assert question.residual(linear.amgcl(question, 1e-8).x) < 1e-7
+    assert question.residual(libraries.amgcl(question, 1e-8).x) < 1e-7
 
 
-@pytest.mark.skipif(PETSC.interpreter() is None, reason="no interpreter imports petsc4py")
+@pytest.mark.skipif(petsc.interpreter() is None, reason="no interpreter imports petsc4py")
 def test_petsc_finds_the_solutions(question):
     with roster("cpu") as there:
         peers = [p for p in there.peers if p.library == "petsc"]
@@ -115,16 +114,9 @@ def test_petsc_finds_the_solutions(question):
 
 
 @pytest.fixture
-def stub(tmp_path, monkeypatch):
-    folder = tmp_path / "benchmarks" / "workers"
-    folder.mkdir(parents=True)
-    (tmp_path / "benchmarks" / "__init__.py").touch()
-    (folder / "__init__.py").touch()
-    shutil.copy(exchange.__file__, folder)
-    (folder / "stub.py").write_text(STUB)
-    monkeypatch.setattr(foreign, "ROOT", tmp_path)
-    monkeypatch.chdir(tmp_path)  # `benchmarks` is then the one here, not the installed one
-    worker = Worker(Home("json", "WARP_LCP_NO_SUCH_VARIABLE", "stub", ""), sys.executable)
+def stub(tmp_path):
+    (tmp_path / "stub.py").write_text(STUB)
+    worker = Worker("json", [sys.executable, str(tmp_path / "stub.py"), str(Path(petsc.__file__).parent)])
     yield worker
     worker.close()
 
@@ -142,13 +134,13 @@ def test_exchange(stub):
 
 
 def test_a_missing_peer_tells_how_to_get_it(monkeypatch):
-    home = Home("no_such_module", "WARP_LCP_TEST_PYTHON", "stub", "pip install it")
-    assert home.interpreter() is None
-    assert home.missing() == "missing: no interpreter imports no_such_module; pip install it"
-    monkeypatch.setenv("WARP_LCP_TEST_PYTHON", "/no/such/python")
-    assert home.interpreter() is None
-    assert "/no/such/python, which WARP_LCP_TEST_PYTHON names, does not import no_such_module" in home.missing()
-    assert Home("json", "WARP_LCP_TEST_OTHER", "stub", "").interpreter() == sys.executable
+    monkeypatch.delenv(petsc.VARIABLE, raising=False)
+    assert petsc.interpreter("no_such_module") is None
+    assert petsc.missing().startswith("missing: no interpreter imports petsc4py; apt-get install")
+    monkeypatch.setenv(petsc.VARIABLE, "/no/such/python")
+    assert petsc.interpreter("json") is None
+    assert "/no/such/python, which WARP_LCP_PETSC_PYTHON names, does not import petsc4py" in petsc.missing()
+    assert petsc.interpreter("json", "WARP_LCP_TEST_OTHER") == sys.executable
 
 
 def contest(question, errors):
@@ -195,43 +187,3 @@ def test_suite_without_foreign_peers(tmp_path, monkeypatch):
     assert pyamg["figures"]["over_engine"]["value"] == pytest.approx(ratio)
     text = (tmp_path / "peers.md").read_text()
     assert "| linear: PETSc's CG+MG | >= 3 x | not measured here |  |" in text
-
-
-def test_sand_without_newton(tmp_path, monkeypatch):
-    monkeypatch.setenv("WARP_LCP_NEWTON_PYTHON", "/no/such/python")
-    arguments = ["bench", "sand", "--group", "implicit_mpm", "--out", str(tmp_path), "--repeat", "1", "--size", "16"]
-    result = CliRunner().invoke(cli.app, arguments)
-    assert result.exit_code == 0, result.stderr
-    records = read_json(tmp_path / "implicit_mpm.json")
-    ours, theirs = records["16 cells: warp_lcp"], records["16 cells: newton, defaults"]
-    assert theirs.facts["remark"].startswith("missing: /no/such/python, which WARP_LCP_NEWTON_PYTHON names, does not import newton")
-    assert ours.value("runout") > 0.05  # the column has spread
-    assert ours.value("height") < 0.25
-    assert "| newton's step (dense grid) over ours | >= 1 x | not measured here |  |" in (tmp_path / "implicit_mpm.md").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(NEWTON.interpreter() is None, reason="no interpreter imports newton")
-def test_newton_computes_the_same_collapse(tmp_path):
-    Suite("sand", "", groups={"implicit_mpm": ""}).run(device="cpu", out=tmp_path, sizes=(32,), repeat=1, group="implicit_mpm")
-    records = read_json(tmp_path / "implicit_mpm.json")
-    ours = records["32 cells: warp_lcp"]
-    for name in ("32 cells: newton, defaults", "32 cells: newton, dense grid"):
-        assert records[name].value("runout") == pytest.approx(ours.value("runout"), rel=0.1)
-        assert records[name].value("height") == pytest.approx(ours.value("height"), rel=0.1)
-
-
-def test_chart_takes_the_largest_size_with_peers(tmp_path):
-    taken = [(32, "PETSc", 0.1), (64, "PETSc", 0.8), (64, "ProjectedMultigrid", 0.02), (128, "ProjectedMultigrid", 0.1)]
-    records = [
-        Record(f"{n}^3 {bounds} {method}", {"total": Figure(seconds, "s")}, {"n": n, "bounds": bounds, "method": method})
-        for n, method, seconds in taken
-        for bounds in chart.TITLES
-    ]
-    assert chart.bars(records, "walls") == (64, {"ProjectedMultigrid": 0.02, "PETSc": 0.8})
-    write_json(tmp_path / "peers.json", records)
-    chart.main([str(tmp_path / "peers.json"), str(tmp_path / "chart.png")])
-    assert (tmp_path / "chart.png").read_bytes().startswith(b"\x89PNG")
-    write_json(tmp_path / "peers.json", [r for r in records if r.facts["method"] != "PETSc"])
-    with pytest.raises(SystemExit, match="no peer was measured on the problem linear"):
-        chart.main([str(tmp_path / "peers.json"), str(tmp_path / "chart.png")])

@@ -7,13 +7,11 @@ import pytest
 import warp as wp
 
 from warp_lcp import benchmarks
-from warp_lcp.benchmarks import machine, plots
-from warp_lcp.benchmarks.compare import bounds, comparison
-from warp_lcp.benchmarks.memory import array_bytes, resident_bytes
-from warp_lcp.benchmarks.record import Bars, Lines, Record, Table, read_json, write_json, write_markdown
-from warp_lcp.benchmarks.stopwatch import timed
-from warp_lcp.benchmarks.targets import Target, targets
-from warp_lcp.benchmarks.timing import Figure, in_turns, ratios
+from warp_lcp.benchmarks.harness import machine, report
+from warp_lcp.benchmarks.harness.compare import bounds, comparison
+from warp_lcp.benchmarks.harness.machine import array_bytes, resident_bytes
+from warp_lcp.benchmarks.harness.record import Bars, Lines, Record, Results, Table, Target, read_json, write_json
+from warp_lcp.benchmarks.harness.timing import Figure, in_turns, ratios, timed
 
 
 def record(name, *samples, **facts):
@@ -88,11 +86,11 @@ def test_report_and_charts(tmp_path):
         Bars("b", "bars", "s", {"one": 1.0, "two": 20.0}, limit=5.0, logarithmic=True),
         Lines("l", "lines", "x", "y", {"c": ([1, 2], [1e-3, 1e-5])}),
     ]
-    images = plots.draw(charts, tmp_path, "x")
+    images = report.draw(charts, tmp_path, "x")
     assert [image.name for image in images] == ["x-b.png", "x-l.png"]
     assert all(image.read_bytes().startswith(b"\x89PNG") for image in images)
     where = Record("machine", {}, {"date": "today", "hardware": {"cpu": "Z80"}})
-    write_markdown(tmp_path / "x.md", "Title", where, [Table("T", ["a", "b"], [["1", "2|3"]], "Remark.")], images)
+    report.write_markdown(tmp_path / "x.md", "Title", where, [Table("T", ["a", "b"], [["1", "2|3"]], "Remark.")], images)
     text = (tmp_path / "x.md").read_text()
     assert "# Title\n" in text
     assert "- hardware: cpu Z80" in text
@@ -101,9 +99,13 @@ def test_report_and_charts(tmp_path):
 
 
 def test_no_charts_without_matplotlib(tmp_path, monkeypatch):
-    monkeypatch.setattr(plots, "present", lambda name: False)
-    assert plots.draw([Bars("b", "bars", "s", {"one": 1.0})], tmp_path, "x") == []
+    monkeypatch.setattr(report, "present", lambda name: False)
+    assert report.draw([Bars("b", "bars", "s", {"one": 1.0})], tmp_path, "x") == []
     assert not machine.present("no-such-distribution")
+    where = Record("machine", {}, {"date": "today"})
+    said = report.write("x", "Title", Results([where], [], [Bars("b", "bars", "s", {"one": 1.0})]), tmp_path)
+    assert said[0].startswith("no plots: Matplotlib is missing (pip install")
+    assert {path.name for path in tmp_path.iterdir()} == {"x.json", "x.md"}
 
 
 def test_targets():
@@ -111,22 +113,6 @@ def test_targets():
     assert not Target("x", 2, Figure(1.5), at_least=True).met
     assert Target("x", 2, None).row() == ["x", "<= 2", "not measured here", ""]
     assert Target("x", 40, Figure.of([30.0, 41.0, 43.0]), " x", True).row() == ["x", ">= 40 x", "41 x (30 to 43)", "yes"]
-
-
-def test_table_of_targets_reads_other_suites(tmp_path):
-    solve = Record("128^3 unit linear ProjectedMultigrid", {"iterations": Figure(9), "pyamg_over_this": Figure(50.0)}, {"n": 128})
-    assert all(row[2] == "not measured here" for row in targets([solve], tmp_path).rows if "round trip" in row[0])
-    write_json(tmp_path / "run.json", [Record("particles, 3-D", {"round_trip": Figure(200.0, "ns")})])
-    rows = {row[0]: row[1:] for row in targets([solve], tmp_path).rows}
-    assert rows["particle-grid-particle round trip, sorted, 3-D"] == ["<= 150 ns", "200 ns", "no"]
-    assert rows["linear solve against PyAMG, set-up included"] == [">= 40 x", "50 x", "yes"]
-
-
-def test_table_of_targets_tells_that_the_code_differs(tmp_path):
-    solve = Record("64^3 unit linear ProjectedMultigrid", {"iterations": Figure(9)}, {"n": 64})
-    for digest, remark in (("a", ""), ("b", "Figures of the suite kernels are of another state of the code than those of the solves.")):
-        write_json(tmp_path / "kernels.json", [Record("machine", {}, {"source digest": digest})])
-        assert targets([Record("machine", {}, {"source digest": "a"}), solve], tmp_path).remark == remark
 
 
 def test_array_bytes_count_memory_once():
@@ -152,3 +138,10 @@ def test_kept_results_can_be_read():
     kept = sorted(Path(benchmarks.__file__).parent.glob("results/*/*.json"))
     assert all("machine" in read_json(path) and path.with_suffix(".md").is_file() for path in kept)
     assert all(read_json(path)["machine"].facts["hardware"]["cpu"] for path in kept)
+
+
+def test_kept_results_are_small():
+    kept = Path(benchmarks.__file__).parent / "results"
+    sizes = {path: path.stat().st_size for path in kept.rglob("*") if path.is_file()}
+    assert sum(sizes.values()) < 2e6
+    assert {path.suffix for path in sizes} == {".json", ".md", ".png"}

@@ -1,16 +1,17 @@
-"""The suite `scaling`: what fits, what grows how, and two devices beside each other."""
+"""The suite `scaling`: what fits, what grows how, and how far each precision gets."""
 
 import json
 
 import numpy as np
 import pytest
+import scipy.sparse.linalg
 from typer.testing import CliRunner
 
-from warp_lcp.benchmarks import scaling, side_by_side
-from warp_lcp.benchmarks.compare import comparison
-from warp_lcp.benchmarks.record import Record, write_json
-from warp_lcp.benchmarks.side_by_side import side_by_side as beside
-from warp_lcp.benchmarks.timing import Figure
+import warp_lcp as wl
+from warp_lcp.benchmarks import scaling
+from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.timing import Figure
+from warp_lcp.benchmarks.problems import BOUNDS, natural, splash
 from warp_lcp.cli import commands as cli
 
 
@@ -34,7 +35,7 @@ def test_sizes_stop_where_memory_ends(monkeypatch):
 
 def test_estimate_of_memory_bounds_what_a_solve_takes(tmp_path):
     records = measured(tmp_path, "--size", 48)
-    most = max(r["figures"]["bytes_per_cell"]["value"] for r in records.values() if "^3" in r["name"])
+    most = max(r["figures"]["bytes_per_cell"]["value"] for r in records.values() if "bytes_per_cell" in r["figures"])
     assert 30 < most < scaling.SOLVE_BYTES
 
 
@@ -60,38 +61,44 @@ def test_scaling(tmp_path):
     assert growth["figures"]["exponent_to_1e-06"]["samples"] == 2
     text = (tmp_path / "scaling.md").read_text()
     assert "| exponent of the seconds to 1e-6, linear, 16^3 to 24^3 | <= 1.05 | not measured here |  |" in text  # too small to be judged
-    assert (tmp_path / "scaling-seconds.png").is_file()
+    assert "| mixed precision: largest floor of any grid | <= 1e-08 |" in text
+    assert {path.name for path in tmp_path.glob("*.png")} == {"scaling-seconds.png", "scaling-floors.png"}
 
 
-def result(copy, seconds, device="cpu"):
-    machine = Record("machine", {"copy": Figure(copy, "GB/s")}, {"hardware": {"cpu": "Z80", "device": device}})
-    return {"machine": machine, "64^3 linear": Record("64^3 linear", {"to_1e-06": Figure.of(seconds, "s")})}
+def floors(n):
+    return {r.facts["precision"]: r for r in (scaling.floor(splash(n), "walls", p, "cpu") for p in scaling.PRECISIONS)}
 
 
-def test_side_by_side_is_limited_by_copying():
-    table = beside(result(10.0, [1.0, 1.0, 1.0]), result(100.0, [0.1, 0.2, 0.4], "cuda:0 a card"))
-    assert table.rows == [["64^3 linear", "to_1e-06", "1000.00", "200.00", "5.00 (2.50 to 10.00)", "50 %"]]
-    assert "A: cpu Z80, copying 10 GB/s" in table.remark
-    assert "B copies memory 10.00 times as fast" in table.remark
+def test_floors_grow_with_the_grid_and_shrink_with_the_precision():
+    small, large = floors(16), floors(48)
+    for found in (small, large):
+        single, mixed, double = (r.value("floor") for r in found.values())
+        assert single > 10 * scaling.REACHED
+        assert mixed < 1e-3 * scaling.REACHED
+        assert mixed == pytest.approx(double, rel=1.0)
+        assert {r.facts["status"] for r in found.values()} <= {"FLOOR", "STAGNATED"}
+    assert large["single"].value("floor") > 2.0 * small["single"].value("floor")
+    assert not scaling._failures([*small.values(), *large.values()])
 
 
-def test_side_by_side_refuses_what_it_cannot_compare():
-    other = result(10.0, [1.0])
-    other["machine"] = Record("machine")
-    with pytest.raises(ValueError, match="no copy bandwidth"):
-        beside(other, result(10.0, [1.0]))
-    with pytest.raises(ValueError, match="no time in common"):
-        beside({"machine": result(1.0, [1.0])["machine"]}, result(10.0, [1.0]))
+def test_a_solve_that_tells_another_residual_is_a_failure():
+    ended = Record("floor 16^3 walls mixed", {"floor": Figure(1e-7), "told": Figure(1e-15)}, {"precision": "mixed"})
+    lines = ["floor 16^3 walls mixed: ends at 1.00e-07", "floor 16^3 walls mixed: the solve tells 1.00e-15, x has 1.00e-07"]
+    assert scaling._failures([ended]) == lines
 
 
-def test_side_by_side_of_files(tmp_path):
-    a, b = tmp_path / "a.json", tmp_path / "b.json"
-    write_json(a, list(result(10.0, [1.0]).values()))
-    write_json(b, list(result(20.0, [0.5], "cuda:0 a card").values()))
-    side_by_side.main([str(a), str(b), "--out", str(tmp_path)])
-    assert "| 64^3 linear | to_1e-06 | 1000.00 | 500.00 | 2.00 (2.00 to 2.00) | 100 % |" in (tmp_path / "side-by-side.md").read_text()
-    assert "of what copying gains" in comparison(a, b)  # of different devices
-    assert "of what copying gains" not in comparison(a, a)
-    b.write_text("{")
-    with pytest.raises(SystemExit, match="no results of a benchmark"):
-        side_by_side.main([str(a), str(b), "--out", str(tmp_path)])
+@pytest.mark.parametrize("bounds", BOUNDS)
+def test_the_residual_is_that_of_the_matrix(bounds):
+    scene = splash(12)
+    fluid = scene.cells == wl.FLUID
+
+    def norm(x, bounds=bounds):
+        return np.linalg.norm(natural(scene.cells, scene.b, scene.lower(bounds), x))
+
+    x = np.random.default_rng(271).standard_normal(scene.cells.shape)
+    lower = np.broadcast_to(scene.lower(bounds), x.shape)
+    y = scene.matrix() @ x[fluid] + scene.b[fluid]
+    assert norm(x) == pytest.approx(np.linalg.norm(np.minimum(x[fluid] - lower[fluid], y)), rel=1e-12)
+    solved = np.zeros(x.shape)
+    solved[fluid] = scipy.sparse.linalg.spsolve(scene.matrix().tocsc(), -scene.b[fluid])
+    assert norm(solved, "linear") < 1e-12 * norm(0.0 * x, "linear") < norm(-solved, "linear")  # a wrong sign is seen

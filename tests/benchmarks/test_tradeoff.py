@@ -1,6 +1,5 @@
 """What accuracy costs: the settings, the Pareto front, and small suites."""
 
-import csv
 import gc
 import json
 from collections.abc import Iterator
@@ -10,8 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from warp_lcp.benchmarks import report, tradeoff, tuning
-from warp_lcp.benchmarks.timing import Options
+from warp_lcp.benchmarks import tradeoff
+from warp_lcp.benchmarks.harness import report
+from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.tradeoff import solves, steps
 from warp_lcp.benchmarks.tradeoff.runs import Runs, front_of
 from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
@@ -90,7 +90,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> None:
     asked = options(scene=scene)
     results = tradeoff.measure(asked, tmp_path)
-    report.write("tradeoff", tradeoff.TITLE, results, asked, tmp_path)
+    report.write("tradeoff", tradeoff.TITLE, results, tmp_path)
     records = {r["name"]: r for r in json.loads((tmp_path / "tradeoff.json").read_text())}
     ran = [r for r in records.values() if r.get("kind") == "run"]
     assert len(ran) == 5
@@ -104,28 +104,11 @@ def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> No
         assert errors[-1] < (0.1 if scene.startswith("dam") else 0.5) * errors[0]  # sand is known to 2e-4 at once
     if scene.startswith("dam"):
         assert records[f"{scene} solve reference"]["figures"]["residual"]["value"] < 1e-11
-    pages = {path.suffix for path in tmp_path.glob(f"tradeoff-{scene}*")}
-    assert pages == {".png", ".svg", ".csv"}
-    with (tmp_path / f"tradeoff-{scene}.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(ran) + len(solved) + 1
+    pages = {path.name for path in tmp_path.glob(f"tradeoff-{scene}*")}
+    assert pages == {f"tradeoff-{scene}-run-distance-to-finest.png", f"tradeoff-{scene}-solve-error.png"}
     text = (tmp_path / "tradeoff.md").read_text()
     assert "| Pareto" in text
     assert f"## {scene}: presets" in text
-
-
-def test_tuning_is_compared_with_all_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(tuning, "FRAMES", 3)
-    monkeypatch.setattr(tuning, "tune", lambda scene, **asked: real(scene, frames=3, **asked))
-    monkeypatch.setattr(tuning, "_all_settings", lambda *given: list(every(*given))[::9])
-    results = tuning.measure(options(scene="dam-break-2d"), tmp_path)
-    figures = results.records[1].figures
-    assert figures["swept"].value == 5
-    assert figures["ratio"].value >= 1.0  # the tuned settings are among those that the best is sought in
-    assert figures["distance"].value <= figures["bound"].value
-
-
-real, every = tuning.tune, tuning._all_settings
 
 
 def test_a_scene_is_for_suites_that_run_some() -> None:

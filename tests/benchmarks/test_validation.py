@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-import benchmarks.__main__ as process
+import warp_lcp.benchmarks.__main__ as process
 from warp_lcp.benchmarks import validation
-from warp_lcp.benchmarks.record import Lines
+from warp_lcp.benchmarks.harness.record import Lines
 from warp_lcp.benchmarks.suite import VALIDATION
 from warp_lcp.benchmarks.validation import ceiling, dam_break, rest, signals, slope, sloshing, transfers
 from warp_lcp.benchmarks.validation.enclosed import cumulative, enclosed_cells, filled_fraction
@@ -68,7 +68,7 @@ def test_a_simulation_that_ends_early_fails_its_check() -> None:
     assert not trial.passed
     assert trial.failures() == ["waves, 8 cells: no convergence"]
     assert trial.record().facts["error"] == "no convergence"
-    assert table([trial]).rows[-1] == ["waves", "8 cells", "error", "no convergence", "none", "NO"]
+    assert table("waves", "", [trial]).rows[-1] == ["waves, 8 cells", "error", "no convergence", "none", "NO"]
 
 
 def test_the_period_of_a_fading_wave_with_a_drift() -> None:
@@ -227,10 +227,10 @@ def test_a_layer_slides_along_a_slope_and_is_stopped_by_stairs() -> None:
 
 @pytest.mark.parametrize("error", [0.5, 2.0])
 def test_a_failed_check_ends_the_process_with_1_after_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float) -> None:
-    chart = Lines("waves", "waves", "t", "y", {"c": ([0.0, 1.0], [-1.0, 1.0])}, logarithmic_x=False, logarithmic_y=False)
+    chart = Lines("waves", "waves", "t", "y", {"c": ([0.0, 1.0], [-1.0, 1.0])}, log="")
     check = SimpleNamespace(check=lambda device: ([found(error, 3.0)], [chart]))
     monkeypatch.setattr(validation, "CHECKS", {"waves": check})
-    monkeypatch.setattr(process.launches, "install", lambda: None)
+    monkeypatch.setattr(validation, "KNOWN", {"waves": "steep"})
     monkeypatch.setattr(sys, "argv", ["benchmarks", "validation", "--out", str(tmp_path), "--repeat", "1"])
     if error > 1.0:
         with pytest.raises(SystemExit) as ended:
@@ -240,11 +240,11 @@ def test_a_failed_check_ends_the_process_with_1_after_its_files(tmp_path: Path, 
         process.main()
     records = {r["name"]: r for r in json.loads((tmp_path / "validation.json").read_text())}
     assert records["waves, 8 cells"]["passed"] is (error < 1.0)
-    assert "| waves | 8 cells | error |" in (tmp_path / "validation.md").read_text()
     assert (tmp_path / "validation-waves.png").is_file()
-    page = (tmp_path / "validation-report.html").read_text(encoding="utf-8")
-    assert f"{int(error < 1.0)} of 1 figures keep their tolerance" in page
-    assert "<polyline" in page
+    page = (tmp_path / "validation.md").read_text(encoding="utf-8")
+    assert "| waves, 8 cells | error |" in page
+    assert f"{int(error < 1.0)} of 1 figures keep their tolerance, and 1 of 1 negative controls fail theirs" in page
+    assert ("| waves, 8 cells: error = 2 % (<= 1 %) | steep |" in page) is (error > 1.0)
 
 
 def test_its_resolutions_are_its_own(tmp_path: Path) -> None:

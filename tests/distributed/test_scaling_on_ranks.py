@@ -5,9 +5,9 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from warp_lcp.benchmarks import distributed
-from warp_lcp.benchmarks.record import Record
-from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks import ranks
+from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.cli import commands as cli
 
 MAIN = "import sys; from warp_lcp.cli.commands import main; main()"
@@ -19,8 +19,8 @@ def records(file):
 
 def test_ranks_measure_what_one_process_does(mpi, tmp_path):
     done = mpi(2, "-c", MAIN, "bench", "scaling", "--engine", "petsc", "--size", 24, "--repeat", 1, "--out", tmp_path)
-    assert done.stdout.split() == [str(tmp_path / "distributed.json"), str(tmp_path / "distributed.md")]
-    found = records(tmp_path / "distributed.json")
+    assert done.stdout.split() == [str(tmp_path / "ranks.json"), str(tmp_path / "ranks.md")]
+    found = records(tmp_path / "ranks.json")
     for bounds in ("linear", "walls", "everywhere"):
         here = found[f"24^3 {bounds}, ranks: 2"]
         assert here["converged"] == 1
@@ -31,16 +31,16 @@ def test_ranks_measure_what_one_process_does(mpi, tmp_path):
         assert here["boxes"] in ("1 x 1 x 2", "1 x 2 x 1", "2 x 1 x 1")
         assert 0.0 <= here["resident_more"] < here["resident"]
     assert "ranks: 2" not in done.stdout
-    assert "| 24^3 | walls | 2 |" in (tmp_path / "distributed.md").read_text()
+    assert "| 24^3 | walls | 2 |" in (tmp_path / "ranks.md").read_text()
 
 
 def test_a_wrong_solution_is_seen(mpi):
     text = """
     import warp as wp
     wp.config.log_level = wp.LOG_ERROR
-    from warp_lcp.benchmarks import on_ranks
+    from warp_lcp.benchmarks import ranks
     from warp_lcp.distributed.ranks import Ranks
-    walls = on_ranks._cases(16, Ranks.world(), "cpu")[1]
+    walls = ranks.shared_cases(16, Ranks.world(), "cpu")[1]
     problem, solver, work = walls.build()
     import warp_lcp as wl
     x = wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-9), workspace=work).x.numpy()
@@ -54,28 +54,22 @@ def test_a_wrong_solution_is_seen(mpi):
 
 
 def test_it_starts_the_ranks_itself(mpi, tmp_path, monkeypatch):
-    monkeypatch.setattr(distributed, "RANKS", (1, 2))
-    results = distributed.measure(Options("cpu", (16,), 1, lambda text: None), tmp_path)
+    monkeypatch.setattr(ranks, "RANKS", (1, 2))
+    results = ranks.measure(Options("cpu", (16,), 1, lambda text: None), tmp_path)
     assert not results.failures
-    found = {r.name: r for r in results.records if "boxes" in r.facts}
-    assert {r.facts["ranks"] for r in found.values()} == {1, 2}
-    counts = [found[f"16^3 walls, ranks: {count}"].value("iterations_to_1e-06") for count in (1, 2)]
+    kept = {r.name: r for r in results.records if "boxes" in r.facts}
+    assert {r.facts["ranks"] for r in kept.values()} == {1, 2}
+    counts = [kept[f"16^3 walls, ranks: {count}"].value("iterations_to_1e-06") for count in (1, 2)]
     assert max(counts) - min(counts) <= 1
-    assert [t.title for t in results.tables] == ["Figures to reach", "Strong scaling", "Weak scaling", "Ranks and sizes"]
+    assert [t.title for t in results.tables] == ["Figures to reach", "Ranks and sizes"]
     assert [row[:3] for row in results.tables[1].rows if row[1] == "walls"] == [["16^3", "walls", "1"], ["16^3", "walls", "2"]]
 
 
-@pytest.mark.parametrize("arguments", [["kernels"], ["scaling", "--group", "floor"]])
+@pytest.mark.parametrize("arguments", [["kernels"], ["solvers"]])
 def test_other_suites_have_one_process(arguments, tmp_path):
     result = CliRunner().invoke(cli.app, ["bench", *arguments, "--engine", "petsc", "--out", str(tmp_path)])
     assert result.exit_code == 2
     assert "measures one process; use scaling" in result.stderr
-
-
-def test_grids_grow_with_the_ranks():
-    assert [distributed.weak_size(128, ranks) for ranks in (1, 2, 4, 8)] == [128, 160, 208, 256]
-    assert distributed.efficiency(1.0, 100, 1.0, 200, 8) == pytest.approx(1.0)
-    assert distributed.efficiency(1.0, 100, 2.0, 200, 8) == pytest.approx(0.5)
 
 
 def measured(n, ranks, seconds, count, memory, over):
@@ -84,10 +78,14 @@ def measured(n, ranks, seconds, count, memory, over):
     return Record("", {name: Figure(value) for name, value in figures.items()}, facts)
 
 
+def found(records):
+    return {(r.facts["n"], r.facts["bounds"], r.facts["ranks"]): r for r in records}
+
+
 def test_figures_to_reach(monkeypatch):
-    monkeypatch.setattr(distributed.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(ranks.os, "cpu_count", lambda: 2)
     kept = [measured(128, 1, 0.2, 8, 100.0, 1.2), measured(128, 2, 0.1, 9, 55.0, 0.7), measured(128, 4, 0.3, 10, 30.0, 2.0)]
-    table = distributed._targets(distributed._found(kept), [64, 128])
+    table = ranks.targets(found(kept), [64, 128])
     assert [row[2:] for row in table.rows] == [["2", "no"], ["2", "yes"], ["1.2", "yes"], ["0.55", "yes"]]
-    monkeypatch.setattr(distributed.os, "cpu_count", lambda: 1)
-    assert distributed._targets(distributed._found(kept), [128]).rows[1][2:] == ["not measured here", ""]
+    monkeypatch.setattr(ranks.os, "cpu_count", lambda: 1)
+    assert ranks.targets(found(kept), [128]).rows[1][2:] == ["not measured here", ""]

@@ -8,7 +8,7 @@ import scipy.optimize
 from scipy.spatial.transform import Rotation
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.inverse_kinematics import MODELS, OUTSIDE, compare, targets
+from kinematics_targets import MODELS, OUTSIDE, compare, targets
 from warp_lcp.gallery.articulated_figure import ArticulatedFigure, branching_figure, planar_chain, spatial_chain
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics, StepProblem
 from warp_lcp.problem.protocol import families

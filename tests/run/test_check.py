@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from warp_lcp.benchmarks.memory import array_bytes, forget_peak
+from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak
 from warp_lcp.cli import commands as cli
 from warp_lcp.files import claims
 from warp_lcp.fluids.simulator import FluidsSimulator

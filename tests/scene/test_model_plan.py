@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from typer.testing import CliRunner
 
-from warp_lcp.benchmarks import predictions
 from warp_lcp.benchmarks.models import offers
-from warp_lcp.benchmarks.timing import Options
 from warp_lcp.cli import commands as cli
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.run.check import check_scene
@@ -70,20 +66,6 @@ def test_every_built_in_scene_says_which_models_it_has(name: str) -> None:
     assert all(model.count == sum(solid.is_body for solid in scene.solid) for model in scene.models() if model.name == "rigid bodies")
     assert ("cut cells" in said) == (bool(scene.solid) and scene.domain.solids == "cut-cell")
     assert sum(word == "step" for word, _ in lines) == 1
-
-
-def test_predictions_are_measured_on_scenes_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Two scenes of a plane; one of space is left out."""
-    monkeypatch.setattr(predictions, "built_in_scenes", lambda: ["dam-break-2d", "dam-break", "column-collapse-2d"])
-    monkeypatch.setattr(predictions, "ENOUGH", 0.05)
-    results = predictions.measure(Options("cpu", (), 1, lambda text: None), tmp_path)
-    assert [record.name for record in results.records] == ["column-collapse-2d", "dam-break-2d"]
-    for record in results.records:
-        figures = {name: figure.value for name, figure in record.figures.items()}
-        assert figures["ratio"] == pytest.approx(figures["predicted"] / figures["measured"])
-        assert figures["iterations"] > 0.0
-        assert figures["predicted"] > 0.0
-    assert len(results.tables[0].rows) == 2
 
 
 def test_the_command_says_it_too() -> None:

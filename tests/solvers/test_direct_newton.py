@@ -9,7 +9,7 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import boxed, lemke, natural_residual
-from warp_lcp.benchmarks.small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
+from small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.solvers.lemke import BandedBasis, Basis
 

@@ -41,7 +41,7 @@ from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
 FAILED = 1
 WRONG_INPUT = 2
-RANKED_SUITE, RANKED_GROUP = "scaling", "distributed"  # what `bench --engine petsc` measures
+RANKED_SUITE = "scaling"  # what `bench --engine petsc` measures
 
 app = typer.Typer(
     name="warp-lcp",
@@ -325,7 +325,10 @@ def solve(
 @app.command()
 def bench(
     suite: Annotated[
-        str, typer.Argument(metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, models, tradeoff or validation.")
+        str,
+        typer.Argument(
+            metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, models, tradeoff, validation or extremes."
+        ),
     ],
     scene: Annotated[
         str | None, typer.Argument(metavar="[SCENE]", help="The scene of tradeoff; its own unless given.", show_default=False)
@@ -334,18 +337,6 @@ def bench(
     out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
     size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; may be repeated.", show_default=False)] = None,
     repeat: Annotated[int, typer.Option(min=1, metavar="K", help="Samples of each timing.")] = 5,
-    problems: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Replay the problems that `run --record-problems DIR` wrote.", show_default=False)
-    ] = None,
-    method: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="With --problems: a method; may be repeated.", show_default=False)
-    ] = None,
-    group: Annotated[
-        str,
-        typer.Option(
-            "--group", "--suite", metavar="GROUP", help="Other cases of SUITE: solvers has book, the book's appendix C.", show_default=False
-        ),
-    ] = "",
     engine: Annotated[
         Engine, typer.Option(help="petsc: scaling on 1, 2 and 4 ranks, or on those of `mpiexec -n N warp-lcp ...`.")
     ] = Engine.SINGLE,
@@ -357,7 +348,7 @@ def bench(
         typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
     ] = None,
 ) -> None:
-    """Measure this machine, or compare two results."""
+    """Measure this machine, or compare two results; says how long a suite takes on two cores, and what it needs, before it begins."""
     installed = benchmarks()
     if suite not in installed:
         _end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
@@ -365,17 +356,17 @@ def bench(
         chosen = device if engine is Engine.PETSC else choose_device(device)  # ranks choose for themselves
         if scene:
             load_scene(scene)
-    if engine is Engine.PETSC:
-        if group or suite != RANKED_SUITE:
-            _end(f"--engine petsc: the suite {group or suite} measures one process; use {RANKED_SUITE}", WRONG_INPUT)
-        group = RANKED_GROUP
+    shared = engine is Engine.PETSC
+    if shared and suite != RANKED_SUITE:
+        _end(f"--engine petsc: the suite {suite} measures one process; use {RANKED_SUITE}", WRONG_INPUT)
     try:
         if compare is not None:
             tell(installed[suite].compare(*compare))
             return
-        asked: dict[str, Any] = {} if problems is None and not method else {"problems": problems, "methods": tuple(method or ())}
-        asked |= ({"group": group} if group else {}) | ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
-        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, **asked)
+        asked: dict[str, Any] = ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
+        if not shared:  # every rank is here
+            tell(f"{suite}: {installed[suite].takes}", error=True)
+        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, shared=shared, **asked)
     except ValueError as error:
         _end(str(error), WRONG_INPUT)
     except RuntimeError as error:

@@ -10,10 +10,11 @@ from warp_lcp.scene.simulator import plug_ins
 
 @runtime_checkable
 class Benchmark(Protocol):
-    """A suite of measurements, found by its entry point."""
+    """A suite of measurements: its name, what it measures, and how long it takes and what it needs."""
 
     name: str
     summary: str
+    takes: str
 
     def run(
         self,
@@ -22,11 +23,9 @@ class Benchmark(Protocol):
         out: Path,
         sizes: tuple[int, ...] = (),
         repeat: int = 5,
-        problems: Path | None = None,
-        methods: tuple[str, ...] = (),
-        group: str = "",
         scene: str = "",
         seed: int | None = None,
+        shared: bool = False,
     ) -> list[Path]:
         """Measure, and return the files written to `out`: NAME.json, NAME.md and plots.
 
@@ -35,11 +34,9 @@ class Benchmark(Protocol):
             out: folder of the files.
             sizes: cells along a side; the suite's own without any.
             repeat: samples of each timing.
-            problems: folder of recorded problems to measure `methods` on instead.
-            methods: their names.
-            group: other cases of the suite, to measure instead; the files then have that name.
             scene: the only one to measure, of a suite that runs scenes; a name or a file.
             seed: first one of the random problems, of a suite that draws them; new ones without.
+            shared: measure on several ranks, of a suite that can.
 
         Raises:
             ValueError: an option is out of range.

@@ -47,7 +47,7 @@ The files are NumPy archives of plain arrays (`numpy.load`, no pickles). Cells a
 (A x)_i = shift_i x_i + sum of face (x_i - x_neighbor) over the faces of FLUID cell i that no SOLID cell touches. r is the 2-norm of
 d (x - clip(x - y / d, lower, upper)) with d the diagonal of A. `absolute_tolerance` has the unit of y.
 
-`warp_lcp.gallery.recorded.load(file)` gives the problem to Python; `warp-lcp bench solvers --problems FOLDER` replays methods on all.
+`warp_lcp.gallery.recorded.load(file)` gives the problem to Python; `warp-lcp solve FILE --method NAME` solves it.
 """
 
 

@@ -36,7 +36,7 @@ class NNCG(Settings):
     Unlike algorithm 8, x is projected onto the bounds after the move along p, so that iterates stay feasible; where bounds are affine in
     x, the unknowns that they depend on first: friction held at its limit by bounds before the move costs most of the acceleration (a box
     on others a thousand times lighter, 5,000 sweeps: 3e-3 of the first residual in place of 4e-11). No proof of convergence. On
-    64^3 cells to 1e-6 it took 250 sweeps where omega = 1 took 3,900, and the best omega, 1.9, 150 to 200 (`benchmarks.sweep_prices`).
+    64^3 cells to 1e-6 it took 250 sweeps where omega = 1 took 3,900, and the best omega, 1.9, 150 to 200.
 
     Args:
         direction: of its sweeps, "forward", "backward" or "symmetric".

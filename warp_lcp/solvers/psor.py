@@ -24,8 +24,8 @@ class ProjectedSOR(Settings):
 
     x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order otherwise. Converges for symmetric positive
     definite A and 0 < omega < 2 ([Book] 2.2.2). The iteration count grows with the grid: on 64^3 cells to 1e-3 and 1e-6 about 1,750 and
-    4,000 sweeps with omega = 1, 110 and 200 with the best omega, 1.9, where ProjectedMultigrid takes 5 and 8 cycles
-    (`benchmarks.sweep_prices`). A time step of an American put, 2,000 nodes on a line, takes 2,031 sweeps with omega = 1, 851 with 1.4,
+    4,000 sweeps with omega = 1, 110 and 200 with the best omega, 1.9, where ProjectedMultigrid takes 5 and 8
+    cycles. A time step of an American put, 2,000 nodes on a line, takes 2,031 sweeps with omega = 1, 851 with 1.4,
     124 with `advised_omega`: more than the 100 that StoppingCriteria allows unless told otherwise.
 
     Where A_ii = 0, x_i goes to the bound that the sign of y_i asks for, and stays where y_i = 0 or there is no such bound; where A_ii < 0

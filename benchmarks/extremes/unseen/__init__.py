@@ -5,66 +5,22 @@ Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept un
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from warp_lcp.benchmarks.extremes.problem import GridProblem
-from warp_lcp.benchmarks.extremes.unseen import domains, matrices, media, obstacles
+from warp_lcp.benchmarks.extremes.unseen import grids, matrices
 from warp_lcp.benchmarks.extremes.unseen.draw import Draw, Unseen, changed, solvable
 
 RESERVED = range(10_000, 20_000)  # seeds for acceptance
 FRESH = range(20_000, 1 << 31)  # seeds that a run draws from
-GRIDS: Mapping[str, Callable[[Draw], Any]] = {
-    "strip": domains.strip,
-    "vent": domains.vent,
-    "voxels-2d": domains.voxels_2d,
-    "voxels-3d": domains.voxels_3d,
-    "rectangles": domains.rectangles,
-    "bend": domains.bend,
-    "spiral": domains.spiral,
-    "maze": domains.maze,
-    "porous": domains.porous,
-    "film": domains.film,
-    "liquid": domains.liquid,
-    "periodic": domains.periodic,
-    "chain": domains.chain,
-    "handful": domains.handful,
-    "torsion": obstacles.torsion,
-    "membrane": obstacles.membrane,
-    "stairs": obstacles.stairs,
-    "ball": obstacles.ball,
-    "moving": obstacles.moving,
-    "lid": obstacles.lid,
-    "rough": obstacles.rough,
-    "dam": obstacles.dam,
-    "bearing": obstacles.bearing,
-    "rows": obstacles.rows,
-    "degenerate": obstacles.degenerate,
-    "lognormal": media.lognormal,
-    "checkerboard": media.checkerboard,
-    "inclusions": media.inclusions,
-    "anisotropic": media.anisotropic,
-    "flat-cells": media.flat_cells,
-    "cut-cells": media.cut_cells,
-    "shifted": media.shifted,
-    "scaled": media.scaled,
-}
-SURE_MATRICES: Mapping[str, Callable[[Draw], Any]] = {
-    "torsion-matrix": matrices.torsion_matrix,
-    "grid-matrix": matrices.grid_matrix,
-    "plate": matrices.plate,
-    "elastic": matrices.elastic,
-    "triangles": matrices.triangles,
-    "option": matrices.option,
-    "convection": matrices.convection,
-}
-HARD_MATRICES: Mapping[str, Callable[[Draw], Any]] = {
-    "linear-program": matrices.linear_program,
-    "quadratic-program": matrices.quadratic_program,
-    "skew": matrices.skew,
-    "nearly-skew": matrices.nearly_skew,
-    "least-squares": matrices.least_squares,
-}
+
+
+def _named(kinds: Iterable[Callable[[Draw], Any]]) -> dict[str, Callable[[Draw], Any]]:
+    return {make.__name__.replace("_", "-"): make for make in kinds}
+
+
+GRIDS, SURE_MATRICES, HARD_MATRICES = _named(grids.KINDS), _named(matrices.SURE), _named(matrices.HARD)
 KINDS = {**GRIDS, **SURE_MATRICES, **HARD_MATRICES}
 ALLOWANCE = {"lognormal": 1.5}
 WARM_EVERY = 3  # of how many seeds one is solved once more with b changed by 1 %

@@ -26,21 +26,13 @@ GENTLY = 0.01  # of the mean |b|: what a pool's b is raised by where its sum has
 
 @dataclass(frozen=True)
 class Unseen:
-    """A problem by kind and seed.
+    """A problem by kind and seed."""
 
-    Args:
-        kind: of `KINDS`.
-        seed: with the kind, all that it depends on.
-        problem: what is to be solved.
-        then: one that differs a little, to be solved from the solution of `problem`; None for none.
-        allowance: factor of the iterations that it may take.
-    """
-
-    kind: str
-    seed: int
-    problem: GridProblem | MatrixProblem
-    then: GridProblem | None = None
-    allowance: float = 1.0
+    kind: str  # of `KINDS`
+    seed: int  # with the kind, all that it depends on
+    problem: GridProblem | MatrixProblem  # what is to be solved
+    then: GridProblem | None = None  # one that differs a little, to be solved from the solution of `problem`; None for none
+    allowance: float = 1.0  # factor of the iterations that it may take
 
 
 class Draw:
@@ -130,25 +122,15 @@ def framed(inside: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Pools:
-    """Connected unknowns, and which of them no AIR, shift or bound holds.
+    """Connected unknowns, and which of them no AIR, shift or bound holds."""
 
-    Args:
-        label: pool of each unknown.
-        loose: whether a pool's constants are in the null space, by pool.
-        net: sum of b, by pool; 0 where that is rounding.
-        size: sum of |b|, by pool.
-        cells: unknowns, by pool.
-        below: whether one of a pool's lower bounds is finite.
-        above: whether one of its upper bounds is.
-    """
-
-    label: np.ndarray
-    loose: np.ndarray
-    net: np.ndarray
-    size: np.ndarray
-    cells: np.ndarray
-    below: np.ndarray
-    above: np.ndarray
+    label: np.ndarray  # pool of each unknown
+    loose: np.ndarray  # whether a pool's constants are in the null space, by pool
+    net: np.ndarray  # sum of b, by pool; 0 where that is rounding
+    size: np.ndarray  # sum of |b|, by pool
+    cells: np.ndarray  # unknowns, by pool
+    below: np.ndarray  # whether one of a pool's lower bounds is finite
+    above: np.ndarray  # whether one of its upper bounds is
 
     @staticmethod
     def of(exact: Exact) -> Pools:

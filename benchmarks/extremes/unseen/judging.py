@@ -27,7 +27,7 @@ from warp_lcp.benchmarks.extremes.case import (
 )
 from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
 from warp_lcp.benchmarks.extremes.unseen.draw import Unseen, equality
-from warp_lcp.benchmarks.record import Table
+from warp_lcp.benchmarks.harness.record import Table
 from warp_lcp.problem.protocol import families
 
 FAMILY = "unseen"
@@ -42,7 +42,7 @@ WARM_MORE = 1  # iterations that a warm start may take beyond a cold one
 METHOD_SECONDS = 120.0  # after which a method hangs on a small problem, compilers included
 GAVE_UP = Promise(Expected.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
 BROKEN = (ArithmeticError, TypeError, LookupError, AttributeError, np.linalg.LinAlgError)  # what no method may end with
-GRIDS_A_KIND, MATRICES_A_KIND = 9, 6
+GRIDS_A_KIND, MATRICES_A_KIND = 18, 10
 
 Solve = Callable[..., wl.SolveResult]
 
@@ -63,17 +63,11 @@ def solved(problem: GridProblem | MatrixProblem, solve: Solve, device: str, **mo
 
 @dataclass(frozen=True)
 class UnseenCase:
-    """A random problem given to the default method.
+    """A random problem given to the default method."""
 
-    Args:
-        kind: of problem.
-        seed: of it.
-        solve: stands in for `wl.solve`, where something wrong is to be caught.
-    """
-
-    kind: str
-    seed: int
-    solve: Solve = wl.solve
+    kind: str  # of problem
+    seed: int  # of it
+    solve: Solve = wl.solve  # stands in for `wl.solve`, where something wrong is to be caught
     family: str = FAMILY
     budget: float = 30.0
     precisions: tuple[str, ...] = ("mixed",)
@@ -137,15 +131,10 @@ def limit(equations: int | None, of: tuple[float, int], allowance: float) -> flo
 
 @dataclass(frozen=True)
 class EveryMethodCase:
-    """A small random problem given to every method that takes it: none may call something a solution that is none, or fail otherwise.
+    """A small random problem given to every method that takes it: none may call something a solution that is none, or fail otherwise."""
 
-    Args:
-        kind: of problem.
-        seed: of it.
-    """
-
-    kind: str
-    seed: int
+    kind: str  # of problem
+    seed: int  # of it
     family: str = METHODS_FAMILY
     budget: float = 180.0
     precisions: tuple[str, ...] = ("mixed",)
@@ -211,17 +200,8 @@ def summary(verdicts: Sequence[Verdict], first: int) -> tuple[Table, list[str]]:
     factor, more = OFTEN
     within = f"{share:.1%} of {len(counted)} grids take at most {factor:g} times the equality's iterations and {more}"
     remark = f"Seeds from {first} on, {len(own)} problems; {within}, the limit is {OFTEN_SHARE:.0%}. `--seed {first}` runs them again."
-    columns = (
-        "kind",
-        "number",
-        "failures",
-        "iterations, mean",
-        "most",
-        "equality, mean",
-        "worst ratio",
-        "warm beyond cold, most",
-        "slowest [s]",
-    )
+    columns = ["kind", "number", "failures", "iterations, mean", "most", "equality, mean", "worst ratio", "warm beyond cold, most"]
+    columns.append("slowest [s]")
     wrong = [f"{FAMILY}: only {within}"] if counted and share < OFTEN_SHARE else []
     return Table("Unseen problems", columns, [row for row in rows if row], remark), wrong
 

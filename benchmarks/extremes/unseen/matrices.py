@@ -2,53 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 import scipy.spatial
 
-from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
-from warp_lcp.benchmarks.extremes.unseen import domains, media, obstacles
+from warp_lcp.benchmarks.extremes.problem import MatrixProblem
+from warp_lcp.benchmarks.extremes.unseen import grids
 from warp_lcp.benchmarks.extremes.unseen.draw import Draw, solvable
 
-GRIDS = (obstacles.torsion, obstacles.stairs, obstacles.dam, domains.voxels_2d, domains.bend, media.anisotropic, media.shifted)
+GRIDS = (grids.torsion, grids.dam, grids.voxels, grids.shifted)
 SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # none, and the range of those that are tiny
-
-
-def from_grid(make: Callable[[Draw], GridProblem], draw: Draw) -> MatrixProblem:
-    """Return a grid's problem as a sparse matrix."""
-    exact = solvable(make(draw)).exact()
-    return MatrixProblem(matrix=exact.matrix, b=exact.b, lower=exact.lower, upper=exact.upper)
-
-
-def torsion_matrix(draw: Draw) -> MatrixProblem:
-    """Return elastic-plastic torsion as a sparse matrix."""
-    return from_grid(obstacles.torsion, draw)
 
 
 def grid_matrix(draw: Draw) -> MatrixProblem:
     """Return one of several grids as a sparse matrix."""
-    return from_grid(draw.of(*GRIDS), draw)
-
-
-def plate(draw: Draw) -> MatrixProblem:
-    """Return a plate over an obstacle: the biharmonic operator, clamped or simply supported."""
-    n = draw.whole(8, 90)
-    second = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
-    eye = scipy.sparse.eye_array(n)
-    laplace = scipy.sparse.kron(second, eye) + scipy.sparse.kron(eye, second)
-    matrix = laplace @ laplace
-    if draw.chance(0.5):  # clamped: the mirrored node beyond a border adds 2 to the diagonal beside it
-        edge = np.zeros(n)
-        edge[[0, -1]] = 2.0
-        matrix = matrix + scipy.sparse.diags_array(np.add.outer(edge, edge).ravel())
-    g = (np.arange(n) + 1) / (n + 1)
-    X, Y = np.meshgrid(g, g)
-    low = -draw.between(0.01, 0.1) - draw.between(0, 1) * ((X - draw.between(0.2, 0.8)) ** 2 + (Y - 0.5) ** 2)
-    b = draw.decades(10, 1e3) * (1.0 if draw.chance(0.6) else draw.smooth((n, n), 4)) * np.ones((n, n)) / (n + 1) ** 4
-    return MatrixProblem(matrix=matrix.tocsr(), b=b.ravel(), lower=low.ravel(), upper=draw.of(np.inf, 0.02))
+    exact = solvable(draw.of(*GRIDS)(draw)).exact()
+    return MatrixProblem(matrix=exact.matrix, b=exact.b, lower=exact.lower, upper=exact.upper)
 
 
 def stiffness(poisson: float) -> np.ndarray:
@@ -124,18 +95,6 @@ def option(draw: Draw) -> MatrixProblem:
     return MatrixProblem(matrix=A.tocsr(), b=b, lower=payoff)
 
 
-def convection(draw: Draw) -> MatrixProblem:
-    """Return an obstacle under diffusion and upwind convection."""
-    n = max(4, draw.side())
-    eye, ones = scipy.sparse.eye_array(n), np.ones(n)
-    parts = []
-    for wind in (draw.decades(1e-2, 1e2) / n, draw.decades(1e-2, 1e2) / n):
-        parts.append(scipy.sparse.diags_array([-(1 + wind) * ones[1:], (2 + wind) * ones, -ones[1:]], offsets=[-1, 0, 1]))
-    A = scipy.sparse.kron(parts[0], eye) + scipy.sparse.kron(eye, parts[1])
-    b = draw.load((n, n)) if draw.chance(0.5) else np.full((n, n), -draw.between(1, 50) / n**2)
-    return MatrixProblem(matrix=A.tocsr(), b=b.ravel(), upper=draw.of(np.inf, 0.1))
-
-
 def held(draw: Draw, matrix: Any) -> MatrixProblem:
     """Return the problem of a matrix whose solution is chosen: entries of x > 0 where y = 0 and the other way round."""
     n = matrix.shape[0]
@@ -165,14 +124,6 @@ def linear_program(draw: Draw) -> MatrixProblem:
     return held(draw, as_kind(draw, M))
 
 
-def quadratic_program(draw: Draw) -> MatrixProblem:
-    """Return the optimality conditions of a convex quadratic program, its Hessian perhaps singular, its other diagonal tiny."""
-    m, n = draw.whole(1, 100), draw.whole(1, 100)
-    B, A = draw.noise((n, max(1, int(n * draw.between(0.3, 1.5))))), draw.noise((m, n))
-    M = np.block([[B @ B.T / n, -A.T], [A, small_diagonal(draw) * np.eye(m)]])
-    return held(draw, as_kind(draw, M))
-
-
 def skew(draw: Draw) -> MatrixProblem:
     """Return a skew matrix with a small diagonal."""
     n = draw.whole(2, 120)
@@ -180,15 +131,12 @@ def skew(draw: Draw) -> MatrixProblem:
     return held(draw, as_kind(draw, (C - C.T) / np.sqrt(n) + small_diagonal(draw) * np.eye(n)))
 
 
-def nearly_skew(draw: Draw) -> MatrixProblem:
-    """Return a skew matrix and a positive definite one, 10^-4 to 1 of its size."""
-    n = draw.whole(2, 120)
-    B, C = draw.rng.standard_normal((2, n, n))
-    return held(draw, as_kind(draw, (C - C.T) / np.sqrt(n) + draw.decades(1e-4, 1) * (B @ B.T / n + 1e-3 * np.eye(n))))
-
-
 def least_squares(draw: Draw) -> MatrixProblem:
     """Return nonnegative least squares: B'B of full or lower rank, columns of any length."""
     n = draw.whole(2, 150)
     B = draw.noise((max(1, int(n * draw.between(0.4, 3))), n)) * 10.0 ** draw.rng.uniform(-draw.of(0, 1, 3), 0, n)
     return MatrixProblem(matrix=B.T @ B, b=-B.T @ (draw.noise((len(B),)) + draw.between(0, 2)))
+
+
+SURE = (grid_matrix, elastic, triangles, option)
+HARD = (linear_program, skew, least_squares)

@@ -1,0 +1,75 @@
+"""New figures over old ones, with bounds of noise from the repeated samples of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from warp_lcp.benchmarks.harness.record import MACHINE, Record, read_json
+from warp_lcp.benchmarks.harness.timing import Figure
+
+ALLOWED = 0.25  # share of a ratio to a peer that may be lost
+# ratios of a peer's time to ours, of the same rounds: what is compared across states of the code and across machines
+TO_PEERS = ("pyamg_over_this", "over_engine", "over_ours", "over Numba product", "over Numba product, constant diagonal")
+
+
+def bounds(old: Figure, new: Figure) -> tuple[float, float]:
+    """Return the smallest and the largest ratio new / old that the samples allow."""
+    old_low, old_high = (old.value, old.value) if old.low is None or old.high is None else (old.low, old.high)
+    new_low, new_high = (new.value, new.value) if new.low is None or new.high is None else (new.low, new.high)
+    return new_low / old_high, new_high / old_low
+
+
+def verdict(low: float, high: float) -> str:
+    """Return what the bounds of a ratio say."""
+    if low > 1:
+        return "more"
+    return "less" if high < 1 else "within noise"
+
+
+def losses(old: Mapping[str, Record], new: Mapping[str, Record], allowed: float = ALLOWED) -> list[str]:
+    """Return the ratios to peers that fell by more than `allowed`, whatever samples of the two are taken; a line each."""
+    found = []
+    for name in (n for n in old if n in new):
+        for label in (f for f in TO_PEERS if f in old[name].figures and f in new[name].figures):
+            before, after = old[name].figures[label], new[name].figures[label]
+            low, high = bounds(before, after)
+            if high < 1 - allowed:
+                found.append(f"{name}: {label} {before} fell to {after}, to [{low:.2f}, {high:.2f}] of it")
+    return found
+
+
+def comparison(old: Path, new: Path) -> str:
+    """Return a table of the figures that both files have.
+
+    Raises:
+        ValueError: a file is no result of a suite, or they have no figure in common.
+    """
+    before, after = read_json(old), read_json(new)
+    lines = [f"{'record':<72} {'figure':<18} {'old':>11} {'new':>11} {'new/old':>8}  {'noise':<17} change"]
+    for name in (n for n in before if n in after):
+        figures = after[name].figures
+        for label, figure in before[name].figures.items():
+            other = figures.get(label)
+            if other is None or figure.value <= 0 or other.value <= 0 or (figure.low or figure.value) <= 0:
+                continue
+            low, high = bounds(figure, other)
+            ratio, noise = other.value / figure.value, f"[{low:.3f}, {high:.3f}]"
+            numbers = f"{figure.value:>11.4g} {other.value:>11.4g} {ratio:>8.3f}"
+            lines.append(f"{name:<72} {label:<18} {numbers}  {noise:<17} {verdict(low, high)}")
+    if len(lines) == 1:
+        raise ValueError(f"{old} and {new} have no figure in common")
+    lost = losses(before, after)
+    lines += [f"lost against a peer: {line}" for line in lost]
+    if not lost and any(f in r.figures for r in after.values() for f in TO_PEERS):
+        lines.append(f"no ratio to a peer fell by more than {100 * ALLOWED:.0f} % beyond noise")
+    machines = [_hardware(r) for r in (before, after)]
+    if machines[0] != machines[1]:
+        lines.append(f"not the same machine: {machines[0]} and {machines[1]}; compare ratios to peers, not seconds")
+    return "\n".join(lines)
+
+
+def _hardware(records: Mapping[str, Record]) -> str:
+    """Return processor and device that a result was measured on."""
+    hardware = records[MACHINE].facts.get("hardware", {}) if MACHINE in records else {}
+    return ", ".join(str(hardware[part]) for part in ("cpu", "device") if part in hardware)

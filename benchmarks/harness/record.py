@@ -1,0 +1,143 @@
+"""What a suite finds: records of figures, tables and charts of them, figures to reach, and the file that keeps the records."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from warp_lcp.benchmarks.harness.timing import Figure
+
+SOURCE = "source digest"  # fact of that record: which state of the code was measured
+MACHINE = "machine"  # name of the record that says where and when the others were measured
+
+
+@dataclass(frozen=True)
+class Record:
+    """Figures of one thing that was measured."""
+
+    name: str  # unique in its file, the same in later ones, so that they can be compared
+    figures: dict[str, Figure] = field(default_factory=dict)  # by name
+    facts: dict[str, Any] = field(default_factory=dict)  # what is no number
+
+    def value(self, figure: str) -> float | None:
+        """Return a figure's value, None if there is no such figure."""
+        found = self.figures.get(figure)
+        return None if found is None else found.value
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a report: `rows` of cells under `columns`."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class Bars:
+    """A bar chart: one value a label; `limit` is drawn as a line."""
+
+    name: str
+    title: str
+    unit: str
+    values: Mapping[str, float]
+    limit: float | None = None
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Curves over x and y, logarithmic along the axes in `log`; those in `marked` are drawn as points."""
+
+    name: str
+    title: str
+    x_label: str
+    y_label: str
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    log: str = "xy"
+    marked: frozenset[str] = frozenset()
+
+
+Chart = Bars | Lines
+
+
+@dataclass(frozen=True)
+class Results:
+    """All that a suite found."""
+
+    records: list[Record]  # for the file
+    tables: list[Table]  # for the report
+    charts: list[Chart] = field(default_factory=list)  # to draw
+    failures: list[str] = field(default_factory=list)  # what is not as it must be, a line each; the suite then ends with an error
+
+
+@dataclass(frozen=True)
+class Target:
+    """A figure to reach: `figure` is at most the limit, or at least; None was not measured here."""
+
+    what: str
+    limit: float
+    figure: Figure | None
+    unit: str = ""
+    at_least: bool = False
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the median meets it."""
+        if self.figure is None:
+            return None
+        return self.figure.value >= self.limit if self.at_least else self.figure.value <= self.limit
+
+    def row(self) -> list[str]:
+        """Return the row of the table."""
+        goal = f"{'>=' if self.at_least else '<='} {self.limit:g}{self.unit}"
+        if self.figure is None:
+            return [self.what, goal, "not measured here", ""]
+        measured = f"{self.figure.value:.3g}{self.unit}"
+        if self.figure.low is not None and self.figure.high is not None and self.figure.samples > 1:
+            measured += f" ({self.figure.low:.3g} to {self.figure.high:.3g})"
+        return [self.what, goal, measured, "yes" if self.met else "no"]
+
+
+def table_of_targets(what: str, targets: Sequence[Target], remark: str = "") -> Table:
+    """Return the table of figures to reach."""
+    return Table("Figures to reach", [what, "target", "measured", "met?"], [t.row() for t in targets], remark)
+
+
+def shown(record: Record, figures: Sequence[str], digits: str = ".3g", factor: float = 1.0) -> list[str]:
+    """Return figures' values as a table shows them, empty where there is none."""
+    return ["" if (v := record.value(name)) is None else f"{factor * v:{digits}}" for name in figures]
+
+
+def spread(figure: Figure, factor: float = 1.0, digits: str = ".1f") -> str:
+    """Return the range of the samples."""
+    return f"{factor * (figure.low or 0):{digits}} to {factor * (figure.high or 0):{digits}}"
+
+
+def write_json(path: Path, records: Sequence[Record]) -> None:
+    """Write records as a JSON list, one a line."""
+    kept = [{"name": r.name, "figures": {k: f.as_dict() for k, f in r.figures.items()}, **r.facts} for r in records]
+    path.write_text("[\n" + ",\n".join(map(json.dumps, kept)) + "\n]\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> dict[str, Record]:
+    """Return the records of a file by name.
+
+    Raises:
+        ValueError: it cannot be read or is no result of a suite.
+    """
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        records = [Record(r["name"], {k: Figure.from_dict(f) for k, f in r["figures"].items()}, _facts(r)) for r in kept]
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: no results of a benchmark: {error}") from error
+    return {record.name: record for record in records}
+
+
+def _facts(kept: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in kept.items() if k not in ("name", "figures")}

@@ -1,0 +1,106 @@
+"""Write what a suite found: SUITE.json, SUITE.md and, where Matplotlib is there, SUITE-*.png."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from warp_lcp.benchmarks.harness.machine import present
+from warp_lcp.benchmarks.harness.record import MACHINE, Bars, Chart, Lines, Record, Results, Table, write_json
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLOR, LIMIT = "#3a6ea5", "#b3432b"
+SHADES = 64  # colors of a picture
+MARKERS = 100  # points of a curve from which on they are not marked
+STYLES = ("-", "--", ":")  # of ten curves each, which have a color of their own
+CROWDED = 10  # curves from which on their names are beside the axes
+NO_PLOTS = "no plots: Matplotlib is missing (pip install 'warp-lcp[peers]')"
+
+
+def write(name: str, title: str, results: Results, out: Path) -> list[str]:
+    """Write the files and return remarks for the user."""
+    machine = next(r for r in results.records if r.name == MACHINE)
+    write_json(out / f"{name}.json", results.records)
+    images = draw(results.charts, out, name)
+    write_markdown(out / f"{name}.md", title, machine, results.tables, images)
+    missing = [] if present("matplotlib") else [NO_PLOTS]
+    return [*missing, f"wrote {out / name}.json, {name}.md and {len(images)} plots"]
+
+
+def write_markdown(path: Path, title: str, machine: Record, tables: Sequence[Table], images: Sequence[Path]) -> None:
+    """Write a report."""
+    lines = [f"# {title}", "", *(f"- {name}: {_text(value)}" for name, value in machine.facts.items()), ""]
+    for table in tables:
+        lines += [f"## {table.title}", "", *markdown(table), ""]
+    lines += [f"![{image.stem}]({image.name})\n" for image in images]
+    path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+def markdown(table: Table) -> list[str]:
+    """Return the lines of a table below its title."""
+    head = [table.remark, ""] if table.remark else []
+    return [*head, _row(table.columns), _row(["---"] * len(table.columns)), *map(_row, table.rows)]
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+
+
+def _text(value: Any) -> str:
+    return ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, Mapping) else str(value)
+
+
+def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
+    """Write a PNG file for each chart, none where Matplotlib is missing; return them."""
+    if not present("matplotlib"):
+        return []
+    from matplotlib.figure import Figure as Canvas
+    from PIL import Image  # Matplotlib needs it
+
+    images = []
+    for chart in charts:
+        size = (11, max(2.5, 0.18 * len(chart.values)) + 0.8) if isinstance(chart, Bars) else (8, 5.3)
+        canvas: Any = Canvas(figsize=size, dpi=90, layout="constrained")
+        if isinstance(chart, Bars):
+            _bars(canvas.add_subplot(), chart)
+        else:
+            _lines(canvas.add_subplot(), chart)
+        canvas.suptitle(chart.title, fontsize=10)
+        images.append(out / f"{prefix}-{chart.name}.png")
+        with io.BytesIO() as drawn:
+            canvas.savefig(drawn)
+            Image.open(drawn).convert("RGB").quantize(SHADES).save(images[-1], optimize=True)  # a third of the bytes
+    return images
+
+
+def _bars(axes: Axes, chart: Bars) -> None:
+    labels = list(chart.values)[::-1]
+    axes.barh(labels, [chart.values[label] for label in labels], color=COLOR)
+    if chart.limit is not None:
+        axes.axvline(chart.limit, color=LIMIT, linewidth=1)
+    if chart.logarithmic:
+        axes.set_xscale("log")
+    axes.set_xlabel(chart.unit)
+    axes.tick_params(axis="y", labelsize=7)
+    axes.margins(y=0.01)
+
+
+def _lines(axes: Axes, chart: Lines) -> None:
+    for number, (label, (x, y)) in enumerate(chart.curves.items()):
+        if label in chart.marked:
+            axes.plot(x, y, marker="o", linestyle="none", fillstyle="none", color="black", label=label)
+        else:
+            axes.plot(x, y, marker="." if len(x) < MARKERS else "", linestyle=STYLES[number // 10 % len(STYLES)], label=label)
+    if "y" in chart.log:
+        axes.set_yscale("log")
+    if "x" in chart.log:
+        axes.set_xscale("log")
+    axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label)
+    axes.grid(alpha=0.3)
+    beside = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)} if len(chart.curves) >= CROWDED else {}
+    axes.legend(fontsize=7, **beside)

@@ -1,0 +1,134 @@
+"""Seconds of things that are compared: measured in turns, so that a slow moment of a shared machine hits all of them."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import warp as wp
+
+SHORTEST_SAMPLE = 2e-3  # [s]: a sample repeats shorter work up to this, clock and launch would show otherwise
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a suite is asked for."""
+
+    device: str  # Warp device
+    sizes: tuple[int, ...]  # cells along a side; empty for the suite's own
+    repeat: int  # samples of each timing
+    say: Callable[[str], object]  # takes a line about progress
+    scene: str = ""  # the one to measure, its name or file; empty for the suite's own
+    seed: int | None = None  # first one of random problems; None for one that was never drawn
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A measured or counted number."""
+
+    value: float  # the median
+    unit: str = ""  # of value, low and high; empty for counts and ratios
+    low: float | None = None  # smallest sample
+    high: float | None = None  # largest sample
+    samples: int = 1  # how many there were
+
+    @staticmethod
+    def of(samples: Sequence[float], unit: str = "") -> Figure:
+        """Return the median with its range."""
+        return Figure(statistics.median(samples), unit, min(samples), max(samples), len(samples))
+
+    def as_dict(self) -> dict[str, float | int | str]:
+        """Return what a file keeps."""
+        kept: dict[str, float | int | str] = {"value": self.value, "unit": self.unit}
+        if self.low is not None and self.high is not None:
+            kept |= {"min": self.low, "max": self.high, "samples": self.samples}
+        return kept
+
+    @staticmethod
+    def from_dict(kept: Mapping[str, float | int | str]) -> Figure:
+        """Return what a file keeps as a figure."""
+        low, high = (float(kept[name]) if name in kept else None for name in ("min", "max"))
+        return Figure(float(kept["value"]), str(kept.get("unit", "")), low, high, int(kept.get("samples", 1)))
+
+    def __str__(self) -> str:
+        """Return the number with its range."""
+        text = f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}"
+        return text if self.low is None or self.samples == 1 else f"{text} ({self.low:.4g} to {self.high:.4g})"
+
+
+def in_turns(work: Mapping[str, Callable[[], object]], repeat: int) -> dict[str, list[float]]:
+    """Return the seconds of each piece of work, `repeat` samples each, one of each in every round.
+
+    An unmeasured run comes before each sample, so that what fits into the caches is there for all, whatever ran before.
+    """
+    times: dict[str, list[float]] = {name: [] for name in work}
+    runs = {}
+    for name, run in work.items():
+        run()
+        runs[name] = max(1, min(1000, int(SHORTEST_SAMPLE / max(seconds(run), 1e-7))))
+    for _ in range(repeat):
+        for name, run in work.items():
+            run()
+            begun = time.perf_counter()
+            for _ in range(runs[name]):
+                run()
+            times[name].append((time.perf_counter() - begun) / runs[name])
+    return times
+
+
+def seconds(run: Callable[[], object]) -> float:
+    """Return the wall time of one run [s]."""
+    begun = time.perf_counter()
+    run()
+    return time.perf_counter() - begun
+
+
+def ratios(a: Sequence[float], b: Sequence[float]) -> Figure:
+    """Return a / b of samples that were taken in the same rounds."""
+    return Figure.of([x / y for x, y in zip(a, b, strict=True)])
+
+
+def clock(device: str) -> Callable[[], float]:
+    """Return a clock [s]: the processor's own on a CPU, which other programs take no part of."""
+    return time.perf_counter if wp.get_device(device).is_cuda else time.process_time
+
+
+@contextmanager
+def timed(device: str, functions: dict[str, tuple[ModuleType | type, str]]) -> Iterator[dict[str, list[float]]]:
+    """Time every call of functions that callers look up in a module or a class.
+
+    Args:
+        device: synchronized around each call.
+        functions: where each is looked up, by label.
+
+    Yields:
+        Seconds of the calls so far, by label.
+    """
+    seconds: dict[str, list[float]] = defaultdict(list)
+    plain = {label: getattr(module, name) for label, (module, name) in functions.items()}
+
+    def watch(label: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **options: Any) -> Any:
+            wp.synchronize_device(device)
+            begun = time.perf_counter()
+            try:
+                return function(*args, **options)
+            finally:
+                wp.synchronize_device(device)
+                seconds[label].append(time.perf_counter() - begun)
+
+        return call
+
+    for label, (module, name) in functions.items():
+        setattr(module, name, watch(label, plain[label]))
+    try:
+        yield seconds
+    finally:
+        for label, (module, name) in functions.items():
+            setattr(module, name, plain[label])

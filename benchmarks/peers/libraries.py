@@ -1,0 +1,144 @@
+"""Peers in this process, on the assembled matrix: solvers of A x = -b, and of quadratic programs, x'A x / 2 + b'x over x >= lower."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+
+from warp_lcp.benchmarks.peers.peer import Answer, Question
+
+CG_PATIENCE, OSQP_PATIENCE = 20_000, 100_000  # iterations
+
+
+def pyamg_aggregation(question: Question, tolerance: float) -> Answer:
+    """Smoothed aggregation before CG, all defaults."""
+    import pyamg
+
+    return _pyamg(pyamg.smoothed_aggregation_solver, question, tolerance)
+
+
+def pyamg_classical(question: Question, tolerance: float) -> Answer:
+    """Ruge-Stueben before CG, all defaults."""
+    import pyamg
+
+    return _pyamg(pyamg.ruge_stuben_solver, question, tolerance)
+
+
+def _pyamg(build: Any, question: Question, tolerance: float) -> Answer:
+    A, residuals = sp.csr_matrix(question.matrix), list[float]()
+    begun = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # its own, of its use of SciPy
+        hierarchy = build(A)
+        middle = time.perf_counter()
+        x = hierarchy.solve(-question.b, tol=tolerance, accel="cg", residuals=residuals)
+    return Answer(x, middle - begun, time.perf_counter() - middle, len(residuals) - 1)
+
+
+def scipy_cg(question: Question, tolerance: float) -> Answer:
+    """Plain conjugate gradients."""
+    A, b, count = question.matrix, -question.b, list[int]()
+    begun = time.perf_counter()
+    x, _ = scipy.sparse.linalg.cg(A, b, rtol=tolerance, atol=0.0, callback=lambda _: count.append(1))
+    return Answer(x, 0.0, time.perf_counter() - begun, len(count))
+
+
+def amgcl(question: Question, tolerance: float) -> Answer:
+    """AMGCL's smoothed aggregation with one sweep of its ILU(0) before CG, the fastest of its smoothers here."""
+    import pyamgcl
+
+    A, b = sp.csr_matrix(question.matrix), -question.b
+    begun = time.perf_counter()
+    preconditioner = pyamgcl.amg(A, {"coarsening.type": "smoothed_aggregation", "relax.type": "ilu0"})
+    solver = pyamgcl.solver(preconditioner, {"type": "cg", "tol": tolerance, "maxiter": 1000})
+    middle = time.perf_counter()
+    x = solver(b)
+    return Answer(x, middle - begun, time.perf_counter() - middle, int(solver.iters))
+
+
+def warp_cg(question: Question, tolerance: float, *, device: str) -> Answer:
+    """Warp's own conjugate gradients with a diagonal preconditioner on a Warp BSR matrix, float64."""
+    import warp as wp
+    import warp.optim.linear
+    import warp.sparse
+
+    coo, n = question.matrix.tocoo(), len(question.b)
+    rows, columns = (wp.array(i, dtype=wp.int32, device=device) for i in coo.coords)
+    A = warp.sparse.bsr_from_triplets(n, n, rows, columns, wp.array(coo.data, dtype=wp.float64, device=device))
+    b, x = wp.array(-question.b, dtype=wp.float64, device=device), wp.zeros(n, dtype=wp.float64, device=device)
+    wp.synchronize_device(device)
+    begun = time.perf_counter()
+    M = warp.optim.linear.preconditioner(A, "diag")
+    middle = time.perf_counter()
+    iterations, _, _ = warp.optim.linear.cg(A, b, x, tol=tolerance, maxiter=CG_PATIENCE, M=M)
+    wp.synchronize_device(device)
+    return Answer(x.numpy(), middle - begun, time.perf_counter() - middle, int(iterations))
+
+
+def cupy_cg(question: Question, tolerance: float) -> Answer:
+    """Plain conjugate gradients of CuPy, on its current CUDA device."""
+    import cupy
+    import cupyx.scipy.sparse
+    import cupyx.scipy.sparse.linalg
+
+    A, b, count = cupyx.scipy.sparse.csr_matrix(sp.csr_matrix(question.matrix)), cupy.asarray(-question.b), list[int]()
+    cupy.cuda.Device().synchronize()
+    begun = time.perf_counter()
+    x, _ = cupyx.scipy.sparse.linalg.cg(A, b, tol=tolerance, maxiter=CG_PATIENCE, callback=lambda _: count.append(1))
+    cupy.cuda.Device().synchronize()
+    return Answer(cupy.asnumpy(x), 0.0, time.perf_counter() - begun, len(count))
+
+
+def osqp(question: Question, tolerance: float) -> Answer:
+    """Operator splitting with one factorization; tolerances are absolute, in units of b."""
+    import osqp as library
+
+    P, A = sp.triu(question.matrix, format="csc"), sp.eye_array(len(question.b), format="csc")
+    scale = tolerance * float(np.abs(question.b).max())
+    begun = time.perf_counter()
+    solver = library.OSQP()
+    solver.setup(
+        sp.csc_matrix(P), question.b, sp.csc_matrix(A), question.lower, np.full(len(question.b), np.inf),
+        verbose=False, eps_abs=scale, eps_rel=0.0, max_iter=OSQP_PATIENCE, polishing=False,
+    )  # fmt: skip
+    middle = time.perf_counter()
+    result = solver.solve(raise_error=False)
+    return Answer(np.array(result.x), middle - begun, time.perf_counter() - middle, int(result.info.iter))
+
+
+def piqp(question: Question, tolerance: float) -> Answer:
+    """Proximal interior point with sparse factorizations."""
+    import piqp as library
+
+    P = sp.csc_matrix(question.matrix)
+    begun = time.perf_counter()
+    solver = library.SparseSolver()
+    solver.settings.eps_abs = tolerance * float(np.abs(question.b).max())
+    solver.settings.eps_rel = 0.0
+    solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = tolerance
+    solver.setup(P, question.b, x_l=question.lower)
+    middle = time.perf_counter()
+    solver.solve()
+    return Answer(np.array(solver.result.x), middle - begun, time.perf_counter() - middle, int(solver.result.info.iter))
+
+
+def clarabel(question: Question, tolerance: float) -> Answer:
+    """Interior point on a homogeneous embedding, with sparse factorizations."""
+    import clarabel as library
+
+    P = sp.csc_matrix(sp.triu(question.matrix, format="csc"))
+    bounded = np.flatnonzero(np.isfinite(question.lower))
+    rows = sp.csc_matrix((-np.ones(len(bounded)), (np.arange(len(bounded)), bounded)), shape=(len(bounded), len(question.b)))
+    settings = library.DefaultSettings()
+    settings.verbose, settings.max_threads = False, 1
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    begun = time.perf_counter()
+    solver = library.DefaultSolver(P, question.b, rows, -question.lower[bounded], [library.NonnegativeConeT(len(bounded))], settings)
+    middle = time.perf_counter()
+    solution = solver.solve()
+    return Answer(np.array(solution.x), middle - begun, time.perf_counter() - middle, int(solution.iterations))

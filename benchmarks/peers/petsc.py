@@ -1,0 +1,168 @@
+"""PETSc, in an interpreter of its own: how it is found, and our side of the exchange."""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Answer, Peer, PeerFailed, Question
+from warp_lcp.benchmarks.problems import BOUNDS
+
+VARIABLE = "WARP_LCP_PETSC_PYTHON"  # environment variable that names the interpreter
+PROBE_SECONDS = 120.0
+DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"  # where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
+CYCLE = "V-cycle, Galerkin, SSOR"
+METHODS = {  # name, method of the worker, problems, cells a side beyond which it is not asked, settings
+    "PETSc CG+MG": ("cg-mg", BOUNDS[:1], 256, f"geometric 2x2x2 aggregates, {CYCLE}"),
+    "PETSc CG+GAMG": ("cg-gamg", BOUNDS[:1], 256, "-pc_type gamg"),
+    "PETSc CG+BoomerAMG": ("cg-boomeramg", BOUNDS[:1], 256, "-pc_type hypre"),
+    "PETSc CG+ICC": ("cg-icc", BOUNDS[:1], 128, "-pc_type icc"),
+    "PETSc SNESVI+MG": ("snesvi-mg", INEQUALITIES, 128, f"vinewtonrsls, -ksp_rtol 1e-2, aggregates of the free set, {CYCLE}"),
+    "PETSc SNESVI+ICC": ("snesvi-icc", INEQUALITIES, 128, "vinewtonrsls, -ksp_rtol 1e-2 -pc_type icc"),
+    "PETSc SNESVI+BoomerAMG": ("snesvi-boomeramg", INEQUALITIES, 64, "vinewtonrsls, -ksp_rtol 1e-2 -pc_type hypre"),
+}
+
+
+def interpreter(module: str = "petsc4py", variable: str = VARIABLE) -> str | None:
+    """Return the first interpreter that imports a module: the one the variable names, this one, the system's; None if none does."""
+    named = os.environ.get(variable)
+    for python in [named] if named else [sys.executable, "/usr/bin/python3"]:
+        command = [python, "-c", f"import {module}"]
+        try:
+            done = subprocess.run(command, env=environment(), capture_output=True, check=False, timeout=PROBE_SECONDS)
+        except (OSError, subprocess.TimeoutExpired):
+            continue
+        if done.returncode == 0:
+            return python
+    return None
+
+
+def missing() -> str:
+    """Return what to tell where there is none."""
+    named = os.environ.get(VARIABLE)
+    where = f"{named}, which {VARIABLE} names, does not import petsc4py" if named else "no interpreter imports petsc4py"
+    return f"missing: {where}; apt-get install python3-petsc4py, or name an interpreter that has it"
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of its interpreter: one thread, and Debian's PETSc where none is named."""
+    found = sorted(glob.glob(DEBIAN_PETSC))
+    return {**({"PETSC_DIR": found[-1]} if found else {}), **os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+@contextmanager
+def peers(folder: Path) -> Iterator[tuple[list[Peer], str]]:
+    """Start PETSc where it is found; yield its peers and its version.
+
+    Args:
+        folder: of the files of the exchange.
+    """
+    python = interpreter()
+    if python is None:
+        yield [], missing()
+        return
+    worker = Worker("petsc4py", [python, str(Path(__file__).with_name("petsc_worker.py"))])
+    desk = Desk(worker, folder)
+    try:
+        made = [Peer(name, "petsc", partial(desk.solve, m), bounds, most, text) for name, (m, bounds, most, text) in METHODS.items()]
+        yield made, worker.version
+    finally:
+        worker.close()
+
+
+class Worker:
+    """A running peer.
+
+    Args:
+        name: of the peer.
+        command: that starts it: an interpreter and a script that serves, see `petsc_worker`.
+
+    Attributes:
+        version: of the peer.
+
+    Raises:
+        PeerFailed: it does not start.
+    """
+
+    def __init__(self, name: str, command: Sequence[str]) -> None:
+        self.name = name
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "encoding": "utf-8"}
+        self.process = subprocess.Popen(command, env=environment(), **pipes)
+        self.version = str(self._read()["version"])
+
+    def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the answer to a request.
+
+        Raises:
+            PeerFailed: it says that it failed, or it has ended.
+        """
+        assert self.process.stdin is not None
+        try:
+            self.process.stdin.write(json.dumps(request) + "\n")
+            self.process.stdin.flush()
+        except BrokenPipeError:
+            raise PeerFailed(f"{self.name} has ended with exit code {self.process.wait()}") from None
+        reply = self._read()
+        if "error" in reply:
+            raise PeerFailed(f"{self.name}: {reply['error']}")
+        return reply
+
+    def close(self) -> None:
+        """End it."""
+        self.process.communicate()
+
+    def _read(self) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise PeerFailed(f"{self.name} has ended with exit code {self.process.wait()}")
+        reply: dict[str, Any] = json.loads(line)
+        return reply
+
+
+class Desk:
+    """Hands problems to a worker through files: one for each scene, written when it is first asked about.
+
+    Args:
+        worker: who is asked.
+        folder: of the files.
+    """
+
+    def __init__(self, worker: Worker, folder: Path) -> None:
+        self.worker, self.folder = worker, folder
+        self._written = 0
+
+    def solve(self, method: str, question: Question, tolerance: float) -> Answer:
+        """Ask the worker.
+
+        Raises:
+            PeerFailed: it gave no answer.
+        """
+        n, answer = question.scene.n, self.folder / "x.npy"
+        path = self.folder / f"{n}.npz"
+        if n != self._written:
+            for old in self.folder.glob("*.npz"):
+                old.unlink()
+            self._write(path, question)
+            self._written = n
+        request = {"method": method, "problem": str(path), "answer": str(answer), "tolerance": tolerance, "bounds": question.bounds}
+        reply = self.worker.ask(request)
+        if reply["reason"] <= 0:
+            raise PeerFailed(f"{method} did not converge: reason {reply['reason']} after {reply['iterations']} iterations")
+        return Answer(np.load(answer), reply["setup"], reply["solve"], reply["iterations"], reply["linear_iterations"])
+
+    def _write(self, path: Path, question: Question) -> None:
+        A = question.matrix
+        fields: dict[str, Any] = {f"lower_{name}": Question(question.scene, name).lower for name in INEQUALITIES}
+        fields |= {"data": A.data, "indices": A.indices, "indptr": A.indptr, "shape": np.array(question.scene.cells.shape)}
+        np.savez(path, b=question.b, where=question.where, **fields)

@@ -1,0 +1,244 @@
+"""PETSc's conjugate gradients with its multigrids, and its active-set solver of inequalities: a program for an interpreter that has it.
+
+The matrix is converted and the transfers of the geometric hierarchy are built before the clock starts: neither is PETSc's work.
+A line of JSON asks, a line of JSON answers; arrays travel in .npz files. It imports nothing of this project.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+Request = dict[str, Any]
+Reply = dict[str, Any]
+COARSEST = 500  # unknowns that are left to a direct solver
+NEWTON_STEPS = 200
+LINEAR_ITERATIONS = 10_000
+# two sweeps of symmetric SOR per level or PETSc's own choices; of what was tried these take the least time on the splash
+MULTIGRID = {"pc_mg_galerkin": "both", "mg_levels_ksp_type": "richardson", "mg_levels_ksp_max_it": 1, "mg_levels_pc_type": "sor"}
+HYPRE = {"pc_type": "hypre", "pc_hypre_type": "boomeramg"}
+GAMG, ICC = {"pc_type": "gamg"}, {"pc_type": "icc"}
+LOOSE = {"ksp_rtol": 1e-2}  # of a Newton step; tighter ones take fewer steps and more time
+
+
+class Problem:
+    """A x + b on the unknowns of a grid, as PETSc wants it.
+
+    Attributes:
+        A: the matrix.
+        b: numpy, shape (unknowns,).
+        where: index of each unknown among the cells of the grid.
+        shape: cells along each axis.
+    """
+
+    def __init__(self, path: str) -> None:
+        with np.load(path) as kept:
+            self.b, self.where, self.shape = kept["b"], kept["where"], tuple(int(s) for s in kept["shape"])
+            rows, columns, values = kept["indptr"].astype(np.int32), kept["indices"].astype(np.int32), kept["data"]
+            self.lower = {name[6:]: kept[name] for name in kept.files if name.startswith("lower_")}
+        self.A = PETSc.Mat().createAIJWithArrays((len(self.b),) * 2, (rows, columns, values))
+        self.A.setOption(PETSc.Mat.Option.SPD, True)
+
+
+class Desk:
+    """Keeps the problem that was asked for last."""
+
+    def __init__(self) -> None:
+        self.path = ""
+        self.problem: Problem | None = None
+
+    def get(self, request: Request) -> Problem:
+        """Return the problem of a request."""
+        if request["problem"] != self.path:
+            self.path, self.problem = request["problem"], Problem(request["problem"])
+        assert self.problem is not None
+        return self.problem
+
+
+class Settings:
+    """PETSc options that hold while a solver reads them."""
+
+    def __init__(self, options: dict[str, Any]) -> None:
+        self.options = options
+
+    def __enter__(self) -> None:
+        """Set them."""
+        for name, value in self.options.items():
+            PETSc.Options()[name] = value
+
+    def __exit__(self, *_: object) -> None:
+        """Forget them."""
+        for name in self.options:
+            PETSc.Options().delValue(name)
+
+
+def aggregates(where: np.ndarray, shape: tuple[int, ...]) -> list[Any]:
+    """Return prolongations by 2 x 2 x 2 aggregates of cells, finest first, constant on each.
+
+    Trilinear ones take fewer iterations and three times as long, for their Galerkin products are of 27 points.
+    """
+    found = []
+    while len(where) > COARSEST and min(shape) > 2:
+        coarse = tuple((s + 1) // 2 for s in shape)
+        parents = np.ravel_multi_index(tuple(i // 2 for i in np.unravel_index(where, shape)), coarse)
+        kept = np.zeros(int(np.prod(coarse)), dtype=bool)
+        kept[parents] = True
+        columns = (np.cumsum(kept) - 1)[parents].astype(np.int32)
+        rows = np.arange(len(where) + 1, dtype=np.int32)
+        where, shape = np.flatnonzero(kept), coarse
+        found.append(PETSc.Mat().createAIJWithArrays((len(rows) - 1, len(where)), (rows, columns, np.ones(len(columns)))))
+    return found
+
+
+def give(pc: Any, prolongations: list[Any]) -> None:
+    """Make a preconditioner PETSc's multigrid with these prolongations and Galerkin products."""
+    pc.setType("mg")
+    pc.setMGLevels(len(prolongations) + 1)
+    for number, P in enumerate(reversed(prolongations), start=1):
+        pc.setMGInterpolation(number, P)
+
+
+def linear(request: Request, desk: Desk, options: dict[str, Any]) -> Reply:
+    """Solve A x = -b by CG; without `pc_type` among the options with geometric multigrid."""
+    problem = desk.get(request)
+    right = PETSc.Vec().createWithArray(-problem.b)
+    x = right.duplicate()
+    transfers = [] if "pc_type" in options else aggregates(problem.where, problem.shape)
+    with Settings(options):
+        begun = time.perf_counter()
+        ksp = PETSc.KSP().create()
+        ksp.setOperators(problem.A)
+        ksp.setType("cg")
+        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+        ksp.setTolerances(rtol=request["tolerance"], atol=0.0, max_it=LINEAR_ITERATIONS)
+        if transfers:
+            give(ksp.getPC(), transfers)
+        ksp.setFromOptions()
+        ksp.setUp()
+        middle = time.perf_counter()
+        ksp.solve(right, x)
+        end = time.perf_counter()
+    return _answer(request, x, middle - begun, end - middle, ksp.getIterationNumber(), ksp.getConvergedReason(), ksp)
+
+
+class ReducedMultigrid:
+    """Multigrid of the principal systems of an active-set method: aggregates of the free unknowns, made anew when these change."""
+
+    def __init__(self, problem: Problem, snes: Any) -> None:
+        self.problem, self.snes, self.building = problem, snes, 0.0
+        self.ksp: Any = None
+
+    def setUp(self, pc: Any) -> None:
+        """Build the hierarchy of the current free set; the time that its transfers take in NumPy is not PETSc's."""
+        free = self.snes.getVIInactiveSet().getIndices()
+        begun = time.perf_counter()
+        transfers = aggregates(self.problem.where[free], self.problem.shape)
+        self.building += time.perf_counter() - begun
+        A, _ = pc.getOperators()
+        if self.ksp is not None:
+            self.ksp.destroy()
+        self.ksp = PETSc.KSP().create()
+        self.ksp.setOperators(A)
+        self.ksp.setType("preonly")
+        give(self.ksp.getPC(), transfers)
+        with Settings(MULTIGRID):
+            self.ksp.setFromOptions()
+            self.ksp.setUp()
+
+    def apply(self, pc: Any, r: Any, z: Any) -> None:
+        """Set z to a V-cycle's answer to r."""
+        self.ksp.solve(r, z)
+
+
+def inequality(request: Request, desk: Desk, options: dict[str, Any]) -> Reply:
+    """Solve the LCP by SNESVI's reduced-space active-set Newton method with CG; without `pc_type` with geometric multigrid."""
+    problem = desk.get(request)
+    lower = problem.lower[request["bounds"]]
+    b = PETSc.Vec().createWithArray(problem.b)
+    low = PETSc.Vec().createWithArray(np.where(np.isinf(lower), PETSc.NINFINITY, lower))
+    x, residual, high = b.duplicate(), b.duplicate(), b.duplicate()
+    high.set(PETSc.INFINITY)
+
+    def function(snes: Any, x: Any, y: Any) -> None:
+        problem.A.mult(x, y)
+        y.axpy(1.0, b)
+
+    with Settings(LOOSE | options):
+        begun = time.perf_counter()
+        snes = PETSc.SNES().create()
+        snes.setType("vinewtonrsls")
+        snes.setFunction(function, residual)
+        snes.setJacobian(lambda snes, x, J, P: None, problem.A, problem.A)  # A is constant
+        snes.setVariableBounds(low, high)
+        snes.setTolerances(rtol=request["tolerance"], atol=0.0, stol=0.0, max_it=NEWTON_STEPS)
+        snes.ksp.setType("cg")
+        own = None
+        if "pc_type" not in options:
+            own = ReducedMultigrid(problem, snes)
+            snes.ksp.getPC().setType("python")
+            snes.ksp.getPC().setPythonContext(own)
+        snes.setFromOptions()
+        middle = time.perf_counter()
+        snes.solve(None, x)
+        end = time.perf_counter()
+    seconds = end - middle - (0.0 if own is None else own.building)
+    return _answer(request, x, middle - begun, seconds, snes.getIterationNumber(), snes.getConvergedReason(), snes)
+
+
+def _answer(request: Request, x: Any, setup: float, solve: float, iterations: int, reason: int, solver: Any) -> Reply:
+    """Write x and return the rest."""
+    np.save(request["answer"], x.array_r)
+    linear_iterations = solver.getLinearSolveIterations() if isinstance(solver, PETSc.SNES) else iterations
+    solver.destroy()
+    return {"setup": setup, "solve": solve, "iterations": iterations, "linear_iterations": linear_iterations, "reason": int(reason)}
+
+
+def serve(version: str, methods: Mapping[str, Callable[[Request], Reply]], failures: tuple[type[Exception], ...] = ()) -> None:
+    """Answer requests until the input ends; the first line that is sent tells the peer's version.
+
+    Args:
+        version: of the peer.
+        methods: what can be asked for, by the request's `method`.
+        failures: what methods raise where they fail; the answer is then {"error": text}. Anything else ends the program.
+    """
+    replies = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what the peer prints must not get between the answers
+
+    def send(reply: Reply) -> None:
+        replies.write(json.dumps(reply) + "\n")
+        replies.flush()
+
+    send({"version": version, "methods": sorted(methods)})
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            send(methods[request["method"]](request))
+        except failures as error:
+            send({"error": (str(error).splitlines() or [type(error).__name__])[-1]})
+
+
+def main() -> None:
+    """Serve."""
+    desk = Desk()
+    methods = {
+        "cg-mg": partial(linear, desk=desk, options=MULTIGRID),
+        "cg-gamg": partial(linear, desk=desk, options=GAMG),
+        "cg-boomeramg": partial(linear, desk=desk, options=HYPRE),
+        "cg-icc": partial(linear, desk=desk, options=ICC),
+        "snesvi-mg": partial(inequality, desk=desk, options={}),
+        "snesvi-icc": partial(inequality, desk=desk, options=ICC),
+        "snesvi-boomeramg": partial(inequality, desk=desk, options=HYPRE),
+    }
+    serve(".".join(map(str, PETSc.Sys.getVersion())), methods, (PETSc.Error,))
+
+
+if __name__ == "__main__":
+    main()
