@@ -55,7 +55,9 @@ class Outcome:
             mass: of a full cell [kg; kg/m in 2-D].
         """
         stress, p = self.stress, self.stress.packing
-        fields = stress.checked.fields | xyz(share=p.share, mass=p.mass) | {"openings": self._openings, "ratio": self.ratio}
+        fields = (
+            stress.checked.fields | xyz(share=p.share, mass=p.mass, inverse=p.inverse) | {"openings": self._openings, "ratio": self.ratio}
+        )
         fields |= {"flags": p.flags, "drive": p.drive, "now": stress.now}
         p.grid.domain.run(self._report, whole=True, numbers=stress.numbers, sums=self._sums, **fields)
         cells, yielded, taken, most = self._sums.numpy().reshape(REPORT_COLUMNS, self._rows)
