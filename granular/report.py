@@ -9,7 +9,6 @@ import warp as wp
 
 from warp_lcp.granular.report_kernels import REPORT_COLUMNS, contact_kernel, report_pass, take_kernel
 from warp_lcp.granular.stress import Stress
-from warp_lcp.granular.yield_set import xyz
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.particle_simulation import Row
 
@@ -55,8 +54,7 @@ class Outcome:
             mass: of a full cell [kg; kg/m in 2-D].
         """
         stress, p = self.stress, self.stress.packing
-        fields = stress.checked.fields | xyz(share=p.share, mass=p.mass) | {"openings": self._openings, "ratio": self.ratio}
-        fields |= {"flags": p.flags, "drive": p.drive, "now": stress.now}
+        fields = p.cells | stress.checked.fields | {"now": stress.now, "openings": self._openings, "ratio": self.ratio}
         p.grid.domain.run(self._report, whole=True, numbers=stress.numbers, sums=self._sums, **fields)
         cells, yielded, taken, most = self._sums.numpy().reshape(REPORT_COLUMNS, self._rows)
         share = float(yielded.sum() / max(cells.sum(), 1.0))

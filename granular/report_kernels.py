@@ -20,8 +20,8 @@ REPORT_COLUMNS = (
 @functools.cache
 def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> RowPass:
     """Return the pass for 2 or 3 dimensions; friction grows with the rate of shear; solids cut cells."""
-    velocity = {name: [wp.float64] * 3 for name in ("edge", "u")}
-    fields = {"flags": wp.uint8, **dict.fromkeys(("now", "drive", "ratio", "openings"), wp.float32), **xyz("share", "mass", **velocity)}
+    vectors = xyz("share", "mass", "inverse", edge=[wp.float64] * 3, u=[wp.float64] * 3)
+    fields = {"flags": wp.uint8, **dict.fromkeys(("now", "drive", "stiff", "ratio", "openings"), wp.float32), **vectors}
     whole, words = {"numbers": wp.float32, "sums": wp.float64}, {"REPORT_COLUMNS": REPORT_COLUMNS, "RATIO_YIELDS": RATIO_YIELDS}
     module = f"report_{dimension}d{'_rate' * rate}{'_cut' * cut}"
     return sand_pass(module, "report", dimension, wp.float64, fields, whole=whole, RATE=rate, CUT=cut, **words)

@@ -29,7 +29,7 @@ HOLDS = 1  # bits of a cell: it holds sand, and so a pressure,
 SHEARS_HERE = 2  # enough of it to carry shear,
 FIRM = 4  # so much that cohesion may hold it together,
 PARTLY = 8  # and a solid cuts it, or a cell beside it
-NEARLY = 0.05  # of a cell free, below which what passes its faces counts as volume, whatever its neighbors hold, see `openings.h`
+NEARLY = 0.05  # of a cell free, below which what passes its faces counts as volume, whatever its neighbors hold, see `divergence.h`
 LEAST_RADIUS = 1e-30  # [m/s], of a yield set that holds only zero
 
 CONSTANTS = {

@@ -1,17 +1,16 @@
 // How near each cell is to yielding; a row's sums: cells that carry shear, yielded ones, dissipation, the most of a fraction predicted.
 #include "shape.h"
-#include "openings.h"
 #include "rate_bound.h"
 const float* share[3] = XYZ(share); const float* mass[3] = XYZ(mass); const double* rate[3] = XYZ(edge); const double* u[3] = XYZ(u);
+const float* inverse[3] = XYZ(inverse);
+#include "divergence.h"
 double cells = 0, yielded = 0, taken = 0, most = 0;
 for (int i = first; i < last; ++i) {
     if (!flags[i]) { ratio[i] = 0; continue; }  // no sand, no stress
-    float size = 0; double e[3], mean = 0, w = drive[i], fast2 = 0;
-    const double full = fullness(w*numbers[STEP_OF_CELL]);
+    float size = 0; double e[3], mean = 0, fast2 = 0, diagonal = 0;
+    const double w = divergence(i, diagonal);
     for (int axis = 0; axis < DIM; ++axis) {
-        const long long o = i + s[axis];
-        e[axis] = counted(axis, i)*(u[axis][o] - u[axis][i]); mean += e[axis]/DIM;
-        w += open(axis, o)*passes(mass[axis][o], full)*u[axis][o] - open(axis, i)*passes(mass[axis][i], full)*u[axis][i];
+        e[axis] = counted(axis, i)*(u[axis][i + s[axis]] - u[axis][i]); mean += e[axis]/DIM;
     }
     if (DIM == 2) { const float a = now[layer + i]; size = a*a; taken += a*(e[0] - e[1]); fast2 = (e[0] - e[1])*(e[0] - e[1]); }
     else for (int c = 0; c < NORMALS; ++c) {

@@ -11,11 +11,11 @@ for (int c = 0; c < COLUMNS; ++c) partial[c*columns] = 0;
 #endif
 #include "shape.h"
 #include "span.h"
-#include "openings.h"
 #include "rate_bound.h"
 #include "yield.h"
 const float* share[3] = XYZ(share); const float* mass[3] = XYZ(mass); const float* inverse[3] = XYZ(inverse);
 const T* rate[3] = XYZ(edge); const T* u[3] = XYZ(u);
+#include "divergence.h"
 const T beta_x = RESIDUAL ? (T)0 : (T)momentum[NOW_X], beta_s = RESIDUAL ? (T)0 : (T)momentum[NOW_S];
 const T ahead_x = (T)momentum[NEXT_X]*(T)numbers[LOOKAHEAD], ahead_s = (T)momentum[NEXT_S]*(T)numbers[LOOKAHEAD];
 const T k_yield = (T)numbers[FRICTION], cohesion = (T)numbers[COHESION];
@@ -28,14 +28,10 @@ auto start = [&](int c, long long i, T beta) INLINE {
 T x_es = 0, x_ee = 0, x_ss = 0, s_es = 0, s_ee = 0, s_ss = 0, x_residual = 0, s_residual = 0;
 MASKED for (int i = begin; i < end; ++i) {
     const int sand = flags[i] & HOLDS, dense = flags[i] & SHEARS_HERE, firm = flags[i] & FIRM;
-    const T full = fullness((T)drive[i]*(T)numbers[STEP_OF_CELL]);
-    T w = (T)drive[i], diagonal = 0, e[DIM], mean = 0;
+    T diagonal = 0, e[DIM], mean = 0;
+    const T w = divergence(i, diagonal);
     UNROLL for (int axis = 0; axis < DIM; ++axis) {
-        const long long o = i + s[axis];
-        const T beyond = open(axis, o)*passes((T)mass[axis][o], full), here = open(axis, i)*passes((T)mass[axis][i], full);
-        w += beyond*u[axis][o] - here*u[axis][i];
-        diagonal += open(axis, o)*beyond*(T)inverse[axis][o] + open(axis, i)*here*(T)inverse[axis][i];
-        e[axis] = counted(axis, i)*(u[axis][o] - u[axis][i]);
+        e[axis] = counted(axis, i)*(u[axis][i + s[axis]] - u[axis][i]);
         mean += e[axis];
     }
     mean *= (T)1/(T)DIM;
