@@ -78,7 +78,7 @@ ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line on the process's own arguments."""
     app()
 
 
@@ -251,7 +251,7 @@ def tune_scene(
 
 @app.command()
 def scenes() -> None:
-    """List the built-in scenes."""
+    """List the built-in scenes with what they show."""
     with _wrong_input():
         _print_pairs([(name, load_scene(name).scene.description) for name in built_in_scenes()])
 

@@ -10,7 +10,7 @@ from warp_lcp.scene.simulator import plug_ins
 
 @runtime_checkable
 class Benchmark(Protocol):
-    """A suite of measurements."""
+    """A suite of measurements, found by its entry point."""
 
     name: str
     summary: str

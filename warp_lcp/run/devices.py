@@ -21,7 +21,7 @@ class EngineError(InputError):
 
 
 class Engine(StrEnum):
-    """What carries a computation."""
+    """What carries a computation: this process, or the ranks that `mpiexec` has started."""
 
     SINGLE = "single"  # one process with one device
     PETSC = "petsc"  # the ranks of MPI, whose grids PETSc cuts and exchanges

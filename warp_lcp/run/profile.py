@@ -39,7 +39,7 @@ class Stage:
     bytes: int = 0
 
     def add(self, seconds: float) -> None:
-        """Count a call."""
+        """Count a call of so many seconds."""
         self.first_seconds = self.first_seconds if self.calls else seconds
         self.calls += 1
         self.seconds += seconds
@@ -58,7 +58,7 @@ class LoadedKernels:
         self._logger, self._level = wp.get_logger(), wp.config.log_level
 
     def debug(self, message: str) -> None:
-        """Pass a message on."""
+        """Pass a message on to the logger that was there before."""
         if self._level <= wp.LOG_DEBUG:
             self._logger.debug(message)
 
@@ -70,12 +70,12 @@ class LoadedKernels:
             self._logger.info(message)
 
     def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
-        """Pass a message on."""
+        """Pass a message on to the logger that was there before."""
         if self._level <= wp.LOG_WARNING:
             self._logger.warning(message, category, stacklevel=stacklevel + 1)
 
     def error(self, message: str) -> None:
-        """Pass a message on."""
+        """Pass a message on to the logger that was there before."""
         self._logger.error(message)
 
 

@@ -26,7 +26,7 @@ class Observer(Protocol):
     """Someone who watches a run."""
 
     def note(self, text: str) -> None:
-        """Take a remark."""
+        """Take a remark that the user should see."""
 
     def start(self, time: float, end: float) -> None:
         """Learn the time [s] that the run begins and ends at."""
@@ -65,7 +65,7 @@ class Lines:
         """Do nothing."""
 
     def note(self, text: str) -> None:
-        """Write a remark."""
+        """Write a remark on a line of its own."""
         self._write(one_line(text))
 
     def start(self, time: float, end: float) -> None:
@@ -78,7 +78,7 @@ class Lines:
         self._progress.update(self._task, completed=_number(row, "time"))
 
     def frame(self, index: int, last: int) -> None:
-        """Write a line."""
+        """Write a line with the frame, its time and the last step's numbers."""
         self._write(
             f"frame {index}/{last}  t {_number(self._row, 'time'):.4g} s  {describe(self._row)}  {time_left(self._progress)}"
             if self._row
@@ -119,7 +119,7 @@ class Bar:
         _begin(self._progress, time, end)
 
     def step(self, row: Mapping[str, Value]) -> None:
-        """Show a step's numbers."""
+        """Show a step's numbers and the time left beside the bar."""
         self._progress.update(self._task, completed=_number(row, "time"))
         self._progress.update(self._task, description=escape(f"{time_left(self._progress)}  {describe(row)}"))
 

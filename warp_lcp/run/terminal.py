@@ -52,7 +52,7 @@ class Commands(TyperGroup):
         return super().main(*arguments, **options)
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Begin a command."""
+        """Begin a command; what refuses its words shows them harmless."""
         try:
             return super().make_context(*arguments, **options)
         except Refusal as error:
@@ -60,7 +60,7 @@ class Commands(TyperGroup):
             raise
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command."""
+        """Run a command; an interruption or a cache that cannot be written ends it with exit code 1."""
         try:
             return super().invoke(ctx)
         except Refusal as error:
