@@ -106,7 +106,7 @@ def _push_liquid_apart(simulation: Any) -> None:
     def pushed(velocity: Any, dt: float, kick_dt: float) -> int:
         unknowns: int = prepare(velocity, dt, kick_dt)
         excess = np.maximum(simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0)
-        inside = projection._cells.numpy() == FLUID
+        inside = projection._unknown.numpy() == FLUID
         projection._b.assign(projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt)
         return unknowns
 

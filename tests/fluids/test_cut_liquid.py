@@ -50,7 +50,7 @@ def test_the_pressure_over_slopes_is_that_of_the_depth(resolution: int) -> None:
     advance(simulation, 0.2)
     dx = simulation.grid.spacing
     pressure = simulation.projection.pressures(1000.0)[1] / (1000.0 * GRAVITY * dx)
-    liquid = simulation.projection.shown.numpy()[1] == wl.FLUID
+    liquid = simulation.projection.cells.numpy()[1] == wl.FLUID
     rows = np.arange(resolution + 2)[:, None] - 0.5
     error = np.where(liquid, pressure - (0.5 / dx - rows), 0.0)
     assert liquid.sum() > 0.2 / dx**2
