@@ -33,7 +33,6 @@ class Picture:
     """
 
     def __init__(self, recording: Recording, size: tuple[int, int], plotter: Any = None) -> None:
-        """Draw what stands."""
         import pyvista
 
         scene = self.scene = recording.scene

@@ -30,7 +30,6 @@ class Viewer:
     """
 
     def __init__(self, recording: Recording, plotter: Any, clock: Callable[[], float] = time.perf_counter) -> None:
-        """Show the first frame."""
         from warp_lcp.render.picture import Picture
 
         self.recording, self.plotter, self.clock = recording, plotter, clock

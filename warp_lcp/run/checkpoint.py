@@ -16,7 +16,7 @@ import numpy as np
 
 from warp_lcp.archive import Archive, ArchiveError
 from warp_lcp.frames.atomic import make_folder, replacing
-from warp_lcp.frames.rank_folder import in_ranks, rank_folder
+from warp_lcp.frames.pieces import in_ranks, rank_folder
 
 FORMAT = 2
 CHECKPOINT_FILE = re.compile(r"step_(?P<step>[0-9]{6,})\.npz")

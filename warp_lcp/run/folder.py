@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from warp_lcp.frames.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
-from warp_lcp.frames.rank_folder import in_ranks, remove_empty_ranks
+from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
 from warp_lcp.run.folder_lock import LOCK, FolderBusyError, locked

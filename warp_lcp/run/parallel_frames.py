@@ -8,8 +8,7 @@ from pathlib import Path
 from warp_lcp.distributed.meeting import Meeting
 from warp_lcp.frames.atomic import make_folder
 from warp_lcp.frames.frames import FrameFolder, FrameWriter, GridFormat
-from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, write_whole
-from warp_lcp.frames.rank_folder import rank_folder
+from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, rank_folder, write_whole
 from warp_lcp.simulation import Cells, Part, Stopwatch, Volume
 
 Pieces = dict[str, Piece]  # of a rank, by their parts' names
