@@ -24,7 +24,7 @@ class Painter(Protocol):
         """Return a picture of a frame."""
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free windows and the like; nothing is drawn afterward."""
 
 
 class Page:

@@ -293,7 +293,7 @@ def spread(numbers: Sequence[int], count: int) -> list[int]:
 
 
 def _read(file: Path) -> Mesh:
-    """Return a frame's mesh."""
+    """Return the mesh of a frame, which may be in pieces."""
     with _readable(file):
         return one_mesh([read_vtu(piece) for piece in _pieces(file)]) if file.suffix == ".pvtu" else read_vtu(file)
 
