@@ -13,10 +13,10 @@ from warp_lcp.benchmarks.machine import machine
 from warp_lcp.benchmarks.models import step_seconds_of
 from warp_lcp.benchmarks.record import Record, Results, Table
 from warp_lcp.benchmarks.timing import Figure, Options
-from warp_lcp.run.loop import plan_dt
+from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import simulators
+from warp_lcp.scene.simulator import simulators
 
 TITLE = "The automatic tolerance"
 SCENES = {  # [s] simulated, and overrides that make runs short

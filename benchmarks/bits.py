@@ -23,7 +23,7 @@ from rich.console import Console
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import cut_cells, splash
 from warp_lcp.protocol import families
-from warp_lcp.run.loop import run_scene
+from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.solvers.mprgp import MPRGP
@@ -186,7 +186,7 @@ def frames(name: str, resolution: int, duration: float) -> str:
     """Run a scene, and return a line with a digest of its frames."""
     with tempfile.TemporaryDirectory() as out:
         scene = load_scene(name, [f"domain.resolution={resolution}", f"time.duration={duration}"])
-        run_scene(scene, Path(out) / "run", device="cpu", observer=Lines(Console(quiet=True)))
+        run_scene(RunRequest(scene=scene, out=Path(out) / "run", device="cpu"), observer=Lines(Console(quiet=True)))
         found = sorted(p for p in Path(out, "run", "frames").rglob("*") if p.is_file())
         return f"{name}: {len(found)} files {_digest(*(p.read_bytes() for p in found))}"
 

@@ -20,7 +20,7 @@ from warp_lcp.frames.atomic import replacing
 from warp_lcp.frames.nvdb import write_nvdb
 from warp_lcp.frames.vti import write_vti
 from warp_lcp.frames.vtu import write_vtu
-from warp_lcp.run.loop import run_scene
+from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.run.profile import Profile
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import Cells, Volume
@@ -112,13 +112,15 @@ def share_table(name: str, overrides: list[str], repeat: int, device: str, folde
     The writer's thread waits for the disk most of the time: the processors' time tells what is left for others.
     """
     scenes = {"with": load_scene(name, overrides), "without": load_scene(name, [*overrides, *NO_FRAMES])}
-    run_scene(scenes["with"], folder / "first", device=device, observer=Nobody())  # loads the kernels
+    run_scene(RunRequest(scene=scenes["with"], out=folder / "first", device=device), observer=Nobody())  # loads the kernels
     wall, processors = (dict.fromkeys(scenes, np.inf) for _ in range(2))
     stages = {"frames": np.inf, "frames, written": np.inf}
     for turn in range(repeat):
         for which, scene in scenes.items():
             profile, begun = Profile(device), time.process_time()
-            seconds = run_scene(scene, folder / f"{which}_{turn}", device=device, observer=Nobody(), profile=profile).seconds
+            seconds = run_scene(
+                RunRequest(scene=scene, out=folder / f"{which}_{turn}", device=device), observer=Nobody(), profile=profile
+            ).seconds
             processors[which] = min(processors[which], time.process_time() - begun)
             wall[which] = min(wall[which], seconds)
             if which == "with":

@@ -17,7 +17,7 @@ import warp_lcp
 from warp_lcp import fluids, granular
 from warp_lcp.benchmarks.record import MACHINE, SOURCE, Record
 from warp_lcp.benchmarks.timing import Figure, in_turns
-from warp_lcp.run.versions import versions
+from warp_lcp.run.devices import versions
 
 PEERS = ("pyamg", "scipy", "numba", "matplotlib")
 COPIED = 1 << 26  # float32 elements of the arrays that are copied: 256 MiB, beyond any cache

@@ -25,12 +25,12 @@ from warp_lcp.benchmarks.machine import machine
 from warp_lcp.benchmarks.memory import array_bytes
 from warp_lcp.benchmarks.record import Record, Results, Table
 from warp_lcp.benchmarks.timing import Figure, Options
-from warp_lcp.run.loop import plan_dt
 from warp_lcp.run.profile import Profile
+from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.models import TABLE, prices
 from warp_lcp.scene.scene import Scene, Time
+from warp_lcp.scene.simulator import simulators
 from warp_lcp.scene.table import validate
-from warp_lcp.simulation import simulators
 
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes

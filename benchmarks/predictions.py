@@ -14,7 +14,8 @@ from warp_lcp.benchmarks.models import create, markdown, step_seconds_of
 from warp_lcp.benchmarks.record import Record, Results, Table
 from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.run.loop import SAME_TIME, plan_dt
+from warp_lcp.run.loop import SAME_TIME
+from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.models import predicted_seconds, prices
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 

@@ -20,9 +20,9 @@ from warp_lcp.benchmarks.stopwatch import timed
 from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.material import particle_simulation
 from warp_lcp.material.boundary import WholeCells
-from warp_lcp.run.loop import run_scene
+from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import simulators
+from warp_lcp.scene.simulator import simulators
 
 TITLE = "Runs of built-in scenes"
 SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated
@@ -93,7 +93,7 @@ def _run(name: str, duration: float, size: int, device: str) -> dict[str, float]
     scene, watch = load_scene(name, _overrides(duration, size)), Watch()
     with tempfile.TemporaryDirectory() as folder, timed(device, STAGES) as seconds:
         begun = time.perf_counter()
-        record = run_scene(scene, Path(folder) / "run", device=device, observer=watch, force=True)
+        record = run_scene(RunRequest(scene=scene, out=Path(folder) / "run", device=device, force=True), observer=watch)
         total = time.perf_counter() - begun
     if record.status != "finished":
         raise RuntimeError(f"{name}: {record.status}: {record.reason}")
@@ -182,7 +182,7 @@ def _walls(size: int, options: Options) -> Record:
         Watch(),
     )
     with tempfile.TemporaryDirectory() as folder, _solving_both(options.device) as both:
-        run_scene(scene, Path(folder) / "run", device=options.device, observer=watch, force=True)
+        run_scene(RunRequest(scene=scene, out=Path(folder) / "run", device=options.device, force=True), observer=watch)
     parts = np.array_split(np.arange(1, len(both.linear)), options.repeat)  # the first step is cold
     ratio = [sum(both.bounded[i] for i in part) / sum(both.linear[i] for i in part) for part in parts if len(part)]
     steps = len(both.linear)

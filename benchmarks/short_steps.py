@@ -13,7 +13,8 @@ from warp_lcp.benchmarks.machine import machine
 from warp_lcp.benchmarks.record import Record, Results, Table
 from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import SimulationFailed, StepFailed, simulators
+from warp_lcp.scene.simulator import simulators
+from warp_lcp.simulation import SimulationFailed, StepFailed
 
 TITLE = "Steps of any length"
 SCENES = {  # cells along the longest side, and the time [s] whose parts are the moments: small enough for seconds, see `MOMENTS`

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from small_runs import MINIMAL
-from warp_lcp import simulation as plug_ins
+from warp_lcp.scene import simulator as plug_ins
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, Points
 

@@ -6,8 +6,8 @@ import random
 from typing import Any
 
 from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.simulator import simulators
 from warp_lcp.scene.table import SceneError, validate
-from warp_lcp.simulation import simulators
 
 LIQUID_METHODS = ["projected-multigrid"] * 6 + ["minimum-map-newton", "primal-dual-active-set", "mprgp", "nncg", "psor", "projected-jacobi"]
 Tables = dict[str, Any]

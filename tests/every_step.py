@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.run.loop import take_step
+from warp_lcp.run.stepping import take_step
 from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Part, Simulation, simulators
+from warp_lcp.scene.simulator import simulators
+from warp_lcp.simulation import Part, Simulation
 
 Told = dict[str, Any]
 

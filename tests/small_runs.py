@@ -2,10 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.run.folder import RunRecord
+from warp_lcp.run.loop import RunRequest, run_scene
+from warp_lcp.run.progress import Lines, Observer
+from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.simulation import Part, Surface
 
@@ -22,6 +28,12 @@ resolution = 8
 [output]
 checkpoint_every = 4
 """
+
+
+def run_into(scene: Scene, out: Path, *, observer: Observer | None = None, **options: Any) -> RunRecord:
+    """Run a scene into a folder on the CPU; options are those of a RunRequest or of `run_scene`."""
+    asked = {name: options.pop(name) for name in ("last_frame", "resume", "force", "force_memory", "record_problems") if name in options}
+    return run_scene(RunRequest(scene=scene, out=out, **asked), observer=observer or Lines(Console(quiet=True)), **options)
 
 
 def write_run(folder: Path, frames: Sequence[list[Part]], text: str = "", size: Sequence[float] = (1.0, 1.0)) -> Path:

@@ -1,24 +1,18 @@
-"""What a run asks of a simulator, and how it finds one: the entry-point group `warp_lcp.simulators`."""
+"""A simulation as a run sees it: its steps, its state, the parts of its frames, its errors and its stages."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.result import SolveStatus
 
-if TYPE_CHECKING:
-    from warp_lcp.distributed.ranks import Ranks
-    from warp_lcp.scene.scene import Scene
-
-GROUP = "warp_lcp.simulators"
 NOTHING = nullcontext()
 
 
@@ -53,6 +47,10 @@ class NoStopwatch:
 
     def wrote(self, name: str, *files: Path) -> None:
         """Do nothing."""
+
+
+class InputError(ValueError):
+    """What the user gave is wrong. The message names it and says what is allowed; the command line ends with exit code 2."""
 
 
 class StepFailed(RuntimeError):
@@ -221,22 +219,6 @@ class Resampled(Protocol):
 
 
 @runtime_checkable
-class Simulator(Protocol):
-    """A plug-in: a kind of material and the scenes that describe it."""
-
-    name: str
-    summary: str
-    scene_model: type[Any]  # a subclass of warp_lcp.scene.scene.Scene
-
-    def create(self, scene: Scene, *, device: str, folder: Path) -> Simulation:
-        """Build a simulation of `scene`. Files that the scene names are relative to `folder`.
-
-        Raises:
-            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
-        """
-
-
-@runtime_checkable
 class Joined(Protocol):
     """What a Simulation may also be: one that can go on where several MPI ranks ended."""
 
@@ -258,26 +240,3 @@ class DistributedSimulation(Simulation, Joined, Protocol):
 
     def piece_state(self) -> dict[str, np.ndarray]:
         """Return this rank's part of the state; `box`, int (2, 3), is its part's first cell and the one behind the last."""
-
-
-@runtime_checkable
-class DistributedSimulator(Protocol):
-    """What a Simulator may also be: one whose simulations several MPI ranks share."""
-
-    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSimulation:
-        """Build this rank's part of a simulation of `scene`; collective.
-
-        Raises:
-            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed.
-        """
-
-
-def simulators() -> dict[str, Simulator]:
-    """Return the installed simulators by name."""
-    found = {}
-    for entry in entry_points(group=GROUP):
-        simulator = entry.load()
-        if not isinstance(simulator, Simulator):
-            raise TypeError(f"entry point {entry.name!r} of {GROUP} is not a simulator: {simulator!r}")
-        found[entry.name] = simulator
-    return found

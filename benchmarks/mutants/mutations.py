@@ -17,7 +17,7 @@ from cosmic_ray.plugins import get_operator
 PACKAGES = ("warp_lcp", "fluids", "granular")
 # lines that only a type checker, the time of a compiler or an eye can tell
 UNSEEN = re.compile(r"TYPE_CHECKING|enable_backward|\(\d+, \d+, \d+\)|\[\d+, \d+, \d+\]")
-APART = re.compile(r"/distributed|/__init__\.py$|parallel_|_table\.py$")  # needs ranks of MPI; names; tables of numbers
+APART = re.compile(r"/distributed|/__init__\.py$|/rank_|_table\.py$")  # needs ranks of MPI; names; tables of numbers
 
 BINARY = "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Mul Mod_FloorDiv Pow_Mul BitAnd_BitOr BitOr_BitAnd LShift_RShift"
 COMPARISON = "Lt_LtE Lt_GtE LtE_Lt LtE_Gt Gt_GtE Gt_LtE GtE_Gt GtE_Lt Eq_NotEq NotEq_Eq Is_IsNot IsNot_Is"

@@ -16,10 +16,11 @@ from warp_lcp.benchmarks.record import Record
 from warp_lcp.benchmarks.replay import Quality
 from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.gallery.recorded import RecordedProblem, files, load
-from warp_lcp.run.loop import plan_dt
 from warp_lcp.run.problem_folder import ProblemFolder
+from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Recorded, simulators
+from warp_lcp.scene.simulator import simulators
+from warp_lcp.simulation import Recorded
 from warp_lcp.solvers.registry import grid_methods
 
 PROBLEMS = 4  # of a run, at equal distances

@@ -12,10 +12,10 @@ import warp as wp
 
 from warp_lcp.benchmarks.record import Record
 from warp_lcp.benchmarks.timing import Figure, Options
-from warp_lcp.run.loop import plan_dt
+from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.presets import changed
 from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import simulators
+from warp_lcp.scene.simulator import simulators
 
 STATES = 3  # of a run, at equal distances
 METHODS = ("accelerated-projection", "interleaved-sweeps")

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from warp_lcp import simulation as simulator
 from warp_lcp.cli import commands as cli
+from warp_lcp.scene import simulator
 from warp_lcp.simulation import SimulationFailed
 
 

@@ -15,11 +15,11 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from warp_lcp import simulation as plug_ins
 from warp_lcp.cli import commands as cli
 from warp_lcp.distributed import meeting
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.run import parallel_frames
+from warp_lcp.frames import frames
+from warp_lcp.scene import simulator as plug_ins
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Points, SimulationFailed, StepFailed
 
@@ -144,7 +144,7 @@ def trouble(dots: Dots) -> None:
         def full(*arguments: object) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-        parallel_frames.ParallelFrames.write_part = full
+        frames.FrameFolder.write_part = full
 
 
 def main(words: list[str]) -> None:

@@ -13,11 +13,11 @@ import pytest
 from dots_on_ranks import COUNT, SCENE, DotsSimulator
 from typer.testing import CliRunner
 
-from warp_lcp import simulation as simulator
 from warp_lcp.cli import commands as cli
 from warp_lcp.frames.pieces import one_mesh, piece_files
 from warp_lcp.frames.vtu import read_vtu
 from warp_lcp.render.recording import Recording
+from warp_lcp.scene import simulator
 
 PROGRAM = Path(__file__).with_name("dots_on_ranks.py")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from small_liquids import box, create, scene
-from warp_lcp.run.loop import run_scene
+from small_runs import run_into
 from warp_lcp.scene.scene_file import load_scene
 
 
@@ -57,12 +57,12 @@ def written(folder: Path) -> dict[str, bytes]:
 def test_resumed_equals_uninterrupted(name: str, overrides: list[str], tmp_path: Path) -> None:
     scene = load_scene(name, overrides)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert run_scene(scene, whole, device="cpu", observer=Silent()).status == "finished"
+    assert run_into(scene, whole, observer=Silent()).status == "finished"
     watch = Silent()
-    first = run_scene(scene, parts, device="cpu", observer=watch, stop=lambda: watch.steps >= 3)
+    first = run_into(scene, parts, observer=watch, stop=lambda: watch.steps >= 3)
     assert first.status == "stopped"
     rest = Silent()
-    second = run_scene(scene, parts, device="cpu", observer=rest, resume=True)
+    second = run_into(scene, parts, observer=rest, resume=True)
     assert second.status == "finished"
     assert second.resumed_from_step == 3
     assert watch.steps + rest.steps == second.steps

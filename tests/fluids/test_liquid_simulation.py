@@ -7,7 +7,8 @@ import pytest
 from small_liquids import GRAVITY, advance, box, create, dam, scene
 from warp_lcp.fluids import SIMULATOR, LiquidSimulation
 from warp_lcp.grid.particles import Particles
-from warp_lcp.simulation import Cells, Points, Profiled, SimulationFailed, Simulator, StepFailed, simulators
+from warp_lcp.scene.simulator import Simulator, simulators
+from warp_lcp.simulation import Cells, Points, Profiled, SimulationFailed, StepFailed
 
 DIMENSIONS = [2, 3]
 

@@ -11,8 +11,7 @@ from warp_lcp.frames.pieces import describe, one_grid, piece_files, write_whole
 from warp_lcp.render import recording
 from warp_lcp.render.recording import Color, Recording, RenderError
 from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
-from warp_lcp.run.parallel_folder import ParallelRunFolder
-from warp_lcp.run.parallel_frames import ParallelFrames
+from warp_lcp.run.rank_frames import RankFrames
 from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.simulation import Cells, Part, Points, Surface
 
@@ -56,11 +55,11 @@ def write(folder: Path, grid_format: str, frames: int = 1) -> None:
         for rank, box in enumerate(BOXES):
             meeting = Meeting.of_one()
             meeting.ranks.comm.rank = rank  # of ranks that are asked nothing else
-            mine = ParallelFrames(folder, grid_format, meeting)
+            mine = RankFrames(FrameFolder(folder, grid_format), meeting)
             mine.write(index, 0.5 * index, piece(box))
             found.append(mine.describe(piece(box)))
         if index == 0:
-            first = ParallelFrames(folder, grid_format, Meeting.of_one())
+            first = RankFrames(FrameFolder(folder, grid_format), Meeting.of_one())
         first.publish(index, 0.5 * index, found)
 
 
@@ -171,7 +170,7 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
 def test_a_folder_that_ranks_do_not_share_is_refused(dots, scene_file, tmp_path):
     meeting = Meeting.of_one()
     meeting.ranks.comm.rank = 1  # the first one writes elsewhere
-    folder = ParallelRunFolder(tmp_path / "out", load_scene(scene_file), meeting)
+    folder = RunFolder(tmp_path / "out", load_scene(scene_file), meeting)
     with pytest.raises(OutputError, match="is not the folder that rank 0 writes; choose one that all machines share"):
         folder.start(RunRecord("dots", "dots", "cpu"))
 

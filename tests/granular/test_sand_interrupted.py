@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from small_runs import run_into
 from small_sands import box, create, scene
-from warp_lcp.run.loop import run_scene
 from warp_lcp.scene.scene_file import load_scene
 
 FAST = ["output.checkpoint_every=5", "solver.max_iterations=60"]
@@ -52,10 +52,10 @@ def written(folder: Path) -> dict[str, bytes]:
 def test_resumed_sand_equals_uninterrupted(name: str, overrides: list[str], tmp_path: Path) -> None:
     model = load_scene(name, [*overrides, *FAST])
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert run_scene(model, whole, device="cpu", observer=Silent()).status == "finished"
+    assert run_into(model, whole, observer=Silent()).status == "finished"
     watch = Silent()
-    assert run_scene(model, parts, device="cpu", observer=watch, stop=lambda: watch.steps >= 13).status == "stopped"
-    second = run_scene(model, parts, device="cpu", observer=Silent(), resume=True)
+    assert run_into(model, parts, observer=watch, stop=lambda: watch.steps >= 13).status == "stopped"
+    second = run_into(model, parts, observer=Silent(), resume=True)
     assert (second.status, second.resumed_from_step) == ("finished", 13)
     assert written(whole) == written(parts)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.run.loop import run_scene
+from small_runs import run_into
 from warp_lcp.scene.scene_file import load_scene
 
 
@@ -28,7 +28,7 @@ class Silent:
 
 def run(name: str, folder: Path, *overrides: str) -> dict[str, np.ndarray]:
     """Run a scene and return the columns of its log that are numbers."""
-    assert run_scene(load_scene(name, list(overrides)), folder, device="cpu", observer=Silent()).status == "finished"
+    assert run_into(load_scene(name, list(overrides)), folder, observer=Silent()).status == "finished"
     with open(folder / "log.csv", newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     columns = ("dt", "mass", "coupled_residual", "dissipation", "predicted_excess", "max_fraction", "runout", "height", "max_speed")

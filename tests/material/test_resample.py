@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 
 from small_liquids import advance, box, create, scene
+from small_runs import run_into
 from warp_lcp.material.resample import resampled
 from warp_lcp.run.folder import OutputError
-from warp_lcp.run.loop import run_scene
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 
@@ -101,7 +101,7 @@ def go(out: Path, *overrides: str, resume: bool = False, steps: int = 10**6) -> 
     left = iter(range(steps, -1, -1))
     scene = load_scene("dam-break-2d", [*SHORT, *overrides])
     observer = Lines(Console(quiet=True))
-    return run_scene(scene, out, device="cpu", observer=observer, resume=resume, stop=lambda: next(left) <= 1)
+    return run_into(scene, out, observer=observer, resume=resume, stop=lambda: next(left) <= 1)
 
 
 def test_a_run_is_resumed_on_another_grid_and_says_so(tmp_path):

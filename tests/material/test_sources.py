@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from small_liquids import advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
-from warp_lcp.run.loop import take_step
+from warp_lcp.run.stepping import take_step
 from warp_lcp.simulation import SimulationFailed
 
 TAP = box([0.0, 0.5], [0.125, 0.625], velocity=[1.0, 0.0])

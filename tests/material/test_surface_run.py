@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from mesh_checks import assert_closed, enclosed
-from warp_lcp.run.loop import run_scene
+from small_runs import run_into
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 
@@ -32,7 +32,7 @@ surface = true
 
 
 def go(scene: Path, out: Path, *overrides: str, **options):
-    return run_scene(load_scene(scene, overrides), out, device="cpu", observer=Lines(Console(quiet=True)), **options)
+    return run_into(load_scene(scene, overrides), out, observer=Lines(Console(quiet=True)), **options)
 
 
 def test_a_run_writes_a_series_of_closed_surfaces(tmp_path):

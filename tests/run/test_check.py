@@ -14,8 +14,8 @@ from warp_lcp.benchmarks.memory import array_bytes, forget_peak
 from warp_lcp.cli import commands as cli
 from warp_lcp.fluids.simulator import FluidsSimulator
 from warp_lcp.run import check, devices
-from warp_lcp.run.calibrate import MOST, step_seconds
 from warp_lcp.run.check import check_memory, check_scene
+from warp_lcp.run.trial import MOST, step_seconds
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 from warp_lcp.simulation import StepFailed
@@ -101,7 +101,7 @@ def test_the_time_of_a_step_leaves_the_first_out(dots: Any, scene_file: Path) ->
 
 
 def test_long_steps_are_few(dots: Any, scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("warp_lcp.run.calibrate.ENOUGH", 0.0)
+    monkeypatch.setattr("warp_lcp.run.trial.ENOUGH", 0.0)
     assert step_seconds(load_scene(scene_file), device="cpu")[1] == 3
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 
 from warp_lcp.cli import commands as cli
 from warp_lcp.run.check import check_scene, start
-from warp_lcp.run.loop import take_step
+from warp_lcp.run.stepping import take_step
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import MOST_TABLES, built_in_scenes, load_scene
 from warp_lcp.scene.table import SceneError

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from small_runs import run_into
 from warp_lcp.distributed.meeting import Meeting
 from warp_lcp.run.checkpoint import PIECES, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import fingerprint
-from warp_lcp.run.loop import run_scene
-from warp_lcp.run.parallel_checkpoint import ParallelCheckpoints
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
@@ -36,7 +35,7 @@ def names(folder):
 
 
 def test_a_rank_writes_its_piece_and_then_the_whole(tmp_path):
-    folder = ParallelCheckpoints(tmp_path / "c", SCENE, {"time.cfl": 2.0}, Meeting.of_one())
+    folder = CheckpointFolder(tmp_path / "c", SCENE, {"time.cfl": 2.0}, Meeting.of_one())
     assert folder.write(Checkpoint(4, 0.5, state(0, 4))) == tmp_path / "c" / "rank_0000" / "step_000004.npz"
     found, refused = CheckpointFolder(tmp_path / "c", SCENE).newest()
     assert found is not None and not refused
@@ -78,7 +77,7 @@ def test_without_a_piece_the_checkpoint_before_is_taken(tmp_path, harm):
     found, refused = one.newest()
     assert found is not None and found.step == 3
     assert len(refused) == 1 and str(piece) in refused[0]
-    many = ParallelCheckpoints(tmp_path, SCENE, {}, Meeting.of_one())
+    many = CheckpointFolder(tmp_path, SCENE, {}, Meeting.of_one())
     newest, _ = many.newest()
     assert newest is not None and newest.step == 4 and not many.complete(newest)
     again, refused_by_many = many.newest()
@@ -93,7 +92,7 @@ def test_without_a_piece_the_checkpoint_before_is_taken(tmp_path, harm):
 def test_old_pieces_go_with_their_checkpoint(tmp_path):
     write(tmp_path, 3, ranks=4)
     write(tmp_path, 6, ranks=2)
-    many = ParallelCheckpoints(tmp_path, SCENE, {}, Meeting.of_one())
+    many = CheckpointFolder(tmp_path, SCENE, {}, Meeting.of_one())
     many.prune(1)
     assert names(tmp_path) == ["rank_0000/step_000006.npz", "rank_0001/step_000006.npz", "step_000006.npz"]
 
@@ -101,9 +100,9 @@ def test_old_pieces_go_with_their_checkpoint(tmp_path):
 def test_a_simulator_that_cannot_join_pieces_says_so(dots, scene_file, tmp_path):
     out, watcher = tmp_path / "out", Lines(Console(quiet=True))
     scene = load_scene(scene_file)
-    run_scene(scene, out, device="cpu", observer=watcher, last_frame=1)
+    run_into(scene, out, observer=watcher, last_frame=1)
     for file in (out / "checkpoints").iterdir():
         file.unlink()
     write(out / "checkpoints", 4, whose=fingerprint(scene))
     with pytest.raises(SceneError, match="the checkpoint is one of several ranks: continue with --engine petsc"):
-        run_scene(scene, out, device="cpu", observer=watcher, resume=True)
+        run_into(scene, out, observer=watcher, resume=True)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from small_runs import run_into
 from warp_lcp.run.folder import OutputError
-from warp_lcp.run.loop import run_scene
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 
@@ -30,7 +30,7 @@ OPERATIONS = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}  # au
 
 def go(scene: Path, out: Path, *overrides: str, resume: bool = False, force: bool = False) -> Any:
     loaded = load_scene(scene, [*SHORT, *overrides])
-    return run_scene(loaded, out, device="cpu", observer=Lines(Console(quiet=True)), resume=resume, force=force)
+    return run_into(loaded, out, observer=Lines(Console(quiet=True)), resume=resume, force=force)
 
 
 def contents(out: Path) -> dict[str, Any]:

@@ -12,10 +12,10 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from small_runs import run_into
 from warp_lcp.cli import commands as cli
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.gaps import spans
-from warp_lcp.run.loop import run_scene
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 
@@ -27,7 +27,7 @@ KINDS = ("particles", "grid")
 def out(scene_file: Path, tmp_path: Path) -> Path:
     """A run that was stopped."""
     asked = iter(range(1, 10_000))
-    run_scene(load_scene(scene_file), tmp_path / "out", device="cpu", observer=Lines(Console(quiet=True)), stop=lambda: next(asked) >= STEP)
+    run_into(load_scene(scene_file), tmp_path / "out", observer=Lines(Console(quiet=True)), stop=lambda: next(asked) >= STEP)
     return tmp_path / "out"
 
 
@@ -104,7 +104,7 @@ def test_frames_without_checkpoints_and_log_are_not_thrown_away(out, scene_file)
     for record in ("{}", (out / "run.json").read_text()):
         (out / "run.json").write_text(record)
         with pytest.raises(OutputError, match="no checkpoint to resume from"):
-            run_scene(load_scene(scene_file), out, device="cpu", observer=Lines(Console(quiet=True)), resume=True)
+            run_into(load_scene(scene_file), out, observer=Lines(Console(quiet=True)), resume=True)
     assert frames(out, "grid") == [0, 1, 2, 3]
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from small_runs import run_into
 from warp_lcp.cli import commands as cli
 from warp_lcp.run import interruption
-from warp_lcp.run.folder import mark_stopped
+from warp_lcp.run.folder import mark_ended
 from warp_lcp.run.interruption import SIGNALS, Interruption
-from warp_lcp.run.loop import run_scene
 
 EACH = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 
@@ -133,13 +133,13 @@ def test_a_compiler_is_not_waited_for(monkeypatch):
 
 def test_the_record_of_a_run_that_is_ended(run, tmp_path):
     assert run("--frames", 0).exit_code == 0
-    mark_stopped(tmp_path / "out", "SIGINT")
+    mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT before its first step had ended")
     assert record(tmp_path)["status"] == "finished"
     (tmp_path / "out" / "run.json").write_text(json.dumps({**record(tmp_path), "status": "running"}))
-    mark_stopped(tmp_path / "out", "SIGINT")
+    mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT before its first step had ended")
     found = record(tmp_path)
     assert (found["status"], found["reason"]) == ("stopped", "interrupted by SIGINT before its first step had ended")
-    mark_stopped(tmp_path, "SIGINT")  # of a run that has not begun
+    mark_ended(tmp_path, "stopped", "interrupted by SIGINT")  # of a run that has not begun
 
 
 def test_ranks_wait_for_each_other():
@@ -151,4 +151,4 @@ def test_ranks_wait_for_each_other():
 def test_those_who_call_the_library_need_not_name_a_signal(scene_file, tmp_path):
     from test_run import Watcher, load_scene
 
-    assert run_scene(load_scene(scene_file), tmp_path / "out", device="cpu", observer=Watcher(), stop=lambda: True).reason == "interrupted"
+    assert run_into(load_scene(scene_file), tmp_path / "out", observer=Watcher(), stop=lambda: True).reason == "interrupted"

@@ -52,14 +52,14 @@ def test_the_table_accounts_for_all_of_the_time():
     with profile.beside("c"):
         pass
     profile.stages["c"].seconds = 3.0
-    lines = [line.split() for line in profile.table(100, 4.0)]
+    lines = [line.split() for line in profile.table(100, 4.0).splitlines()]
     assert lines[0] == ["stage", "seconds", "share", "ms", "a", "step", "MB", "a", "step", "GB/s"]
     assert lines[1] == ["a", "1.000", "25.0%", "10.000", "40.00", "4.00"]
     assert lines[2] == ["b", "2.000", "50.0%", "20.000"]
     assert lines[3][:3] == ["(c)", "3.000", "75.0%"]
     assert lines[4] == ["rest", "1.000", "25.0%", "10.000"]
     assert lines[5][:2] == ["all", "4.000"]
-    assert profile.table(0, 0.0)[1].split()[:2] == ["a", "1.000"]
+    assert profile.table(0, 0.0).splitlines()[1].split()[:2] == ["a", "1.000"]
 
 
 def test_the_file_has_every_stage(tmp_path):
@@ -101,7 +101,7 @@ def test_kernels_that_load_are_a_stage_of_their_own():
     assert kernels.seconds > 0.0
     assert 0.0 <= stage.seconds <= seconds - 0.99 * kernels.seconds
     assert Said.messages == ["heard"]
-    assert profile.table(1, seconds)[1].startswith(KERNELS)
+    assert profile.table(1, seconds).splitlines()[1].startswith(KERNELS)
 
 
 def test_without_a_profile_nothing_is_measured(monkeypatch, tmp_path):

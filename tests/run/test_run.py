@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from small_runs import run_into
 from warp_lcp.frames import vtu as vtu_module
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.run import loop as run_module
 from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.run.folder import OutputError, RunRecord
-from warp_lcp.run.loop import plan_dt, run_scene
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Lines
+from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.scene import SceneError, Time
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed
@@ -41,7 +42,7 @@ class Watcher(Lines):
 
 def go(scene: Path, out: Path, *overrides: str, **options: Any) -> RunRecord:
     observer = options.pop("observer", None) or Watcher()
-    return run_scene(load_scene(scene, overrides), out, device="cpu", observer=observer, **options)
+    return run_into(load_scene(scene, overrides), out, observer=observer, **options)
 
 
 def rows(out: Path) -> list[dict[str, str]]:
@@ -363,7 +364,9 @@ def test_a_frame_that_fails_late_ends_the_run_without_a_checkpoint_after_it(dots
     assert result.reason.startswith("the disk is full")
     assert sorted(path.name for path in out.glob("frames/particles*")) == [f"particles_{k:06d}.vtu" for k in range(3)]
     monkeypatch.undo()
-    monkeypatch.setattr("warp_lcp.simulation.entry_points", lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()])
+    monkeypatch.setattr(
+        "warp_lcp.scene.simulator.entry_points", lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()]
+    )
     assert go(scene_file, out, resume=True).status == "finished"
     assert contents(out) == contents(whole)
 

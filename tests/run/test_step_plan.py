@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from warp_lcp.run.loop import SAME_TIME, SHARE, plan_dt, take_step
+from warp_lcp.run.loop import SAME_TIME
+from warp_lcp.run.stepping import SHARE, plan_dt, take_step
 from warp_lcp.scene.scene import Time
 from warp_lcp.simulation import StepFailed
 

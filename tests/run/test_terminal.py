@@ -11,10 +11,9 @@ import pytest
 from rich.table import Table
 from typer.testing import CliRunner, Result
 
-from small_runs import MINIMAL
+from small_runs import MINIMAL, run_into
 from warp_lcp.cli import commands as cli
 from warp_lcp.run import folder as run_folder
-from warp_lcp.run.loop import run_scene
 from warp_lcp.run.progress import Lines
 from warp_lcp.run.terminal import Terminal, say
 from warp_lcp.scene.foreign import one_line, visible
@@ -175,7 +174,7 @@ def test_a_terminal_that_is_gone_ends_no_run(dots, scene_file, tmp_path, code):
             raise OSError(code, os.strerror(code))
 
     watcher = Lines(Terminal(file=Gone()))
-    record = run_scene(load_scene(scene_file), tmp_path / "out", device="cpu", observer=watcher, last_frame=2)
+    record = run_into(load_scene(scene_file), tmp_path / "out", observer=watcher, last_frame=2)
     assert record.status == "finished"
 
 

@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 
 from warp_lcp.cli import commands as cli
 from warp_lcp.run import tune as tuning
-from warp_lcp.run.accuracy import Bounds
-from warp_lcp.run.trial import Look, Trial, look_times, spread, trial
+from warp_lcp.run.trial import Bounds, Look, Trial, look_times, spread, trial
 from warp_lcp.scene.presets import price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene

@@ -23,23 +23,21 @@ from warp_lcp.render.film import check_rate
 from warp_lcp.render.recording import Color, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
 from warp_lcp.render.viewer import view_run
-from warp_lcp.run.calibrate import step_seconds
 from warp_lcp.run.check import check_memory, check_scene, start
-from warp_lcp.run.devices import DeviceError, choose_device, cuda_driver, devices
-from warp_lcp.run.engine import Engine, EngineError, EngineOption
-from warp_lcp.run.folder import OutputError, RunRecord, mark_stopped
+from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
+from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
 from warp_lcp.run.interruption import Interrupted, Interruption
-from warp_lcp.run.launcher import crew_of, default_folder
+from warp_lcp.run.launcher import default_folder, launcher_of
+from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Bar, Lines
-from warp_lcp.run.terminal import Commands, Terminal, say, tell
+from warp_lcp.run.terminal import Commands, Terminal, say, table_lines, tell
+from warp_lcp.run.trial import step_seconds
 from warp_lcp.run.tune import FRAMES, Tuning, tune, write_tuned
-from warp_lcp.run.versions import versions
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, load_scene
-from warp_lcp.scene.table import SceneError
-from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
 FAILED = 1
 WRONG_INPUT = 2
@@ -56,6 +54,9 @@ app = typer.Typer(
 
 SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`).")
+]
+EngineOption = Annotated[
+    Engine, typer.Option(help="single: this process; petsc: the ranks that `mpiexec -n N warp-lcp ...` starts (needs petsc4py and mpi4py).")
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -77,7 +78,7 @@ ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line on the process's own arguments."""
     app()
 
 
@@ -108,26 +109,32 @@ def run(
 ) -> None:
     """Simulate a scene into a folder that ParaView opens."""
     given = {"--out": out, "--device": device, "--frames": frames, "--resume": resume, "--force": force, "--force-memory": force_memory}
-    with _wrong_input(), crew_of(engine) as crew:
+    with _wrong_input(), launcher_of(engine) as launcher:
         if resume and force:
             raise OutputError("--resume continues a run and --force deletes it: choose one")
-        loaded = crew.load(scene, overrides or (), given)
-        chosen, console = crew.choose_device(device), crew.console
+        loaded = launcher.load(scene, overrides or (), given)
+        chosen, console = launcher.choose_device(device), launcher.console
         folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
-        say(console, f"{name} on {crew.place(chosen)}, into {folder}")
+        say(console, f"{name} on {launcher.place(chosen)}, into {folder}")
         if loaded.kept:
             say(console, f"--set as before: {', '.join(loaded.kept)}")
-        stop = Interruption(partial(say, console), at_once=crew.ranks is None, last=partial(mark_stopped, folder))
+        request = RunRequest(
+            scene=loaded.scene, out=folder, device=chosen, overrides=loaded.overrides, last_frame=frames, resume=resume, force=force,
+            force_memory=force_memory, record_problems=record_problems,
+        )  # fmt: skip
+        at_once = launcher.ranks is None
+
+        def last(name: str) -> None:
+            mark_ended(folder, "stopped", f"interrupted by {name} {BEFORE}")
+
+        stop = Interruption(partial(say, console), at_once=at_once, last=last)
         with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
-            watch = Profile(chosen) if profile and crew.speaks else None
-            record = crew.run(
-                loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, force_memory=force_memory,
-                stop=stop, profile=watch, record_problems=record_problems,
-            )  # fmt: skip
-    if not crew.speaks:
+            watch = Profile(chosen) if profile and launcher.is_root else None
+            record = launcher.run(request, observer=observer, stop=stop, profile=watch)
+    if not launcher.is_root:
         raise typer.Exit(0 if record.status == "finished" else FAILED)
     if watch:
-        tell("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))
+        tell(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds))
     _report(record, folder)
 
 
@@ -244,7 +251,7 @@ def tune_scene(
 
 @app.command()
 def scenes() -> None:
-    """List the built-in scenes."""
+    """List the built-in scenes with what they show."""
     with _wrong_input():
         _print_pairs([(name, load_scene(name).scene.description) for name in built_in_scenes()])
 
@@ -286,9 +293,9 @@ def solve(
     options: dict[str, Any] = {
         "method": method, "tolerance": tolerance, "max_iterations": max_iterations, "max_seconds": max_seconds
     }  # fmt: skip
-    with _wrong_input(), crew_of(engine) as crew:
-        crew.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
-        chosen = crew.choose_device(device)
+    with _wrong_input(), launcher_of(engine) as launcher:
+        launcher.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
+        chosen = launcher.choose_device(device)
         if out is not None and not out.parent.is_dir():
             raise ProblemError(f"--out {out}: there is no folder {out.parent}")
         if out is not None and out.is_dir():
@@ -296,7 +303,7 @@ def solve(
         outcome: Outcome
         if problem.suffix == SUFFIX:
             check_recorded(problem, right_side=right_side, lower=lower, upper=upper, out=out)
-            outcome = solve_recorded(problem, device=chosen, ranks=crew.ranks, **options)
+            outcome = solve_recorded(problem, device=chosen, ranks=launcher.ranks, **options)
         elif engine is Engine.PETSC:
             raise ProblemError(f"{problem}: --engine petsc solves problems of grids, which `warp-lcp run --record-problems` writes")
         elif right_side is None:
@@ -305,7 +312,7 @@ def solve(
             outcome = solve_files(problem, right_side, device=chosen, lower=lower or "0", upper=upper or "inf", **options)
         if out is not None:
             outcome.write(out)
-    if not crew.speaks:
+    if not launcher.is_root:
         raise typer.Exit(0 if outcome.result else FAILED)
     console = Terminal(soft_wrap=True, highlight=False)
     say(console, outcome.heading())
@@ -391,9 +398,7 @@ def info() -> None:
 def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
     """Say what was measured, and which settings are the fastest."""
     rows = tuning.rows()
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        tell("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    tell(table_lines(rows[0], rows[1:], left=range(len(rows[0]))))
     tell(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
     for line in tuning.verdict(accuracy):
         tell(line)
@@ -408,7 +413,7 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
 def _wrong_input() -> Iterator[None]:
     try:
         yield
-    except (SceneError, OutputError, DeviceError, RenderError, ProblemError, EngineError) as error:
+    except InputError as error:
         _end(str(error), WRONG_INPUT)
     except OSError as error:
         if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.ENOTDIR):

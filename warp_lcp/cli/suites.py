@@ -1,17 +1,16 @@
-"""What the driver asks of a suite of benchmarks, and how it finds one: the entry-point group `warp_lcp.benchmarks`."""
+"""What the command line asks of a suite of benchmarks, and how it finds one: the entry-point group `warp_lcp.benchmarks`."""
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-GROUP = "warp_lcp.benchmarks"
+from warp_lcp.scene.simulator import plug_ins
 
 
 @runtime_checkable
 class Benchmark(Protocol):
-    """A suite of measurements."""
+    """A suite of measurements, found by its entry point."""
 
     name: str
     summary: str
@@ -57,10 +56,4 @@ class Benchmark(Protocol):
 
 def benchmarks() -> dict[str, Benchmark]:
     """Return the installed suites by name."""
-    found = {}
-    for entry in entry_points(group=GROUP):
-        suite = entry.load()
-        if not isinstance(suite, Benchmark):
-            raise TypeError(f"entry point {entry.name!r} of {GROUP} is not a suite of benchmarks: {suite!r}")
-        found[entry.name] = suite
-    return found
+    return plug_ins("warp_lcp.benchmarks", Benchmark, "a suite of benchmarks")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import socket
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -95,6 +97,11 @@ class Meeting:
         """Return what the first rank has given."""
         return self._comm.bcast(value)
 
+    def share_of_device(self, device: str) -> float:
+        """Return what part of the work is on this rank's device, which others of its machine may have too."""
+        places = self.exchange((socket.gethostname(), device))
+        return places.count(places[self.ranks.rank]) / len(places)
+
     def enter(self) -> None:
         """Begin a block."""
         self._depth += 1
@@ -112,6 +119,9 @@ class Meeting:
         failure = self._failure(error)
         found = self._meet(error, failure)
         self._depth -= 1
+        if self.ranks.size == 1:
+            self.failed = [] if failure is None else [0]
+            return
         failed = [(rank, other) for rank, other in enumerate(found) if other is not None]
         self.failed = [rank for rank, _ in failed]
         if not failed:
@@ -215,3 +225,14 @@ def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
         yield f"rank {those[0]}: {text}" if len(those) == 1 else f"ranks {', '.join(map(str, those))}: {text}"
     if len(ranks) > SHOWN:
         yield f"and {len(ranks) - SHOWN} other messages"
+
+
+def on_root(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Have the root rank alone run a method of an object with a `meeting`, collectively: the others get None, and its error is theirs."""
+
+    @functools.wraps(method)
+    def collective(self: Any, *arguments: Any, **options: Any) -> Any:
+        with self.meeting.led():
+            return method(self, *arguments, **options) if self.meeting.ranks.first else None
+
+    return collective

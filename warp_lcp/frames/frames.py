@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Protocol, Self
 
 from warp_lcp.frames.atomic import make_folder, write_text
 from warp_lcp.frames.nvdb import nvdb_bytes, write_nvdb
@@ -136,6 +136,13 @@ class FrameFolder:
         return file
 
 
+class Frames(Protocol):
+    """What takes a run's frames."""
+
+    def write(self, index: int, time: float, frame: list[Part]) -> list[Path]:
+        """Write frame `index` of a time [s]; return its files."""
+
+
 class FrameWriter:
     """Write frames on a thread of its own while the simulation goes on; at most WAITING frames are in memory.
 
@@ -143,18 +150,13 @@ class FrameWriter:
     block waits for the frames that were put, whatever ended the block, and raises only if nothing else did.
     """
 
-    def __init__(self, folder: FrameFolder, watch: Stopwatch | None = None) -> None:
-        self.written: int | None = None  # the number of the newest frame that the thread brought to disk
+    def __init__(self, folder: Frames, watch: Stopwatch | None = None) -> None:
+        self.newest: int | None = None  # the number of the newest frame that is on disk
         self._folder = folder
         self._watch = watch or NoStopwatch()
         self._pending: deque[Future[None]] = deque()
         self._failed = False
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames")
-
-    @property
-    def newest(self) -> int | None:
-        """The number of the newest frame that is there as a whole."""
-        return self.written
 
     def put(self, index: int, time: float, frame: list[Part]) -> None:
         """Hand over a frame, whose arrays nobody changes any more; wait if there are too many already.
@@ -184,13 +186,17 @@ class FrameWriter:
         while self._pending:
             self._finish()
 
+    def end(self) -> None:
+        """Wait for the frames that were put, and take no more."""
+        self._thread.shutdown()
+
     def __enter__(self) -> Self:
         """Return the writer itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """End the thread."""
-        self._thread.shutdown()
+        self.end()
         if kind is None:
             self.flush()
 
@@ -206,7 +212,7 @@ class FrameWriter:
         with self._watch.beside("frames, written"):
             files = self._folder.write(index, time, frame)
         self._watch.wrote("frames, written", *files)
-        self._failed, self.written = False, index
+        self._failed, self.newest = False, index
 
 
 def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> int:

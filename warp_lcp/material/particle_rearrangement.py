@@ -140,7 +140,7 @@ class Rearrangement:
             self.correction = (self.correction or self._made()) if STATE in state else None
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from `state`."""
+        """Continue from a checkpoint's `state`."""
         if self.correction is not None:
             self.correction.x.assign(state[STATE])
 

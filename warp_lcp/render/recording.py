@@ -18,7 +18,7 @@ from warp_lcp.frames.vti import read_vti
 from warp_lcp.frames.vtu import Mesh, read_vtu
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
-from warp_lcp.simulation import Cells, Surface
+from warp_lcp.simulation import Cells, InputError, Surface
 
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
@@ -30,7 +30,7 @@ PALETTES = {  # of speeds, by `Scene.palette`
 }
 
 
-class RenderError(ValueError):
+class RenderError(InputError):
     """Nothing can be drawn; the message says why and what to do."""
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.run.devices import free_memory
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
-from warp_lcp.scene.table import Problem, SceneError
-from warp_lcp.simulation import Simulation, simulators
+from warp_lcp.scene.simulator import DistributedSimulator, simulators
+from warp_lcp.scene.table import Problem, SceneError, written
+from warp_lcp.simulation import Simulation
 
 
 def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene, list[tuple[str, str]]]:
@@ -51,18 +53,40 @@ def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
         raise SceneError(scene.scene.name, [Problem("domain.resolution", message, str(scene.domain.resolution))])
 
 
-def start(scene: Scene, device: str) -> Simulation:
+def check_ranks(scene: Scene) -> None:
+    """Refuse a scene that nothing simulates on ranks, or whose output cannot be written in pieces.
+
+    Raises:
+        SceneError: listing what stands against it.
+    """
+    name = scene.scene.simulator
+    problems = []
+    if not isinstance(simulators()[name], DistributedSimulator):
+        problems.append(Problem("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
+    if scene.output.volume:
+        problems.append(Problem("output.volume", "--engine petsc has no volumes, which cannot be written in pieces", "true"))
+    if scene.output.surface_ply:
+        problems.append(Problem("output.surface_ply", "--engine petsc writes surfaces as .vtu pieces alone", "true"))
+    if problems:
+        raise SceneError(scene.scene.name, problems)
+
+
+def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
     """Return the simulation of a scene where a run begins, which refuses what a run would refuse before its first step.
 
     Args:
         scene: what would run.
         device: a Warp device's name.
+        ranks: that share it, for this rank's part.
 
     Raises:
         SceneError: the scene cannot be simulated.
     """
+    simulator = simulators()[scene.scene.simulator]
     try:
-        return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+        if ranks is not None and isinstance(simulator, DistributedSimulator):
+            return simulator.create_distributed(scene, ranks, device=device, folder=Path.cwd())
+        return simulator.create(scene, device=device, folder=Path.cwd())
     except ValueError as error:
         check_shapes(scene, scene.scene.name)  # whose message names the shape
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error

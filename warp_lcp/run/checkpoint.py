@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.archive import Archive, ArchiveError
+from warp_lcp.distributed.meeting import Meeting, on_root
 from warp_lcp.frames.atomic import make_folder, replacing
 from warp_lcp.frames.pieces import in_ranks, rank_folder
 
@@ -90,14 +91,17 @@ class CheckpointFolder:
         folder: made when the first checkpoint is written.
         fingerprint: tells the run's scene from others, whatever may change when it goes on.
         keys: of the scene, with their values, written with each checkpoint.
+        meeting: of the ranks that share the run, whose checkpoints are in pieces; `write`, `complete` and `prune` are collective then.
 
     Attributes:
         spared: steps whose checkpoints `prune` leaves, as something that is missing can be made again from them.
     """
 
-    def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None, meeting: Meeting | None = None) -> None:
         """Look at a folder."""
-        self.folder = folder
+        self.folder, self.meeting, self._in_pieces = folder, meeting or Meeting.of_one(), meeting is not None
+        self._refused: dict[int, str] = {}  # why the pieces of a step cannot be used, as its ranks have found
+        self._continued: int | None = None  # the step that ranks go on from, whose pieces are not to be replaced
         self.fingerprint = fingerprint
         self.keys = dict(keys or {})
         self.spared: set[int] = set()
@@ -112,12 +116,29 @@ class CheckpointFolder:
         return sorted((int(match["step"]) for file in files if (match := CHECKPOINT_FILE.fullmatch(file.name))), reverse=True)
 
     def write(self, checkpoint: Checkpoint) -> Path:
-        """Write a checkpoint atomically.
+        """Write a checkpoint atomically; of several ranks each its piece, and then the root rank the file that makes them count.
+
+        Returns:
+            The file of this rank's state.
 
         Raises:
-            OSError: the file cannot be written; the earlier ones are intact.
+            OSError: a file cannot be written; the earlier checkpoints are intact.
             ValueError: an array holds Python objects, which would need a pickle.
         """
+        if not self._in_pieces:
+            return self._write(checkpoint)
+        if checkpoint.step == self._continued:
+            return self.path(checkpoint.step)
+        with self.meeting.together():
+            make_folder(self.folder)
+            file = self.of_rank(self.meeting.ranks.rank)._write(checkpoint)
+        checksums = self.meeting.exchange(checkpoint.checksum)
+        with self.meeting.led():
+            if self.meeting.ranks.first:
+                self._write(Checkpoint(checkpoint.step, checkpoint.time, {PIECES: np.array(checksums)}))
+        return file
+
+    def _write(self, checkpoint: Checkpoint) -> Path:
         pickled = [name for name, array in checkpoint.state.items() if array.dtype.hasobject]
         if pickled:
             raise ValueError(f"these arrays hold Python objects, which would need a pickle: {', '.join(pickled)}")
@@ -136,6 +157,7 @@ class CheckpointFolder:
             np.savez(file, **arrays)
         return self.path(checkpoint.step)
 
+    @on_root
     def prune(self, kept: int) -> None:
         """Delete all but the newest `kept` and those that are spared, and pieces that belong to none.
 
@@ -190,14 +212,30 @@ class CheckpointFolder:
         return checkpoint
 
     def verify(self, checkpoint: Checkpoint) -> None:
-        """Read and verify the pieces of a checkpoint, if it is in pieces.
+        """Read and verify the pieces of a checkpoint, if it is in pieces; ranks have done so in `complete`.
 
         Raises:
             CheckpointError: one of them cannot be used.
         """
+        if checkpoint.step in self._refused:
+            raise CheckpointError(self._refused[checkpoint.step])
+        if self._in_pieces:
+            return
         for rank in range(len(checkpoint.state.get(PIECES, ()))):
             if problem := self.problem(checkpoint, rank):
                 raise CheckpointError(problem)
+
+    def complete(self, checkpoint: Checkpoint) -> bool:
+        """Verify the pieces of a checkpoint, each on one rank; without a valid one `newest` refuses the checkpoint from now on."""
+        self._continued = checkpoint.step
+        ranks = self.meeting.ranks
+        mine = range(ranks.rank, len(checkpoint.state.get(PIECES, ())), ranks.size)
+        problems = [problem for rank in mine if (problem := self.problem(checkpoint, rank))]
+        found = [problem for those in self.meeting.exchange(problems) for problem in those]
+        if found:
+            more = f" (and {len(found) - 1} other pieces)" if len(found) > 1 else ""
+            self._refused[checkpoint.step] = found[0] + more
+        return not found
 
     def problem(self, checkpoint: Checkpoint, rank: int) -> str:
         """Return why a rank's piece of a checkpoint cannot be used, "" if it can."""

@@ -1,18 +1,33 @@
-"""Which devices there are."""
+"""What a run runs on: this process or ranks, devices, and the versions of the software."""
 
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
+from enum import StrEnum
+from importlib.metadata import PackageNotFoundError, version
 
 import warp as wp
 
 from warp_lcp.claims import free_host_memory
 from warp_lcp.run.kernel_cache import cache_error, watch_loads
+from warp_lcp.simulation import InputError
 
 
-class DeviceError(ValueError):
+class EngineError(InputError):
+    """An engine cannot be used here. The message says why and what to do."""
+
+
+class Engine(StrEnum):
+    """What carries a computation: this process, or the ranks that `mpiexec` has started."""
+
+    SINGLE = "single"  # one process with one device
+    PETSC = "petsc"  # the ranks of MPI, whose grids PETSc cuts and exchanges
+
+
+class DeviceError(InputError):
     """There is no such device; the message lists those there are."""
 
 
@@ -80,3 +95,16 @@ def _describe(device: wp.Device) -> str:
     if device.is_cuda:
         return f"{device.name}, {device.total_memory / 2**30:.1f} GiB, compute capability {device.arch / 10:.1f}"
     return str(device.name)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what decides a run's numbers."""
+    found = {name: _version(name) for name in ("warp-lcp", "warp-lang", "numpy")}
+    return {**found, "python": platform.python_version(), "platform": platform.platform()}
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed as a distribution"

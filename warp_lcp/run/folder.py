@@ -7,24 +7,27 @@ import re
 import shutil
 import tempfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
+import numpy as np
 from pydantic import TypeAdapter
 
+from warp_lcp.distributed.meeting import Meeting, on_root
 from warp_lcp.frames.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
-from warp_lcp.run.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
+from warp_lcp.run.checkpoint import CHECKPOINT_FILE, PIECES, REFUSED_FILE, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
+from warp_lcp.run.devices import versions
 from warp_lcp.run.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.run.gaps import gaps
-from warp_lcp.run.log import Log
-from warp_lcp.run.versions import versions
+from warp_lcp.run.log import Log, OutputError
+from warp_lcp.run.rank_frames import RankFrames, RankFrameWriter
 from warp_lcp.scene.foreign import one_line
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import dump_scene, keys, load_scene, table_keys
@@ -45,10 +48,6 @@ STORED_STATE = re.compile(f"{CHECKPOINT_FILE.pattern}|{REFUSED_FILE.pattern}")
 OWN_FOLDERS = {"frames": FRAME_FILE, CHECKPOINTS: STORED_STATE, "images": IMAGE_FILE}
 
 
-class OutputError(ValueError):
-    """The output folder cannot take the run. The message says why and what to do."""
-
-
 @dataclass
 class RunRecord:
     """What run.json says of a run.
@@ -57,7 +56,7 @@ class RunRecord:
         scene: the scene's name.
         simulator: what simulates it.
         device: where.
-        engine: what carried it, see `warp_lcp.run.engine`.
+        engine: what carried it, see `warp_lcp.run.devices`.
         ranks: processes that shared it.
         status: how it ended, or that it has not.
         reason: why it ended.
@@ -112,20 +111,29 @@ class Continuation:
 
 
 class RunFolder:
-    """scene.toml, run.json, log.csv, frames and checkpoints of one run."""
+    """scene.toml, run.json, log.csv, frames and checkpoints of one run.
 
-    def __init__(self, path: Path, scene: Scene) -> None:
-        """Look at a folder, there or not; nothing is written yet.
+    Of several ranks the root rank owns the folder and each adds its pieces; methods are collective, but for `write_record`, and raise on
+    all ranks what fails on any.
 
-        Raises:
-            SceneError: a mesh file of the scene cannot be read.
-        """
-        self.path = path
-        self.scene = scene
-        self.mesh_files = mesh_digests(scene)
-        self.log = path / "log.csv"
-        self.frames = FrameFolder(path, scene.output.grid_format, surface_ply=scene.output.surface_ply)
-        self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene))
+    Args:
+        path: of the folder, which all ranks see.
+        scene: what runs.
+        meeting: of the ranks that share the run; None: this process has it alone.
+
+    Raises:
+        SceneError: a mesh file of the scene cannot be read.
+    """
+
+    def __init__(self, path: Path, scene: Scene, meeting: Meeting | None = None) -> None:
+        """Look at a folder, there or not; nothing is written yet."""
+        self.path, self.scene, self.log = path, scene, path / "log.csv"
+        self.meeting, self._shared = meeting or Meeting.of_one(), meeting is not None
+        with self.meeting.together():
+            self.mesh_files = mesh_digests(scene)
+        whole = FrameFolder(path, scene.output.grid_format, surface_ply=scene.output.surface_ply)
+        self.frames = RankFrames(whole, meeting) if meeting else whole
+        self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene), meeting)
 
     @contextmanager
     def held(self, *, resume: bool) -> Iterator[list[str]]:
@@ -137,20 +145,25 @@ class RunFolder:
         Raises:
             OutputError: the folder cannot be made or written, another process runs there, or there is no run to resume.
         """
+        with ExitStack() as stack:
+            yield self._lock(stack, resume) or []
+
+    @on_root
+    def _lock(self, stack: ExitStack, resume: bool) -> list[str]:
+        """Keep other processes out until a stack ends; return remarks."""
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path}: is not a folder")
         if resume:
             self._check_run()
         _probe(self.path)
-        with ExitStack() as stack:
-            try:
-                remarks = stack.enter_context(locked(self.path))
-            except FolderBusyError as error:
-                raise OutputError(str(error)) from error
-            except OSError as error:
-                raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
-            yield remarks
+        try:
+            return stack.enter_context(locked(self.path))
+        except FolderBusyError as error:
+            raise OutputError(str(error)) from error
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
 
+    @on_root
     def check_new(self, *, force: bool) -> None:
         """Refuse what a new run may not overwrite, and folders that cannot be written.
 
@@ -177,7 +190,13 @@ class RunFolder:
 
         Raises:
             OSError: a file cannot be deleted or written.
+            OutputError: ranks do not see the same folder.
         """
+        self._start(record)
+        self._check_shared()
+
+    @on_root
+    def _start(self, record: RunRecord) -> None:
         own, _ = self._contents()
         own.sort(key=lambda file: file.parent.name != CHECKPOINTS)  # first, so that a half-deleted run is not continued
         for file in own:
@@ -191,11 +210,29 @@ class RunFolder:
         write_text(self.path / SCENE, dump_scene(self.scene))
 
     def resume(self) -> Continuation:
-        """Return where to continue.
+        """Return where to continue: the newest checkpoint of which all is valid; one of a single process is on all ranks.
 
         Raises:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
         """
+        while True:
+            found = self._continuation()
+            if not self._shared:
+                return found
+            whole: Mapping[str, np.ndarray] = {}
+            if found and found.checkpoint and PIECES not in found.checkpoint.state:  # too much for a message
+                whole, found = found.checkpoint.state, replace(found, checkpoint=replace(found.checkpoint, state={}))
+            continued: Continuation = self.meeting.share(found)
+            checkpoint = continued.checkpoint
+            if checkpoint is None or (checkpoint.state and self.checkpoints.complete(checkpoint)):
+                return continued
+            if not checkpoint.state:
+                with self.meeting.together():
+                    state = whole if self.meeting.ranks.first else self.checkpoints.read(checkpoint.step).state
+                return replace(continued, checkpoint=replace(checkpoint, state=state))
+
+    @on_root
+    def _continuation(self) -> Continuation:
         self._check_run()
         self._check_same_scene()
         checkpoint, refused = self.checkpoints.newest()
@@ -232,17 +269,25 @@ class RunFolder:
             OSError: a file cannot be read.
             OutputError: the log has other columns.
         """
-        try:
-            return gaps(self.log, columns, self.frames, self.checkpoints, step=step, times=times, frame=frame)
-        except ValueError as error:
-            raise OutputError(str(error)) from error
+        return self._gaps(columns, step, times, frame) or []
+
+    @on_root
+    def _gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
+        whole = self.frames.whole if isinstance(self.frames, RankFrames) else self.frames
+        return gaps(self.log, columns, whole, self.checkpoints, step=step, times=times, frame=frame)
 
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
 
         Raises:
             OSError: a file cannot be written, renamed or deleted.
+            OutputError: ranks do not see the same folder.
         """
+        self._go_on(record, step)
+        self._check_shared()
+
+    @on_root
+    def _go_on(self, record: RunRecord, step: int) -> None:
         self.write_record(record)
         write_text(self.path / SCENE, dump_scene(self.scene))
         for file in (path for path, _ in _walk(self.path) if path.name.endswith(SUFFIX) and path.name.startswith(".")):
@@ -252,46 +297,50 @@ class RunFolder:
 
     def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None) -> Log:
         """Begin the log or continue it, see `Log`."""
-        return Log(self.log, columns, after_step=after_step)
+        return Log(self.log, columns, after_step=after_step, meeting=self.meeting)
 
-    def frame_writer(self, watch: Stopwatch) -> FrameWriter:
+    def frame_writer(self, watch: Stopwatch) -> FrameWriter | RankFrameWriter:
         """Return what writes the frames while the simulation goes on."""
-        return FrameWriter(self.frames, watch)
+        return RankFrameWriter(self.frames, watch) if isinstance(self.frames, RankFrames) else FrameWriter(self.frames, watch)
 
     def write_record(self, record: RunRecord) -> None:
         """Write run.json; that of a run that begins keeps room for the one of its end, which is written even if the disk is full.
 
         Raises:
-            OSError: the disk is full before the run begins, or cannot be written at all.
+            OSError: the disk is full before the run begins, or cannot be written at all; on the root rank.
         """
+        if not self.meeting.ranks.first:
+            return
         text, begins = json.dumps(asdict(record), indent=2) + "\n", record.status == "running"
         if begins:
             reserve(self.path / RECORD, len(text) + LAST_WORDS)
         write_text(self.path / RECORD, text, spare=not begins)
 
-    def mark_failed(self, reason: str) -> None:
-        """Write into run.json that the run has failed, if it says that it is running; for a process that does not have its record.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        _end_record(self.path, "failed", reason)
-
     def check_space(self, needed: int) -> None:
         """Refuse a run whose output does not fit.
 
         Args:
-            needed: an estimate [bytes].
+            needed: an estimate of what this rank writes [bytes].
 
         Raises:
             OutputError: there is less free.
         """
+        self._check_space(sum(self.meeting.exchange(needed)))
+
+    @on_root
+    def _check_space(self, needed: int) -> None:
         free = shutil.disk_usage(self.path).free
         if free < needed:
             raise OutputError(
                 f"{self.path}: the run needs about {needed / 1e9:.3g} GB and {free / 1e9:.3g} GB are free; "
                 "make room, choose another --out, or write less (time.frames_per_second, output.particles, output.grid)"
             )
+
+    def _check_shared(self) -> None:
+        """Refuse a folder that the root rank has begun to write and that others do not see."""
+        with self.meeting.together():
+            if not (self.path / RECORD).is_file():
+                raise OutputError(f"{self.path}: is not the folder that rank 0 writes; choose one that all machines share")
 
     def _check_run(self) -> None:
         if not holds_run(self.path):
@@ -352,17 +401,12 @@ def holds_run(folder: Path) -> bool:
     return (folder / RECORD).is_file() or any(CHECKPOINT_FILE.fullmatch(file.name) for file in folder.glob(f"{CHECKPOINTS}/*"))
 
 
-def mark_stopped(folder: Path, signal: str) -> None:
-    """Write into run.json that a signal has stopped the run before its first step; for a thread that ends the process."""
+def mark_ended(folder: Path, status: Status, reason: str) -> None:
+    """Write into run.json how the run has ended, if it says that it is running; for who ends the process and has no record of the run."""
     with suppress(OSError):
-        _end_record(folder, "stopped", f"interrupted by {signal} {BEFORE}")
-
-
-def _end_record(folder: Path, status: Status, reason: str) -> None:
-    """Write into run.json how the run has ended, if it says that it is running."""
-    record = read_record(folder)
-    if record.get("status") == "running":
-        write_text(folder / RECORD, json.dumps({**record, "status": status, "reason": reason}, indent=2) + "\n", spare=True)
+        record = read_record(folder)
+        if record.get("status") == "running":
+            write_text(folder / RECORD, json.dumps({**record, "status": status, "reason": reason}, indent=2) + "\n", spare=True)
 
 
 def read_record(folder: Path) -> dict[str, Any]:

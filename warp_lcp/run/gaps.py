@@ -28,7 +28,7 @@ def gaps(
         frame: as the run would write it now.
 
     Raises:
-        ValueError: the log has other columns.
+        OutputError: the log has other columns.
     """
     lines = []
     rows = {int(row.split(",", 1)[0]) for row in rows_until(log, ",".join(columns), step)[1:]}

@@ -1,4 +1,4 @@
-"""Who carries out a command: this process alone, or the ranks that started with it."""
+"""The launcher of a command: this process alone, or the ranks that started with it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warp_lcp.run.devices import choose_device
-from warp_lcp.run.engine import Engine
+from warp_lcp.run.devices import Engine, choose_device
 from warp_lcp.run.folder import OutputError, RunRecord
 from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
-from warp_lcp.run.loop import run_scene
+from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer
 from warp_lcp.run.terminal import Terminal
@@ -19,21 +18,33 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
 
 if TYPE_CHECKING:
+    from warp_lcp.distributed.meeting import Meeting
     from warp_lcp.distributed.ranks import Ranks
 
 
-class Crew:
-    """This process alone.
+class Launcher:
+    """Carries out a command in this process alone.
 
     Attributes:
-        console: takes messages.
-        speaks: this process tells the user what happens.
+        console: takes messages; those of the root rank.
+        meeting: of the ranks that share the work; None if this process has it alone.
     """
 
-    def __init__(self, console: Terminal | None = None, *, speaks: bool = True) -> None:
-        """Speak to the error stream."""
+    meeting: Meeting | None = None
+
+    def __init__(self, console: Terminal | None = None) -> None:
+        """Write messages to the error stream."""
         self.console = console or Terminal(stderr=True)
-        self.speaks = speaks
+
+    @property
+    def is_root(self) -> bool:
+        """Whether this process tells the user what happens."""
+        return self.meeting is None or self.meeting.ranks.first
+
+    @property
+    def ranks(self) -> Ranks | None:
+        """Who share the work; None if this process has it alone."""
+        return self.meeting.ranks if self.meeting else None
 
     def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
         """Return the scene of a run, or of one that goes on.
@@ -63,11 +74,6 @@ class Crew:
             OutputError: they were not; the message names what differs.
         """
 
-    @property
-    def ranks(self) -> Ranks | None:
-        """Who share the work; None if this process has it alone."""
-        return None
-
     def choose_device(self, name: str | None) -> str:
         """Return the device of this process.
 
@@ -77,38 +83,21 @@ class Crew:
         return choose_device(name)
 
     def place(self, device: str) -> str:
-        """Return where the crew works, in words.
+        """Return where the work is done, in words.
 
         Args:
             device: of this process.
         """
         return device
 
-    def run(
-        self,
-        given: GivenScene,
-        out: Path,
-        *,
-        device: str,
-        observer: Observer,
-        last_frame: int | None,
-        resume: bool,
-        force: bool,
-        force_memory: bool,
-        stop: Callable[[], bool | str],
-        profile: Profile | None,
-        record_problems: Path | None,
-    ) -> RunRecord:
+    def run(self, request: RunRequest, *, observer: Observer, stop: Callable[[], bool | str], profile: Profile | None) -> RunRecord:
         """Simulate a scene that `load` returned, as `run_scene` does.
 
         Raises:
             OutputError: the folder cannot take the run.
             SceneError: the scene cannot be simulated.
         """
-        return run_scene(
-            given.scene, out, overrides=given.overrides, device=device, observer=observer, last_frame=last_frame, resume=resume,
-            force=force, force_memory=force_memory, stop=stop, profile=profile, record_problems=record_problems,
-        )  # fmt: skip
+        return run_scene(request, observer=observer, stop=stop, profile=profile, meeting=self.meeting)
 
 
 def default_folder(scene: Scene) -> Path:
@@ -117,16 +106,16 @@ def default_folder(scene: Scene) -> Path:
 
 
 @contextmanager
-def crew_of(engine: Engine) -> Iterator[Crew]:
-    """Give who carries out a command.
+def launcher_of(engine: Engine) -> Iterator[Launcher]:
+    """Give the launcher of a command.
 
     Raises:
         EngineError: the engine cannot be used here.
     """
     if engine is Engine.SINGLE:
-        yield Crew()
+        yield Launcher()
         return
     from warp_lcp.run.rank_launcher import ranks_together  # needs MPI and PETSc
 
-    with ranks_together() as crew:
-        yield crew
+    with ranks_together() as launcher:
+        yield launcher

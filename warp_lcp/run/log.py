@@ -9,33 +9,48 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TextIO
 
+from warp_lcp.distributed.meeting import Meeting, on_root
 from warp_lcp.frames.atomic import write_text
+from warp_lcp.simulation import InputError
 
 Value = float | int | str | None
 
 
-class Log:
-    """A CSV file that grows by a row a step. What has no value is empty, never nan; every row reaches the system at once."""
+class OutputError(InputError):
+    """The output folder cannot take the run. The message says why and what to do."""
 
-    def __init__(self, path: Path, columns: tuple[str, ...], *, after_step: int | None = None) -> None:
+
+class Log:
+    """A CSV file that grows by a row a step. What has no value is empty, never nan; every row reaches the system at once.
+
+    The root rank writes it; methods are collective, so that a full disk ends all ranks.
+    """
+
+    def __init__(self, path: Path, columns: tuple[str, ...], *, after_step: int | None = None, meeting: Meeting | None = None) -> None:
         """Begin a log, or continue one.
 
         Args:
             path: the file.
             columns: all of its columns; the first is `step`.
             after_step: continue an existing file behind this step; later rows, and a last row cut short, are dropped.
+            meeting: of the ranks that share the run.
 
         Raises:
             OSError: the file cannot be written.
-            ValueError: the existing file has other columns.
+            OutputError: the existing file has other columns.
         """
-        self.columns = columns
+        self.columns, self.meeting = columns, meeting or Meeting.of_one()
+        self._open(path, columns, after_step)
+
+    @on_root
+    def _open(self, path: Path, columns: tuple[str, ...], after_step: int | None) -> None:
         header = ",".join(columns)
         lines = [header] if after_step is None else rows_until(path, header, after_step)
         write_text(path, "".join(f"{line}\n" for line in lines))
         self._file: TextIO = open(path, "a", buffering=1, encoding="utf-8", newline="")  # noqa: SIM115 - `close` closes it
         self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
 
+    @on_root
     def append(self, row: Mapping[str, Value]) -> None:
         """Write a row; columns that it lacks are empty.
 
@@ -45,6 +60,7 @@ class Log:
         """
         self._writer.writerow({name: _cell(value) for name, value in row.items()})
 
+    @on_root
     def sync(self) -> None:
         """Wait until the rows are on the disk.
 
@@ -55,8 +71,9 @@ class Log:
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file; the only method that is not collective."""
+        if self.meeting.ranks.first:
+            self._file.close()
 
 
 def _cell(value: Value) -> Value:
@@ -76,12 +93,12 @@ def rows_until(path: Path, header: str, step: int) -> list[str]:
         step: the last one.
 
     Raises:
-        ValueError: the file has other columns.
+        OutputError: the file has other columns.
     """
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else f"{header}\n"
     found, *rows = text.split("\n")[:-1] or [""]  # what no line break ends was cut
     if found != header and (rows or not header.startswith(found)):
-        raise ValueError(f"{path}: its columns are {found!r}, this run's are {header!r}")
+        raise OutputError(f"{path}: its columns are {found!r}, this run's are {header!r}")
     kept, last = [header], 0
     for row in rows:
         number = row.split(",", 1)[0]

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import errno
-import math
 import time as clock
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
+from warp_lcp.distributed.meeting import Meeting
 from warp_lcp.frames.frames import frame_bytes
-from warp_lcp.run.check import check_memory, start
+from warp_lcp.run.check import check_memory, check_ranks, start
 from warp_lcp.run.checkpoint import PIECES, Checkpoint
+from warp_lcp.run.devices import Engine
 from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
 from warp_lcp.run.interruption import Interrupted
 from warp_lcp.run.log import Log, Value
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer, missed, residual_of
-from warp_lcp.scene.scene import Scene, Time
+from warp_lcp.run.rank_simulation import RankSimulation
+from warp_lcp.run.stepping import stable_dt, take_step
+from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.table import Problem, SceneError
 from warp_lcp.simulation import (
     Cells,
+    DistributedSimulation,
     Joined,
     NoStopwatch,
     Part,
@@ -29,7 +35,6 @@ from warp_lcp.simulation import (
     Profiled,
     Recorded,
     Resampled,
-    Scheduled,
     Simulation,
     SimulationFailed,
     StepFailed,
@@ -38,161 +43,138 @@ from warp_lcp.simulation import (
     Volume,
 )
 
-RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
-SHARE = 0.25  # of a step: what starts or stops closer to a step's end than that makes no step of its own
 SAME_TIME = 1e-9  # of a frame's interval: what rounding leaves between a step's end and the frame it was cut for
 SPACE_MARGIN = 1.1
 
 
-def run_scene(
-    scene: Scene,
-    out: Path,
-    *,
-    device: str,
-    observer: Observer,
-    overrides: Sequence[dict[str, str]] = (),
-    last_frame: int | None = None,
-    resume: bool = False,
-    force: bool = False,
-    force_memory: bool = False,
-    stop: Callable[[], bool | str] = lambda: False,
-    profile: Profile | None = None,
-    record_problems: Path | None = None,
-) -> RunRecord:
-    """Simulate a scene into a folder.
+@dataclass(frozen=True, kw_only=True)
+class RunRequest:
+    """What a run is asked for, as the options of `warp-lcp run`.
 
     Args:
-        scene: what to simulate.
-        out: the run's folder.
-        device: a Warp device, such as `cuda:0`.
-        observer: learns of every step.
+        scene: what to simulate, the same on all ranks.
+        out: the run's folder, which all ranks see.
+        device: a Warp device, such as `cuda:0`; of this rank.
         overrides: by which the scene differs from its file, for run.json, see `warp_lcp.run.given_scene`.
         last_frame: end after this frame; the scene's last one without it.
-        resume: continue the run in the folder.
+        resume: continue the run in the folder, which may have had another number of ranks.
         force: delete the run in the folder.
         force_memory: run even what will not fit into the device's free memory.
-        stop: asked after every step; True, or what it is interrupted by, ends the run with a checkpoint.
+        record_problems: folder that takes the problem of each step, see `warp_lcp.gallery.recorded`; not on ranks.
+    """
+
+    scene: Scene
+    out: Path
+    device: str = "cpu"
+    overrides: Sequence[dict[str, str]] = ()
+    last_frame: int | None = None
+    resume: bool = False
+    force: bool = False
+    force_memory: bool = False
+    record_problems: Path | None = None
+
+
+def run_scene(
+    request: RunRequest,
+    *,
+    observer: Observer,
+    stop: Callable[[], bool | str] = lambda: False,
+    profile: Profile | None = None,
+    meeting: Meeting | None = None,
+) -> RunRecord:
+    """Simulate a scene into a folder; collective where ranks share the run.
+
+    Args:
+        request: what is asked for.
+        observer: learns of every step.
+        stop: asked after every step; True, or what it is interrupted by, ends the run with a checkpoint, on any rank.
         profile: measures the run's stages; written to profile.json at the end.
-        record_problems: folder that takes the problem of each step, see `warp_lcp.gallery.recorded`.
+        meeting: of the ranks that share the run; None: this process has it alone.
 
     Returns:
         How the run ended, as in run.json.
 
     Raises:
-        OutputError: the folder cannot take the run.
-        SceneError: the scene cannot be simulated.
+        OutputError: the folder cannot take the run; on all ranks, as everything here.
+        SceneError: the scene cannot be simulated, or not on ranks.
     """
-    if not force_memory:
-        check_memory(scene, device)
-
-    folder = RunFolder(out, scene)
-
-    def create(continued: Continuation | None) -> tuple[Simulation, list[str]]:
-        simulation, notes = _create(folder, device, continued)
-        if record_problems is not None:
-            _record_problems(simulation, scene, record_problems, more=resume)
-        return simulation, notes
-
-    record = RunRecord(scene.scene.name, scene.scene.simulator, device, overrides=list(overrides))
-    return run_in_folder(
-        folder,
-        record,
-        create,
-        observer=observer,
-        last_frame=last_frame,
-        resume=resume,
-        force=force,
-        stop=stop,
-        profile=profile,
-    )
-
-
-def run_in_folder(
-    folder: RunFolder,
-    record: RunRecord,
-    create: Callable[[Continuation | None], tuple[Simulation, list[str]]],
-    *,
-    observer: Observer,
-    last_frame: int | None,
-    resume: bool,
-    force: bool,
-    stop: Callable[[], bool | str],
-    profile: Profile | None,
-    somewhere: Callable[[bool], bool] = bool,
-) -> RunRecord:
-    """Simulate into a folder.
-
-    Args:
-        folder: of the run.
-        record: with what is known of it.
-        create: returns the simulation where the run begins, or where it goes on, and what there is to say of it.
-        observer: learns of every step.
-        last_frame: end after this frame.
-        resume: continue the run in the folder.
-        force: delete the run in the folder.
-        stop: asked after every step.
-        profile: measures the run's stages.
-        somewhere: see `Run`.
-
-    Returns:
-        How the run ended.
-
-    Raises:
-        OutputError: the folder cannot take the run.
-        SceneError: the scene cannot be simulated.
-    """
-    with folder.held(resume=resume) as remarks:
+    scene, everyone = request.scene, meeting or Meeting.of_one()
+    if meeting is not None and request.record_problems is not None:
+        raise OutputError("--record-problems: not with --engine petsc, whose ranks have but parts of a problem")
+    share = everyone.share_of_device(request.device)
+    with everyone.together():
+        if meeting is not None:
+            check_ranks(scene)
+        if not request.force_memory:
+            check_memory(scene, request.device, share=share)
+    folder = RunFolder(request.out, scene, meeting)
+    record = RunRecord(scene.scene.name, scene.scene.simulator, request.device, overrides=list(request.overrides))
+    if meeting is not None:
+        record.engine, record.ranks = Engine.PETSC.value, meeting.ranks.size
+    with folder.held(resume=request.resume) as remarks:
         record.warnings, record.mesh_files = list(remarks), folder.mesh_files
         continued: Continuation | None = None
-        if resume:
+        if request.resume:
             continued = folder.resume()
             record.overrides = record.overrides or read_record(folder.path).get("overrides", [])
             record.warnings += continued.remarks
             record.changed, record.resampled_from_resolution = continued.changed, continued.resampled_from
             record.resumed_from_step = continued.checkpoint.step if continued.checkpoint else 0
         else:
-            folder.check_new(force=force)
-        simulation, notes = create(continued)
+            folder.check_new(force=request.force)
+        with everyone.together():
+            simulation, notes = _simulation(request, folder, meeting, continued)
         record.warnings += notes
         for note in record.warnings:
             observer.note(note)
         for change in record.changed:
             observer.note(f"changed: {change}")
         checkpoint = continued.checkpoint if continued else None
-        run = Run(folder.scene, simulation, folder, record, observer, profile, somewhere)
+        run = Run(simulation, folder, record, observer, profile)
         with profile.kernels_apart() if profile else nullcontext():
-            return run.execute(last_frame, stop, resumed=checkpoint is not None)
+            return run.execute(request.last_frame, stop, resumed=checkpoint is not None)
 
 
-def _create(folder: RunFolder, device: str, continued: Continuation | None) -> tuple[Simulation, list[str]]:
-    """Return the simulation where the run begins or goes on, and what it has to say."""
-    scene = folder.scene
-    simulation = start(scene, device)
+def _simulation(
+    request: RunRequest, folder: RunFolder, meeting: Meeting | None, continued: Continuation | None
+) -> tuple[Simulation, list[str]]:
+    """Return the simulation where the run begins or goes on, or this rank's part of it, and what it has to say."""
+    scene, notes = request.scene, list[str]()
+    simulation = start(scene, request.device, meeting.ranks if meeting else None)
     try:
-        notes: list[str] = []
         if continued and continued.checkpoint:
-            state = continued.checkpoint.state
-            if PIECES in state:
-                _join(simulation, folder, continued)
-            elif continued.resampled_from is None:
-                simulation.restore(state)
-            elif isinstance(simulation, Resampled):
-                notes = simulation.resample(state)
-            else:
-                raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: {scene.scene.simulator} cannot change grids")
+            notes = _go_on(simulation, folder, continued, on_ranks=meeting is not None)
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
-    return simulation, simulation.notes() + notes
+    if request.record_problems is not None:
+        _record_problems(simulation, scene, request.record_problems, more=request.resume)
+    notes = simulation.notes() + notes
+    if meeting is None:
+        return simulation, notes
+    return RankSimulation(cast(DistributedSimulation, simulation), meeting), notes
 
 
-def _join(simulation: Simulation, folder: RunFolder, continued: Continuation) -> None:
-    """Continue from the pieces of ranks."""
+def _go_on(simulation: Simulation, folder: RunFolder, continued: Continuation, *, on_ranks: bool) -> list[str]:
+    """Continue from a checkpoint; return what the user should know of it.
+
+    Raises:
+        ValueError: the simulation cannot.
+    """
     assert continued.checkpoint is not None
-    if not isinstance(simulation, Joined):
+    state, name, other_grid = continued.checkpoint.state, folder.scene.scene.simulator, continued.resampled_from is not None
+    if PIECES in state and not isinstance(simulation, Joined):
         raise ValueError("the checkpoint is one of several ranks: continue with --engine petsc, on any number of ranks")
-    if continued.resampled_from is not None:
-        raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: the checkpoint is one of several ranks")
-    simulation.restore_pieces(folder.checkpoints.pieces(continued.checkpoint))
+    if other_grid and (on_ranks or PIECES in state or not isinstance(simulation, Resampled)):
+        who = "--engine petsc" if on_ranks else name
+        why = "the checkpoint is one of several ranks" if PIECES in state and not on_ranks else f"{who} cannot change grids"
+        raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: {why}")
+    if PIECES in state and isinstance(simulation, Joined):
+        simulation.restore_pieces(folder.checkpoints.pieces(continued.checkpoint))
+    elif other_grid and isinstance(simulation, Resampled):
+        return simulation.resample(state)
+    else:
+        simulation.restore(state)
+    return []
 
 
 def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more: bool) -> None:
@@ -204,77 +186,20 @@ def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more
     simulation.record = ProblemFolder(folder, more=more).write
 
 
-def plan_dt(stable: float, remaining: float, time: Time, events: Sequence[float] = ()) -> float:
-    """Return the next step [s]: within the scene's bounds, ending on the frame's time, never leaving a sliver before it.
-
-    It depends on nothing but the state, so a run that was interrupted takes the same steps. The last two steps before a frame or an event
-    are equal; they may be shorter than dt_min. Steps run across events that are closer than SHARE dt to now or to the frame, and of several
-    within dt across all but the last.
-
-    Args:
-        stable: what the CFL number allows [s].
-        remaining: the time to the next frame [s].
-        time: the scene's bounds.
-        events: the times from now [s] to those at which steps should end.
-    """
-    dt = min(max(stable, time.dt_min), time.dt_max)
-    later = [event for event in events if SHARE * dt <= event <= remaining - SHARE * dt]
-    ahead = max((event for event in later if event <= dt), default=min(later, default=remaining))
-    if ahead <= dt:
-        return ahead
-    return ahead / 2 if ahead < 2 * dt else dt
-
-
-def take_step(simulation: Simulation, stable: float, end: float, time: Time) -> tuple[float, int, dict[str, Value]]:
-    """Take a step, or a shorter one where it fails; return its length [s], how often it was halved and what the log gets.
-
-    Args:
-        simulation: that takes it.
-        stable: what the CFL number allows [s].
-        end: the next frame's time [s].
-        time: the scene's bounds.
-
-    Raises:
-        StepFailed: the shortest step failed too.
-        SimulationFailed: the run cannot go on.
-    """
-    now, retries = simulation.time, 0
-    events = simulation.events(end) if isinstance(simulation, Scheduled) else []
-    dt = plan_dt(stable, end - now, time, [event - now for event in events])
-    while True:
-        try:
-            return dt, retries, simulation.step(dt)
-        except StepFailed as error:
-            if retries == RETRIES or dt / 2 < time.dt_min:
-                number = simulation.step_count + 1
-                raise StepFailed(f"step {number} at t = {now:.6g} s, dt = {dt:.3g} s, retries {retries}: {error}") from error
-            retries, dt = retries + 1, dt / 2
-
-
 class Run:
     """A simulation on its way through its frames.
 
     Args:
-        scene: what is simulated.
         simulation: where it begins or goes on.
-        folder: takes the output.
+        folder: takes the output, and knows the scene.
         record: says how the run ends.
         observer: learns of every step.
         profile: measures the stages.
-        somewhere: tells whether something that only this process knows holds for the run; where several run it, on some of them.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        simulation: Simulation,
-        folder: RunFolder,
-        record: RunRecord,
-        observer: Observer,
-        profile: Profile | None,
-        somewhere: Callable[[bool], bool] = bool,
-    ) -> None:
+    def __init__(self, simulation: Simulation, folder: RunFolder, record: RunRecord, observer: Observer, profile: Profile | None) -> None:
         """Take over a simulation; nothing is written yet."""
+        scene = folder.scene
         self.time = scene.time
         self.output = scene.output
         self.simulation = simulation
@@ -286,7 +211,7 @@ class Run:
         if isinstance(simulation, Profiled):
             simulation.watch = self.watch
         self.writer = folder.frame_writer(self.watch)
-        self._somewhere = somewhere
+        self._somewhere = folder.meeting.ranks.any  # what only this process knows holds for the run if it does on some rank
         self._has_bodies = any(solid.is_body for solid in scene.solid)  # whose surfaces are part of every frame
         self._begun = clock.perf_counter()
         self._first_step = 0
@@ -383,10 +308,7 @@ class Run:
     def _step(self, end: float) -> dict[str, Value]:
         """Take a step towards a time [s] and return its row of the log."""
         begun = clock.perf_counter()
-        stable = self.simulation.stable_dt()
-        number = self.simulation.step_count + 1
-        if math.isnan(stable):
-            raise SimulationFailed(f"step {number}: the stable time step is not a number")
+        stable, number = stable_dt(self.simulation), self.simulation.step_count + 1
         if stable < self.time.dt_min and not self._below_dt_min:
             self._below_dt_min = True  # once is enough: the log's column cfl has the rest
             self._warn(f"step {number}: the CFL number asks for dt = {stable:.3g} s, below time.dt_min; steps are longer than it allows")

@@ -10,11 +10,12 @@ import numpy as np
 from warp_lcp.frames.atomic import make_folder, replacing, write_text
 from warp_lcp.gallery.recorded import DESCRIPTION, files
 from warp_lcp.run.folder import OutputError
+from warp_lcp.simulation import InputError
 
 README = "README.md"
 
 
-class ProblemError(ValueError):
+class ProblemError(InputError):
     """The files do not make a problem, or the method does not take it; the message names the file or the option."""
 
 

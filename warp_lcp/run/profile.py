@@ -13,6 +13,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.frames.atomic import write_text
+from warp_lcp.run.terminal import table_lines
 
 PROFILE = "profile.json"
 KERNELS = "kernels, loaded"  # the stage of modules that Warp compiles, or finds compiled
@@ -38,7 +39,7 @@ class Stage:
     bytes: int = 0
 
     def add(self, seconds: float) -> None:
-        """Count a call."""
+        """Count a call of so many seconds."""
         self.first_seconds = self.first_seconds if self.calls else seconds
         self.calls += 1
         self.seconds += seconds
@@ -57,7 +58,7 @@ class LoadedKernels:
         self._logger, self._level = wp.get_logger(), wp.config.log_level
 
     def debug(self, message: str) -> None:
-        """Pass a message on."""
+        """Pass a message on to the logger that was there before."""
         if self._level <= wp.LOG_DEBUG:
             self._logger.debug(message)
 
@@ -69,12 +70,12 @@ class LoadedKernels:
             self._logger.info(message)
 
     def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
-        """Pass a message on."""
+        """Pass a message on to the logger that was there before."""
         if self._level <= wp.LOG_WARNING:
             self._logger.warning(message, category, stacklevel=stacklevel + 1)
 
     def error(self, message: str) -> None:
-        """Pass a message on."""
+        """Pass a message on to the logger that was there before."""
         self._logger.error(message)
 
 
@@ -128,19 +129,19 @@ class Profile:
         """Add the sizes of files to a stage."""
         self.stages[name].bytes += sum(file.stat().st_size for file in files)
 
-    def table(self, steps: int, seconds: float) -> list[str]:
-        """Return lines that show the stages, and what no stage accounts for.
+    def table(self, steps: int, seconds: float) -> str:
+        """Return a table of the stages, and of what no stage accounts for.
 
         Args:
             steps: that the run took.
             seconds: that it took.
         """
-        rows = [("stage", "seconds", "share", "ms a step", "MB a step", "GB/s")]
+        rows = []
         for name, stage in self.stages.items():
             rows.append((f"({name})" if stage.beside else name, *_figures(stage.seconds, stage.bytes, steps, seconds)))
         rest = seconds - sum(stage.seconds for stage in self.stages.values() if not stage.beside)
         rows += [("rest", *_figures(rest, 0, steps, seconds)), ("all", *_figures(seconds, 0, steps, seconds))]
-        return [f"{row[0]:<22}" + "".join(f"{cell:>11}" for cell in row[1:]).rstrip() for row in rows]
+        return table_lines(("stage", "seconds", "share", "ms a step", "MB a step", "GB/s"), rows)
 
     def write(self, folder: Path, steps: int, seconds: float) -> None:
         """Write profile.json.

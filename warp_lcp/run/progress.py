@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import time
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from datetime import timedelta
 from types import TracebackType
 from typing import Protocol, Self
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn
 from rich.table import Column
 
 from warp_lcp.result import SolveStatus
@@ -27,7 +26,7 @@ class Observer(Protocol):
     """Someone who watches a run."""
 
     def note(self, text: str) -> None:
-        """Take a remark."""
+        """Take a remark that the user should see."""
 
     def start(self, time: float, end: float) -> None:
         """Learn the time [s] that the run begins and ends at."""
@@ -39,43 +38,13 @@ class Observer(Protocol):
         """Learn that a frame is taken; its files follow."""
 
 
-class TimeLeft:
-    """The wall time that a run still needs, at the rate of its recent past: a run grows slower when its liquid spreads."""
+def time_left(progress: Progress) -> str:
+    """Return the wall time that a run still needs, at the rate of its recent past: a run grows slower when its liquid spreads.
 
-    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
-        """Begin without knowledge."""
-        self._clock = clock
-        self._marks: deque[tuple[float, float]] = deque()
-        self._end = 0.0
-
-    def start(self, time: float, end: float) -> None:
-        """Begin at a simulated time [s] that is to reach `end`. The first step, which loads kernels, does not count."""
-        self._end = end
-        self._marks.clear()
-
-    def advance(self, time: float) -> None:
-        """Note that the run has reached a simulated time [s]."""
-        now = self._clock()
-        self._marks.append((now, time))
-        while len(self._marks) > 2 and self._marks[1][0] < now - WINDOW:
-            self._marks.popleft()
-
-    def seconds(self) -> float | None:
-        """Return the seconds left, or None before there is a rate."""
-        if len(self._marks) < 2:
-            return None
-        (begun, before), (now, reached) = self._marks[0], self._marks[-1]
-        if reached <= before:
-            return None
-        return (self._end - reached) * (now - begun) / (reached - before)
-
-    def __str__(self) -> str:
-        """Return the time left as h:mm:ss."""
-        left = self.seconds()
-        if left is None:
-            return "-:--:--"
-        minutes, seconds = divmod(round(left), 60)
-        return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+    The first step, which loads kernels, does not count.
+    """
+    left = progress.tasks[0].time_remaining
+    return f"{timedelta(seconds=left) if left is not None else '-:--:--'} left"
 
 
 class Lines:
@@ -84,7 +53,8 @@ class Lines:
     def __init__(self, console: Console) -> None:
         """Write to `console`."""
         self._console = console
-        self._left = TimeLeft()
+        self._progress = Progress(console=console, speed_estimate_period=WINDOW)  # never shown
+        self._task = self._progress.add_task("", total=None)
         self._row: Mapping[str, Value] = {}
 
     def __enter__(self) -> Self:
@@ -95,22 +65,22 @@ class Lines:
         """Do nothing."""
 
     def note(self, text: str) -> None:
-        """Write a remark."""
+        """Write a remark on a line of its own."""
         self._write(one_line(text))
 
     def start(self, time: float, end: float) -> None:
         """Learn the time [s] that the run begins and ends at."""
-        self._left.start(time, end)
+        _begin(self._progress, time, end)
 
     def step(self, row: Mapping[str, Value]) -> None:
         """Remember a step's row of the log."""
         self._row = row
-        self._left.advance(_number(row, "time"))
+        self._progress.update(self._task, completed=_number(row, "time"))
 
     def frame(self, index: int, last: int) -> None:
-        """Write a line."""
+        """Write a line with the frame, its time and the last step's numbers."""
         self._write(
-            f"frame {index}/{last}  t {_number(self._row, 'time'):.4g} s  {describe(self._row)}  {self._left} left"
+            f"frame {index}/{last}  t {_number(self._row, 'time'):.4g} s  {describe(self._row)}  {time_left(self._progress)}"
             if self._row
             else f"frame {index}/{last}"
         )
@@ -128,9 +98,8 @@ class Bar:
         bar = BarColumn(bar_width=None, table_column=Column(ratio=1))  # what the text leaves of the line
         percent = TaskProgressColumn(table_column=Column(no_wrap=True, width=4))
         self._console = console
-        self._progress = Progress(bar, percent, text, console=console, refresh_per_second=4, expand=True)
+        self._progress = Progress(bar, percent, text, console=console, refresh_per_second=4, expand=True, speed_estimate_period=WINDOW)
         self._task = self._progress.add_task("first step: loading kernels", total=None)
-        self._left = TimeLeft()
 
     def __enter__(self) -> Self:
         """Begin to draw."""
@@ -147,17 +116,20 @@ class Bar:
 
     def start(self, time: float, end: float) -> None:
         """Learn the time [s] that the run begins and ends at."""
-        self._left.start(time, end)
-        self._progress.update(self._task, total=end, completed=time)
+        _begin(self._progress, time, end)
 
     def step(self, row: Mapping[str, Value]) -> None:
-        """Show a step's numbers."""
-        time = _number(row, "time")
-        self._left.advance(time)
-        self._progress.update(self._task, completed=time, description=escape(f"{self._left} left  {describe(row)}"))
+        """Show a step's numbers and the time left beside the bar."""
+        self._progress.update(self._task, completed=_number(row, "time"))
+        self._progress.update(self._task, description=escape(f"{time_left(self._progress)}  {describe(row)}"))
 
     def frame(self, index: int, last: int) -> None:
         """Do nothing: the bar shows the time."""
+
+
+def _begin(progress: Progress, time: float, end: float) -> None:
+    """Begin at a simulated time [s] that is to reach `end`."""
+    progress.reset(TaskID(0), total=end, completed=time)  # type: ignore[arg-type]
 
 
 def describe(row: Mapping[str, Value]) -> str:

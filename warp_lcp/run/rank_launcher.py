@@ -1,4 +1,4 @@
-"""The ranks of MPI as those who carry out a command: they start alike, the first one speaks, and they end alike."""
+"""The ranks of MPI as launchers of a command: they start alike, the root rank speaks, and they end alike."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import os
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,41 +17,38 @@ from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.run.continuation import mesh_digests
-from warp_lcp.run.devices import DeviceError, devices
-from warp_lcp.run.engine import EngineError
-from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
+from warp_lcp.run.devices import DeviceError, EngineError, devices
+from warp_lcp.run.folder import OutputError, RunRecord, mark_ended
 from warp_lcp.run.given_scene import GivenScene
-from warp_lcp.run.launcher import Crew
-from warp_lcp.run.parallel_run import run_on_ranks
-from warp_lcp.run.problem_folder import ProblemError
+from warp_lcp.run.launcher import Launcher
+from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer
 from warp_lcp.run.terminal import Terminal, say, tell
 from warp_lcp.scene.scene_file import keys
-from warp_lcp.scene.table import SceneError, written
-from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.scene.table import written
+from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
-WRONG_INPUT = (SceneError, OutputError, DeviceError, EngineError, ProblemError)
-PLANNED = (OSError, *WRONG_INPUT, StepFailed, SimulationFailed)
+PLANNED = (OSError, InputError, StepFailed, SimulationFailed)
 SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")  # how many processes mpiexec has started, as it tells them
 NUMBERS = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")  # which of them this one is
 SHOWN = 4  # differences in one message
 
 
-class RankCrew(Crew):
-    """One of the ranks; every method is collective.
+class RankLauncher(Launcher):
+    """Carries out a command on one of the ranks; every method is collective.
 
     Args:
         ranks: all of them.
     """
 
     def __init__(self, ranks: Ranks) -> None:
-        """Let the first rank speak."""
-        super().__init__(Terminal(stderr=True, quiet=not ranks.first), speaks=ranks.first)
+        """Have messages of the root rank alone."""
+        super().__init__(Terminal(stderr=True, quiet=not ranks.first))
         if not ranks.first:
             wp.config.log_level = wp.LOG_ERROR
-        self.meeting = Meeting(ranks, PLANNED, self._last_words)
-        self._folder: RunFolder | None = None
+        self.meeting: Meeting = Meeting(ranks, PLANNED, self._last_words)
+        self._folder: Path | None = None
 
     def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
         """Return a scene that is the same on all ranks.
@@ -84,39 +81,10 @@ class RankCrew(Crew):
         size = self.meeting.ranks.size
         return f"{size} rank{'s' if size > 1 else ''} ({device})"
 
-    def run(
-        self,
-        given: GivenScene,
-        out: Path,
-        *,
-        device: str,
-        observer: Observer,
-        last_frame: int | None,
-        resume: bool,
-        force: bool,
-        force_memory: bool,
-        stop: Callable[[], bool | str],
-        profile: Profile | None,
-        record_problems: Path | None,
-    ) -> RunRecord:
-        """Simulate a scene that `load` returned, as `run_on_ranks` does.
-
-        Raises:
-            OutputError: the folder cannot take the run.
-            SceneError: the scene cannot be simulated.
-        """
-        if record_problems is not None:
-            raise OutputError("--record-problems: not with --engine petsc, whose ranks have but parts of a problem")
-        self._folder = RunFolder(out, given.scene)
-        return run_on_ranks(
-            given.scene, out, meeting=self.meeting, device=device, observer=observer, overrides=given.overrides, last_frame=last_frame,
-            resume=resume, force=force, force_memory=force_memory, stop=stop, profile=profile,
-        )  # fmt: skip
-
-    @property
-    def ranks(self) -> Ranks:
-        """Who share the work."""
-        return self.meeting.ranks
+    def run(self, request: RunRequest, *, observer: Observer, stop: Callable[[], bool | str], profile: Profile | None) -> RunRecord:
+        """Simulate a scene on all ranks, as `run_scene` does; if they end from inside MPI, run.json says so."""
+        self._folder = request.out
+        return super().run(request, observer=observer, stop=stop, profile=profile)
 
     def agree(self, given: Mapping[str, Any]) -> None:
         """Check that all ranks were given the same values, by their names.
@@ -141,15 +109,14 @@ class RankCrew(Crew):
         """Say why all processes end now, and write it into run.json, which the first rank cannot do from inside MPI."""
         tell(text, error=True)
         if self._folder is not None:
-            with suppress(OSError):
-                lines = text.splitlines()
-                who = f"rank {self.meeting.ranks.rank}"
-                self._folder.mark_failed(f"{who}: {lines[-2]}" if "Traceback" in lines[0] else lines[0])
+            lines = text.splitlines()
+            who = f"rank {self.meeting.ranks.rank}"
+            mark_ended(self._folder, "failed", f"{who}: {lines[-2]}" if "Traceback" in lines[0] else lines[0])
 
 
 @contextmanager
-def ranks_together() -> Iterator[RankCrew]:
-    """Give this process's part in what all ranks do; those that do not speak end silently, with the exit code of the first.
+def ranks_together() -> Iterator[RankLauncher]:
+    """Give this process's part in what all ranks do; all but the root rank end silently, with its exit code.
 
     Raises:
         EngineError: MPI or PETSc is missing, or of another kind than mpiexec.
@@ -168,16 +135,16 @@ def ranks_together() -> Iterator[RankCrew]:
             "mpiexec of the MPI that mpi4py was built with"
         )
     try:
-        crew = RankCrew(ranks)
-        with crew.meeting.together():
-            yield crew
+        launcher = RankLauncher(ranks)
+        with launcher.meeting.together():
+            yield launcher
     except RankFailed as error:
-        say(crew.console, str(error))
+        say(launcher.console, str(error))
         raise typer.Exit(1) from error
     except PLANNED as error:
         if ranks.first:
             raise
-        raise typer.Exit(2 if isinstance(error, WRONG_INPUT) else 1) from error
+        raise typer.Exit(2 if isinstance(error, InputError) else 1) from error
 
 
 def _number() -> str:

@@ -10,6 +10,8 @@ from typing import Any
 import typer
 from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderHook, RenderResult
 from rich.segment import Segment
+from rich.table import Column, Table
+from rich.text import Text
 from typer.core import TyperGroup
 
 from warp_lcp.run.kernel_cache import KernelCacheError
@@ -50,7 +52,7 @@ class Commands(TyperGroup):
         return super().main(*arguments, **options)
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Begin a command."""
+        """Begin a command; what refuses its words shows them harmless."""
         try:
             return super().make_context(*arguments, **options)
         except Refusal as error:
@@ -58,7 +60,7 @@ class Commands(TyperGroup):
             raise
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command."""
+        """Run a command; an interruption or a cache that cannot be written ends it with exit code 1."""
         try:
             return super().invoke(ctx)
         except Refusal as error:
@@ -79,6 +81,16 @@ def tell(text: object, *, error: bool = False) -> None:
     """Write a text of one or more lines to the output, or to the error stream; a stream that nobody reads any more is no error."""
     with suppress(BrokenPipeError):
         typer.echo(visible(str(text)), err=error)
+
+
+def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]], *, left: Iterable[int] = (0,)) -> str:
+    """Return a table as text, in columns as wide as their cells; those of `left` begin at their left sides."""
+    table = Table(*(Column(name, justify="left" if i in left else "right") for i, name in enumerate(header)), box=None, pad_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    with (console := Console(width=1000)).capture() as text:
+        console.print(table, highlight=False)
+    return "\n".join(line.rstrip() for line in text.get().splitlines())
 
 
 class _Harmless(RenderHook):

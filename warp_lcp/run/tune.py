@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_lcp.frames.atomic import write_text
-from warp_lcp.run.accuracy import Bounds, spread_of
-from warp_lcp.run.trial import Trial, trial
+from warp_lcp.run.trial import Bounds, Trial, spread_of, trial
 from warp_lcp.scene.presets import Preset, PresetName, Prices, changed, price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import HEADER, dump_scene

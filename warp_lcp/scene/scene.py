@@ -182,7 +182,7 @@ class Scene(Table):
 
     @property
     def dimension(self) -> int:
-        """Return 2 or 3."""
+        """Return the domain's number of axes, 2 or 3."""
         return len(self.domain.size)
 
     @property

@@ -16,8 +16,8 @@ import tomli_w
 from warp_lcp.nearest import nearest
 from warp_lcp.scene.scene import Scene, file_name
 from warp_lcp.scene.shapes import BUILTIN
+from warp_lcp.scene.simulator import Simulator, simulators
 from warp_lcp.scene.table import Problem, SceneError, validate, written
-from warp_lcp.simulation import Simulator, simulators
 
 DEEPEST = 16  # tables and arrays in each other; a scene needs six
 MOST_TABLES = 10_000  # in an array of them, such as [[liquid]]: each is a shape whose distances are taken by itself

@@ -159,7 +159,7 @@ class Sphere(Shape):
     radius: Positive = Field(description="a length [m]")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
-        """Return the ball."""
+        """Return the ball, a disk in 2-D."""
         from warp_lcp.grid import solids
 
         return solids.Sphere(center=self.center, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
@@ -174,7 +174,7 @@ class Capsule(Shape):
     radius: Positive = Field(description="a length [m]")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
-        """Return the capsule."""
+        """Return the capsule around its axis."""
         from warp_lcp.grid import solids
 
         return solids.Capsule(start=self.start, end=self.end, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
@@ -195,7 +195,7 @@ class Plane(Shape):
     normal: Vector = Field(description="points out of the material; its length does not matter")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
-        """Return the half space."""
+        """Return the half space that the normal points away from."""
         from warp_lcp.grid import solids
 
         return solids.Plane(point=self.point, normal=self.normal, placement=self.placement(dimension), invert=self.invert)
@@ -336,7 +336,7 @@ class LiquidMesh(MaterialProperties, Mesh):
 
 
 class Schedule(Table):
-    """When something runs."""
+    """When a source or a drain runs."""
 
     begin: NonNegative = Field(alias="start", default=0.0, description="when it starts to run [s]")
     stop: float | None = Field(default=None, description="when it no longer runs [s]; it goes on unless given")

@@ -13,6 +13,7 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from warp_lcp.nearest import nearest
 from warp_lcp.scene.foreign import one_line
+from warp_lcp.simulation import InputError
 
 ModelT = TypeVar("ModelT", bound="Table")
 
@@ -80,7 +81,7 @@ class Problem:
         return one_line(f"{where}: {self.message}" if where else self.message)
 
 
-class SceneError(ValueError):
+class SceneError(InputError):
     """A scene that cannot be used; `problems` lists everything that is wrong with it."""
 
     def __init__(self, source: str, problems: Iterable[Problem]) -> None:

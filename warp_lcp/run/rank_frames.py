@@ -4,29 +4,30 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.meeting import Meeting, on_root
 from warp_lcp.frames.atomic import make_folder
-from warp_lcp.frames.frames import FrameFolder, FrameWriter, GridFormat
+from warp_lcp.frames.frames import FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, rank_folder, write_whole
 from warp_lcp.simulation import Cells, Part, Stopwatch, Volume
 
 Pieces = dict[str, Piece]  # of a rank, by their parts' names
 
 
-class ParallelFrames(FrameFolder):
+class RankFrames:
     """The frames of a run on several ranks: `frames/rank_0003/<name>_<index>.vtu` (or .vti), and `frames/<name>_<index>.pvtu` (.pvti).
 
     Args:
-        folder: of the run.
-        grid_format: of the cells.
+        whole: the folder of the run's frames.
         meeting: of the ranks.
     """
 
-    def __init__(self, folder: Path, grid_format: GridFormat, meeting: Meeting) -> None:
+    def __init__(self, whole: FrameFolder, meeting: Meeting) -> None:
         """Look at a run's folder; nothing is written before the first frame."""
-        super().__init__(folder, grid_format)
-        self.meeting = meeting
+        self.whole, self.meeting = whole, meeting
+        self.frames = whole.frames
         self.pieces = self.frames / rank_folder(meeting.ranks.rank)
 
     def write(self, index: int, time: float, frame: list[Part]) -> list[Path]:
@@ -44,13 +45,12 @@ class ParallelFrames(FrameFolder):
             OSError: a file cannot be written; the earlier ones are intact.
         """
         make_folder(self.pieces)
-        return [self.write_part(self.pieces / f"{part.name}_{index:06d}", part) for part in frame]
+        return [self.whole.write_part(self.pieces / f"{part.name}_{index:06d}", part) for part in frame]
 
+    @on_root
     def resume(self, times: list[float]) -> None:
         """Continue after the frames of `times`, as `FrameFolder.resume` does; collective."""
-        with self.meeting.led():
-            if self.meeting.ranks.first:
-                super().resume(times)
+        self.whole.resume(times)
 
     def describe(self, frame: list[Part]) -> Pieces:
         """Return what there is to say of the rank's pieces.
@@ -58,11 +58,12 @@ class ParallelFrames(FrameFolder):
         Raises:
             ValueError: a field has another length than its points or cells.
         """
-        images: Kind = self.grid_format
+        images: Kind = self.whole.grid_format
         return {part.name: describe(part, images if isinstance(part, Cells) else "vtu") for part in frame if not isinstance(part, Volume)}
 
+    @on_root
     def publish(self, index: int, time: float, pieces: list[Pieces]) -> None:
-        """Write the files of a whole frame, and add it to the collections.
+        """Write the files of a whole frame, and add it to the collections; collective.
 
         Args:
             index: the frame's number.
@@ -77,40 +78,37 @@ class ParallelFrames(FrameFolder):
             found = [(f"{folder}/{name}_{index:06d}.{piece.kind}", piece) for folder, piece in of_ranks]
             file = self.frames / f"{name}_{index:06d}.{WHOLE[found[0][1].kind]}"
             write_whole(file, found)
-            self.collect(name, time, file)
+            self.whole.collect(name, time, file)
 
 
-class ParallelFrameWriter(FrameWriter):
+class RankFrameWriter:
     """A FrameWriter on each rank. Its methods are collective: what goes wrong with a rank's pieces is raised on all.
 
     A frame is published, as a whole and in order, when all ranks have written their pieces.
 
     Args:
-        folder: of the frames.
+        frames: of the run.
         watch: measures what this rank writes.
+
+    Attributes:
+        newest: the number of the newest frame that is there as a whole.
     """
 
-    def __init__(self, folder: ParallelFrames, watch: Stopwatch) -> None:
+    def __init__(self, frames: RankFrames, watch: Stopwatch) -> None:
         """Begin without frames."""
-        super().__init__(folder, watch)
-        self._whole, self._meeting = folder, folder.meeting
-        self._published: int | None = None
+        self.newest: int | None = None
+        self._frames, self._meeting, self._mine = frames, frames.meeting, FrameWriter(frames, watch)
         self._waiting: deque[tuple[int, float, list[Pieces]]] = deque()
 
-    @property
-    def newest(self) -> int | None:
-        """The number of the newest frame that is there as a whole."""
-        return self._published
-
     def put(self, index: int, time: float, frame: list[Part]) -> None:
-        """Hand over a frame, whose arrays nobody changes any more; wait if there are too many already.
+        """Hand over a frame, as to `FrameWriter.put`; on all ranks.
 
         Raises:
             OSError: an earlier frame could not be written on some rank.
         """
         with self._meeting.together():
-            pieces = self._whole.describe(frame)
-            super().put(index, time, frame)
+            pieces = self._frames.describe(frame)
+            self._mine.put(index, time, frame)
         self._waiting.append((index, time, self._meeting.exchange(pieces)))
         self._publish()
 
@@ -122,7 +120,7 @@ class ParallelFrameWriter(FrameWriter):
         """
         if self._waiting:  # as on every rank
             with self._meeting.together():
-                super().check()
+                self._mine.check()
             self._publish()
 
     def flush(self) -> None:
@@ -132,14 +130,22 @@ class ParallelFrameWriter(FrameWriter):
             OSError: a frame could not be written.
         """
         with self._meeting.together():
-            super().flush()
+            self._mine.flush()
         self._publish()
 
+    def __enter__(self) -> Self:
+        """Return the writer itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """End the thread, as `FrameWriter` does."""
+        self._mine.end()
+        if kind is None:
+            self.flush()
+
     def _publish(self) -> None:
-        done = min(-1 if written is None else written for written in self._meeting.exchange(self.written))
+        done = min(-1 if written is None else written for written in self._meeting.exchange(self._mine.newest))
         while self._waiting and self._waiting[0][0] <= done:
             index, time, pieces = self._waiting.popleft()
-            with self._meeting.led():
-                if self._meeting.ranks.first:
-                    self._whole.publish(index, time, pieces)
-            self._published = index
+            self._frames.publish(index, time, pieces)
+            self.newest = index

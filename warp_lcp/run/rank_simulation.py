@@ -1,0 +1,112 @@
+"""A simulation that ranks share, as the run loop wants it: an error on one rank is one on all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from warp_lcp.distributed.meeting import Meeting, RankFailed
+from warp_lcp.run.log import Value
+from warp_lcp.simulation import (
+    Cells,
+    DistributedSimulation,
+    NoStopwatch,
+    Part,
+    Profiled,
+    Scheduled,
+    SimulationFailed,
+    StepFailed,
+    Stopwatch,
+)
+
+Corners = tuple[tuple[int, int, int], tuple[int, int, int]]
+
+
+class RankSimulation:
+    """A rank's part of a simulation as the run loop wants it: an error on one rank is one on all.
+
+    Args:
+        simulation: of this rank, where the run begins or goes on.
+        meeting: of the ranks.
+
+    Attributes:
+        time: the simulation's [s].
+        step_count: steps done.
+    """
+
+    def __init__(self, simulation: DistributedSimulation, meeting: Meeting) -> None:
+        """Take over a simulation."""
+        self._simulation, self._meeting = simulation, meeting
+        self.time, self.step_count = simulation.time, simulation.step_count
+        self._watch: Stopwatch = NoStopwatch()
+
+    @property
+    def watch(self) -> Stopwatch:
+        """What the stages are measured with."""
+        return self._watch
+
+    @watch.setter
+    def watch(self, watch: Stopwatch) -> None:
+        self._watch = watch
+        if isinstance(self._simulation, Profiled):
+            self._simulation.watch = watch
+
+    def stable_dt(self) -> float:
+        """Return the largest time step [s] that all ranks allow."""
+        with self._meeting.together():
+            mine = self._simulation.stable_dt()
+        return float(self._meeting.share(mine))
+
+    def events(self, until: float) -> list[float]:
+        """Return when something starts or stops, up to `until` [s]; all ranks know it."""
+        return self._simulation.events(until) if isinstance(self._simulation, Scheduled) else []
+
+    def step(self, dt: float) -> dict[str, Value]:
+        """Advance by dt [s] and return a row of the log.
+
+        Raises:
+            StepFailed: the solve missed its criteria on all ranks.
+            SimulationFailed: the run cannot go on.
+        """
+        try:
+            with self._meeting.together():
+                row = self._simulation.step(dt)
+        except RankFailed as error:
+            raise SimulationFailed(str(error)) from error
+        except StepFailed as error:
+            if len(self._meeting.failed) < self._meeting.ranks.size:  # the others have gone on: there is no state to try again from
+                raise SimulationFailed(f"{error} (but not on all ranks)") from error
+            raise
+        self.time, self.step_count = self._simulation.time, self._simulation.step_count
+        return row
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns."""
+        return self._simulation.columns()
+
+    def frame(self) -> list[Part]:
+        """Return this rank's pieces of a frame; cells know which part of the grid they are from."""
+        with self._meeting.together():
+            return [replace(part, box=part.box or self._box) if isinstance(part, Cells) else part for part in self._simulation.frame()]
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return this rank's piece of the state."""
+        with self._meeting.together():
+            return self._simulation.piece_state()
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from the only piece of a state."""
+        self._simulation.restore_pieces([state])
+        self.time, self.step_count = self._simulation.time, self._simulation.step_count
+
+    def notes(self) -> list[str]:
+        """Return what is worth a line at the start of a run."""
+        return self._simulation.notes()
+
+    @cached_property
+    def _box(self) -> Corners:
+        (x0, y0, z0), (x1, y1, z1) = self._simulation.piece_state()["box"].tolist()
+        return (x0, y0, z0), (x1, y1, z1)

@@ -1,0 +1,60 @@
+"""What simulates a scene, and how it is found: the entry-point group `warp_lcp.simulators`."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from warp_lcp.simulation import DistributedSimulation, Simulation
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.scene.scene import Scene
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """A plug-in: a kind of material and the scenes that describe it."""
+
+    name: str
+    summary: str
+    scene_model: type[Any]  # a subclass of warp_lcp.scene.scene.Scene
+
+    def create(self, scene: Scene, *, device: str, folder: Path) -> Simulation:
+        """Build a simulation of `scene`. Files that the scene names are relative to `folder`.
+
+        Raises:
+            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+        """
+
+
+@runtime_checkable
+class DistributedSimulator(Protocol):
+    """What a Simulator may also be: one whose simulations several MPI ranks share."""
+
+    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSimulation:
+        """Build this rank's part of a simulation of `scene`; collective.
+
+        Raises:
+            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed.
+        """
+
+
+def simulators() -> dict[str, Simulator]:
+    """Return the installed simulators by name."""
+    return plug_ins("warp_lcp.simulators", Simulator, "a simulator")
+
+
+def plug_ins(group: str, kind: type[Any], what: str) -> dict[str, Any]:
+    """Return what the entry points of a group load, by name.
+
+    Raises:
+        TypeError: something is not of a kind, which `what` says in words.
+    """
+    found = {}
+    for entry in entry_points(group=group):
+        found[entry.name] = entry.load()
+        if not isinstance(found[entry.name], kind):
+            raise TypeError(f"entry point {entry.name!r} of {group} is not {what}: {found[entry.name]!r}")
+    return found
