@@ -13,7 +13,7 @@ import numpy as np
 from warp_lcp.claims import read_whole
 from warp_lcp.frames.atomic import write_text
 from warp_lcp.frames.vti import GHOSTS, extent_of, image_box, image_end
-from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writable
+from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writable, writable_fields
 from warp_lcp.frames.vtu import Mesh
 from warp_lcp.simulation import Cells, Points, Surface
 
@@ -50,8 +50,8 @@ class Piece:
 def describe(part: Points | Cells | Surface, kind: Kind) -> Piece:
     """Return what is to be said of a part that becomes a file of a kind."""
     cells = isinstance(part, Cells)
-    size = len(part.index) if isinstance(part, Cells) else len(part.points)
-    fields = tuple(attributes(name, writable(name, values, size)) for name, values in part.fields.items())
+    size, written = writable_fields(part)
+    fields = tuple(attributes(name, values) for name, values in written.items())
     if isinstance(part, Cells) and kind == "vti":
         low, counts = image_box(part)
         end = image_end(low, counts, part.dimension)
