@@ -52,7 +52,7 @@ wheel-check: $(VENV)/.dev
 	rm -rf build/wheel-check
 	mkdir -p build/wheel-check
 	$(BIN)/python -m pip install --quiet --target build/wheel-check/tools 'setuptools>=77'
-	PYTHONPATH=build/wheel-check/tools $(BIN)/python .ci/wheel_contents.py build/wheel-check
+	PYTHONPATH=$(CURDIR)/build/wheel-check/tools $(BIN)/python .ci/wheel_contents.py build/wheel-check
 	$(BIN)/python -c "import sys, tomllib; floors = tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies']; \
 		print(*(floor.replace('>=', '==') for floor in floors if sys.version_info[:2] == (3, 11)), sep='\n')" > build/wheel-check/floors.txt
 	$(PYTHON) -m venv build/wheel-check/venv

@@ -11,7 +11,7 @@ from warp_lcp.cli import commands as cli
 from warp_lcp.render.recording import Color, RenderError, Show
 from warp_lcp.render.render import INSTALL_MATPLOTLIB, Looks, render_run
 from warp_lcp.render.section import cut
-from warp_lcp.simulation import Cells, Points
+from warp_lcp.simulation import Cells, Points, Surface
 
 pytest.importorskip("matplotlib", reason="sections need Matplotlib, the extra `render`")
 SIZE = (400, 300)
@@ -56,6 +56,8 @@ def test_a_section_of_a_sphere_is_a_circle():
         np.testing.assert_allclose(np.linalg.norm(ends, axis=-1), np.sqrt(1.0 - z**2), atol=5e-3)
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
         assert length == pytest.approx(2.0 * np.pi * np.sqrt(1.0 - z**2), rel=5e-3)  # each part of the circle once
+        area = 0.5 * (ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 0, 1] * ends[:, 1, 0]).sum()
+        assert abs(area) == pytest.approx(np.pi * (1.0 - z**2), rel=1e-2)  # all in one direction
     assert len(cut(points[corners], 1.5)) == 0
 
 
@@ -97,6 +99,23 @@ def test_surfaces_and_bodies_are_outlined(dots, tmp_path):
     (image,), (plain,) = draw(folder, show=Show.BOTH), draw(folder)
     assert (plain[..., 0] - plain[..., 2] > 80).sum() > 30  # the body
     assert ((image != plain).any(axis=-1)).sum() > 150  # the surface
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_bodies_are_filled_but_for_their_holes(dots, tmp_path, dimension):
+    outer, inner = (ball([0.6, 0.5, 0.5][:dimension], radius, "bodies", body=1) for radius in (0.3, 0.2))
+    corners = np.concatenate([outer.corners, inner.corners[:, ::-1] + len(outer.points)])
+    shell = Surface(
+        "bodies", np.concatenate([outer.points, inner.points]), corners, {"body": np.ones(len(outer.points) + len(inner.points))}
+    )
+    (image,) = draw(
+        write_run(tmp_path / "run", [[*material(dimension, 0), shell]], size=(1.0,) * dimension),
+        color=Color.PLAIN,
+        at=0.53 if dimension == 3 else None,
+    )
+    orange = (np.abs(image - [224, 122, 63]) < 12).all(axis=-1)
+    side = np.ptp(np.argwhere((image.max(axis=-1) < 60).sum(axis=1) > 100).ravel())  # pixels of a meter
+    assert orange.sum() / side**2 == pytest.approx(np.pi * (0.3**2 - 0.2**2), rel=0.1)  # but for the lines along its edges
 
 
 def test_a_surface_alone_is_drawn_over_plain_cells(dots, tmp_path):

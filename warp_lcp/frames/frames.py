@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 import re
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Protocol, Self
+from typing import Any, Literal, Protocol, Self
 
 from warp_lcp.files.atomic import make_folder, write_text
 from warp_lcp.frames.nvdb import nvdb_bytes, write_nvdb
-from warp_lcp.frames.pieces import WHOLE, piece_files
+from warp_lcp.frames.pieces import WHOLE, in_ranks, piece_files
 from warp_lcp.frames.ply import ply_bytes, write_ply
-from warp_lcp.frames.rank_folder import in_ranks
 from warp_lcp.frames.vti import vti_bytes, write_vti
 from warp_lcp.frames.vtu import vtu_bytes, write_vtu
 from warp_lcp.simulation import Cells, NoStopwatch, Part, Stopwatch, Surface, Volume
@@ -26,6 +25,12 @@ WAITING = 2  # frames in memory, the one being written included
 END = b"</VTKFile>\n"  # of those that are whole
 
 GridFormat = Literal["vtu", "vti"]
+FORMATS: dict[str, tuple[Callable[[Path, Any], None], Callable[[Any], int]]] = {  # what writes a part, and how many bytes that takes
+    "vtu": (write_vtu, vtu_bytes),
+    "vti": (write_vti, vti_bytes),
+    "nvdb": (write_nvdb, nvdb_bytes),
+    "ply": (write_ply, ply_bytes),
+}
 
 
 class FrameFolder:
@@ -125,15 +130,9 @@ class FrameFolder:
         Raises:
             OSError: the file cannot be written.
         """
-        if isinstance(part, Volume):
-            file = path.with_suffix(".nvdb")
-            write_nvdb(file, part)
-        elif isinstance(part, Cells) and self.grid_format == "vti":
-            file = path.with_suffix(".vti")
-            write_vti(file, part)
-        else:
-            file = path.with_suffix(".vtu")
-            write_vtu(file, part)
+        suffix = part_format(part, self.grid_format)
+        file = path.with_suffix(f".{suffix}")
+        FORMATS[suffix][0](file, part)
         return file
 
 
@@ -152,7 +151,6 @@ class FrameWriter:
     """
 
     def __init__(self, folder: Frames, watch: Stopwatch | None = None) -> None:
-        """Begin without frames."""
         self.newest: int | None = None  # the number of the newest frame that is on disk
         self._folder = folder
         self._watch = watch or NoStopwatch()
@@ -225,8 +223,14 @@ def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_p
         grid_format: of the cells.
         surface_ply: count the PLY files of surfaces.
     """
-    more = sum(ply_bytes(part) for part in frame if surface_ply and isinstance(part, Surface))
-    return more + sum(_bytes(part, grid_format) for part in frame)
+    formats = [(part, part_format(part, grid_format)) for part in frame]
+    formats += [(part, "ply") for part in frame if surface_ply and isinstance(part, Surface)]
+    return sum(FORMATS[suffix][1](part) for part, suffix in formats)
+
+
+def part_format(part: Part, grid_format: GridFormat) -> str:
+    """Return the suffix of a part's file, a key of FORMATS; surfaces may have a PLY file besides."""
+    return "nvdb" if isinstance(part, Volume) else grid_format if isinstance(part, Cells) else "vtu"
 
 
 def _is_whole(file: Path) -> bool:
@@ -251,9 +255,3 @@ def collection(entries: list[tuple[float, str]]) -> str:
     lines = [f'    <DataSet timestep="{time!r}" group="" part="0" file="{file}"/>' for time, file in entries]
     head = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "  <Collection>"]
     return "\n".join([*head, *lines, "  </Collection>", "</VTKFile>", ""])
-
-
-def _bytes(part: Part, grid_format: GridFormat) -> int:
-    if isinstance(part, Volume):
-        return nvdb_bytes(part)
-    return vti_bytes(part) if isinstance(part, Cells) and grid_format == "vti" else vtu_bytes(part)

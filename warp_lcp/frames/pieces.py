@@ -1,7 +1,8 @@
-"""Frames in pieces, one a rank: PVTU and PVTI files, which make one of them for ParaView, and reading them back."""
+"""Frames in pieces, each in the folder of a rank: PVTU and PVTI files, which make one of them for ParaView, and reading them back."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +12,12 @@ import numpy as np
 
 from warp_lcp.files.atomic import write_text
 from warp_lcp.files.claims import read_whole
-from warp_lcp.frames.rank_folder import RANK_FOLDER
 from warp_lcp.frames.vti import GHOSTS, extent_of, image_box, image_end
-from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writable
+from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writable, writable_fields
 from warp_lcp.frames.vtu import Mesh
 from warp_lcp.simulation import Cells, Points, Surface
 
+RANK_FOLDER = re.compile(r"rank_\d{4,}")  # where each process keeps its pieces of frames and checkpoints
 WHOLE = {"vtu": "pvtu", "vti": "pvti"}  # the suffix of the file that names the pieces, by theirs
 
 Kind = Literal["vtu", "vti"]
@@ -49,8 +50,8 @@ class Piece:
 def describe(part: Points | Cells | Surface, kind: Kind) -> Piece:
     """Return what is to be said of a part that becomes a file of a kind."""
     cells = isinstance(part, Cells)
-    size = len(part.index) if isinstance(part, Cells) else len(part.points)
-    fields = tuple(attributes(name, writable(name, values, size)) for name, values in part.fields.items())
+    size, written = writable_fields(part)
+    fields = tuple(attributes(name, values) for name, values in written.items())
     if isinstance(part, Cells) and kind == "vti":
         low, counts = image_box(part)
         end = image_end(low, counts, part.dimension)
@@ -132,6 +133,31 @@ def one_grid(parts: Sequence[Cells]) -> Cells:
     return Cells(first.name, np.concatenate([part.index for part in parts]), first.spacing, first.dimension, fields)
 
 
+def rank_folder(rank: int) -> str:
+    """Return the name of a rank's folder."""
+    return f"rank_{rank:04d}"
+
+
+def in_ranks(folder: Path) -> Iterator[Path]:
+    """Yield what is in a folder, and in the folders of ranks there; nothing if there is no such folder."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if _is_rank(path):
+            yield from path.iterdir()
+        else:
+            yield path
+
+
+def remove_empty_ranks(folder: Path) -> None:
+    """Delete the folders of ranks in a folder that hold nothing.
+
+    Raises:
+        OSError: one cannot be deleted.
+    """
+    for path in list(folder.iterdir()) if folder.is_dir() else ():
+        if _is_rank(path) and not any(path.iterdir()):
+            path.rmdir()
+
+
 def _mesh(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:
     yield opening("PUnstructuredGrid").decode()
     yield '<PUnstructuredGrid GhostLevel="0">\n'
@@ -163,3 +189,7 @@ def _arrays(where: str, arrays: Sequence[str]) -> Iterator[str]:
 def _triple(values: np.ndarray) -> tuple[int, int, int]:
     x, y, z = map(int, values)
     return x, y, z
+
+
+def _is_rank(path: Path) -> bool:
+    return RANK_FOLDER.fullmatch(path.name) is not None and path.is_dir() and not path.is_symlink()

@@ -1,4 +1,8 @@
-"""PLY files of surfaces, which modelers such as Blender read."""
+"""PLY files of surfaces, which modelers such as Blender read.
+
+meshio writes such files too, but with the time of day in them, so that no two runs make the same bytes, and
+segments as faces of two corners.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +32,7 @@ def write_ply(path: Path, surface: Surface) -> None:
     for name, values in surface.fields.items():
         parts = {name: values} if values.ndim == 1 else {f"{name}_{axis}": values[:, number] for number, axis in enumerate(AXES)}
         columns |= {key: part.astype(part.dtype.newbyteorder("<")) for key, part in parts.items()}
-    vertices = np.empty(len(surface.points), dtype=[(name, column.dtype) for name, column in columns.items()])
-    for name, column in columns.items():
-        vertices[name] = column
+    vertices = np.rec.fromarrays(list(columns.values()), dtype=[(name, column.dtype) for name, column in columns.items()])
     count, size = surface.corners.shape
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property {TYPES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]

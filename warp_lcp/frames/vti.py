@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_lcp.files.atomic import replacing
 from warp_lcp.files.claims import read_whole
-from warp_lcp.frames.vtk_xml import LENGTH_BYTES, array_values, attributes, length, opening, raw, read_back, root, writable
+from warp_lcp.frames.vtk_xml import LENGTH_BYTES, array_values, attributes, length, opening, raw, read_back, root, writable_fields
 from warp_lcp.simulation import Cells
 
 HIDDEN = 32  # vtkDataSetAttributes::HIDDENCELL
@@ -30,7 +30,7 @@ def write_vti(path: Path, cells: Cells) -> None:
         OSError: the file cannot be written.
         ValueError: a field has another length than the cells, or a cell lies outside the grid.
     """
-    fields = {name: writable(name, values, len(cells.index)) for name, values in cells.fields.items()}
+    _, fields = writable_fields(cells)
     low, counts = image_box(cells)
     columns = cells.index.T
     if len(cells.index) and any(c.min() < a or c.max() >= a + n for c, a, n in zip(columns, low, counts, strict=True)):

@@ -11,6 +11,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from warp_lcp.simulation import Cells, Points, Surface
+
 ENCODED = 3 * 2**18  # bytes encoded at a time, a multiple of 3: memory stays small, and other threads go on in between
 TYPE = re.compile(r"(?P<kind>Float|Int|UInt)(?P<bits>8|16|32|64)")
 LENGTH_BYTES = 8  # before each array, as header_type says
@@ -43,6 +45,12 @@ def writable(name: str, values: np.ndarray, size: int) -> np.ndarray:
     elif values.dtype == np.float16:
         values = values.astype(np.float32)
     return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+
+
+def writable_fields(part: Points | Cells | Surface) -> tuple[int, dict[str, np.ndarray]]:
+    """Return how many points or cells a part has, and its fields as `writable` makes them."""
+    size = len(part.index if isinstance(part, Cells) else part.points)
+    return size, {name: writable(name, values, size) for name, values in part.fields.items()}
 
 
 def attributes(name: str, values: np.ndarray) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_lcp.files.atomic import replacing
 from warp_lcp.files.claims import read_whole
-from warp_lcp.frames.vtk_xml import inline, inline_values, opening, read_back, root, writable
+from warp_lcp.frames.vtk_xml import inline, inline_values, opening, read_back, root, writable, writable_fields
 from warp_lcp.simulation import Cells, Points, Surface
 
 # Corners of a cell in VTK's order for quadrilaterals (the first four) and hexahedra, as x, y, z.
@@ -52,8 +52,7 @@ def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
         OSError: the file cannot be written.
         ValueError: a field has another length than the points or cells.
     """
-    size = len(part.index if isinstance(part, Cells) else part.points)
-    fields = {name: writable(name, values, size) for name, values in part.fields.items()}
+    size, fields = writable_fields(part)
     if isinstance(part, Points):
         points, corners = writable("points", part.points, size), np.arange(size, dtype="<i4")[:, None]
     elif isinstance(part, Surface):

@@ -38,7 +38,6 @@ class Actors:
     """What stands on a plotter of pyvista's, in groups that are exchanged as a whole."""
 
     def __init__(self, plotter: Any) -> None:
-        """Begin without any."""
         self.plotter = plotter
         self._counts: dict[str, int] = defaultdict(int)
 

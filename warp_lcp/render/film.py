@@ -42,7 +42,6 @@ class Film:
     """
 
     def __init__(self, file: Path, size: tuple[int, int], rate: float) -> None:
-        """Begin without images."""
         self.file, self.size, self.suffix = file, size, film_suffix(file)
         self._every = max(1, math.ceil(rate / GIF_FASTEST * (1.0 - 1e-9))) if self.suffix == ".gif" else 1
         self._rate, self._offered = rate / self._every, 0

@@ -24,7 +24,7 @@ class Painter(Protocol):
         """Return a picture of a frame."""
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free windows and the like; nothing is drawn afterward."""
 
 
 class Page:
@@ -43,7 +43,6 @@ class Page:
     def __init__(
         self, recording: Recording, size: tuple[int, int], pictures: int, painter: Callable[[Recording, tuple[int, int]], Painter]
     ) -> None:
-        """Divide the image."""
         self.recording, self.size = recording, size
         self.line = max(20, round(0.065 * min(size)))  # heights [pixels]
         self.caption = round(0.8 * self.line) if pictures > 1 else 0

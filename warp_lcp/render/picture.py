@@ -33,7 +33,6 @@ class Picture:
     """
 
     def __init__(self, recording: Recording, size: tuple[int, int], plotter: Any = None) -> None:
-        """Draw what stands."""
         import pyvista
 
         scene = self.scene = recording.scene
@@ -79,7 +78,7 @@ class Picture:
         return np.asarray(Image.fromarray(self.plotter.screenshot(return_img=True)).reduce(SAMPLES))
 
     def close(self) -> None:
-        """Free the window."""
+        """Free the window that pyvista draws into."""
         self.plotter.close()
 
     def _place_standing(self) -> None:

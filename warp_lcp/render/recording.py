@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -15,13 +14,14 @@ import numpy as np
 from warp_lcp.frames.frames import FRAME_FILE
 from warp_lcp.frames.pieces import one_grid, one_mesh, piece_files
 from warp_lcp.frames.vti import read_vti
-from warp_lcp.frames.vtu import Mesh, read_vtu
+from warp_lcp.frames.vtu import read_vtu
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
 from warp_lcp.simulation import Cells, InputError, Surface
 
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
+READERS: dict[str, tuple[Callable[[Path], Any], Callable[[list[Any]], Any]]] = {"vtu": (read_vtu, one_mesh), "vti": (read_vti, one_grid)}
 SUFFIXES = (".vti", ".pvti", ".pvtu", ".vtu")  # of a frame's files; at most one of them is there
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 PALETTES = {  # of speeds, by `Scene.palette`
@@ -254,7 +254,7 @@ class Recording:
         """Return the cells of a frame with their fields."""
         file = self._file("grid", number)
         if file.suffix in (".vti", ".pvti"):
-            cells = _read_image(file)
+            cells = _read(file)
         elif not len((mesh := _read(file)).corners):
             return None
         else:
@@ -292,30 +292,19 @@ def spread(numbers: Sequence[int], count: int) -> list[int]:
     return [numbers[round(place)] for place in places]
 
 
-def _read(file: Path) -> Mesh:
-    """Return a frame's mesh."""
-    with _readable(file):
-        return one_mesh([read_vtu(piece) for piece in _pieces(file)]) if file.suffix == ".pvtu" else read_vtu(file)
+def _read(file: Path) -> Any:
+    """Return the Mesh or the Cells of a frame's file, or of the pieces that it names.
 
-
-def _read_image(file: Path) -> Cells:
-    """Return the cells of a frame that is an image."""
-    with _readable(file):
-        return one_grid([read_vti(piece) for piece in _pieces(file)]) if file.suffix == ".pvti" else read_vti(file)
-
-
-def _pieces(file: Path) -> list[Path]:
-    """Return the files of the pieces of a frame, of which there is at least one."""
-    if found := piece_files(file):
-        return found
-    raise ValueError("names no pieces")
-
-
-@contextmanager
-def _readable(file: Path) -> Iterator[None]:
-    """Say which file of a frame cannot be read, and why."""
+    Raises:
+        RenderError: a file cannot be read.
+    """
+    read, joined = READERS[file.suffix[-3:]]
     try:
-        yield
+        if not file.suffix.startswith(".p"):
+            return read(file)
+        if pieces := piece_files(file):
+            return joined([read(piece) for piece in pieces])
+        raise ValueError("names no pieces")
     except OSError as error:
         raise RenderError(f"{error.filename or file}: cannot be read: {error.strerror}") from error
     except ValueError as error:

@@ -109,7 +109,13 @@ def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, 
         RenderError: it is not installed, or is not asked for what it can.
     """
     if looks.cut:
-        return _section(looks)
+        try:
+            import matplotlib as _  # noqa: F401
+        except ImportError as error:
+            raise RenderError(f"--slice needs Matplotlib, which cannot be loaded ({error}): {INSTALL_MATPLOTLIB}") from error
+        from warp_lcp.render.section import Section
+
+        return partial(Section, at=looks.at)
     if looks.at is not None:
         raise RenderError("--at: says where --slice cuts; give both")
     try:
@@ -122,16 +128,6 @@ def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, 
 
     stack.enter_context(pyvista.vtk_verbosity("off"))  # VTK warns where there is no display, and draws all the same
     return Picture
-
-
-def _section(looks: Looks) -> Callable[[Recording, tuple[int, int]], Painter]:
-    try:
-        import matplotlib as _  # noqa: F401
-    except ImportError as error:
-        raise RenderError(f"--slice needs Matplotlib, which cannot be loaded ({error}): {INSTALL_MATPLOTLIB}") from error
-    from warp_lcp.render.section import Section
-
-    return lambda recording, size: Section(recording, size, looks.at)
 
 
 def parse_size(text: str) -> tuple[int, int]:

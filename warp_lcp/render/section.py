@@ -10,14 +10,14 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.motion import Pose
+from warp_lcp.render.actors import BODY_COLORS, BODY_EDGE
 from warp_lcp.render.recording import Color, Frame, Recording, RenderError
-from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
+from warp_lcp.render.solid_meshes import EDGE, nearest_distance, prescribed_solids
 from warp_lcp.simulation import Surface
 
 DOTS_AN_INCH = 100
 OUTLINE_POINTS = 400  # along the longest side, where solids are sampled
-CELL, DOT, SOLID, EDGE, LINE, BODY = "#e6eaee", "#1c3f63", "#c3c7cc", "#6b7075", "#0c3e80", "#e07a3f"
-BODY_EDGE = "#4a3b33"
+CELL, DOT, SOLID, LINE = "#e6eaee", "#1c3f63", "#c3c7cc", "#0c3e80"
 SMALLEST_DOT, LARGEST_DOT = 2.0, 5.0  # points
 
 
@@ -125,7 +125,7 @@ class Section:
         origin = np.zeros((len(ends), 1, 2))
         triangles = np.concatenate([origin, ends, origin], axis=1).reshape(-1, 2)
         codes = np.tile([Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY], len(ends))
-        axes.add_patch(PathPatch(Path(triangles, codes), facecolor=BODY, linewidth=0.0, zorder=5))
+        axes.add_patch(PathPatch(Path(triangles, codes), facecolor=BODY_COLORS[0], linewidth=0.0, zorder=5))
         self._draw_lines(axes, bodies, BODY_EDGE)
 
     def _segments(self, surface: Surface) -> np.ndarray:

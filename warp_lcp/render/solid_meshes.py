@@ -72,7 +72,6 @@ class RoomSolids:
     """
 
     def __init__(self, size: Sequence[float], line_width: float) -> None:
-        """Take the domain."""
         self.size, self.line_width = np.array(size), line_width
 
     def domain(self) -> list[Drawn]:

@@ -10,8 +10,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from warp_lcp.render.page import INK
 from warp_lcp.render.recording import Recording, RenderError
 from warp_lcp.render.render import INSTALL, Looks
+from warp_lcp.render.solid_meshes import EDGE
 
 WINDOW = 1280, 720  # pixels at the start
 WITHOUT_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK falls back to
@@ -30,7 +32,6 @@ class Viewer:
     """
 
     def __init__(self, recording: Recording, plotter: Any, clock: Callable[[], float] = time.perf_counter) -> None:
-        """Show the first frame."""
         from warp_lcp.render.picture import Picture
 
         self.recording, self.plotter, self.clock = recording, plotter, clock
@@ -46,7 +47,7 @@ class Viewer:
         self.place = min(max(place, 0), len(self.recording.numbers) - 1)
         frame = self.recording.frame(self.recording.numbers[self.place])
         self.picture.place(frame)
-        self.plotter.add_text(f"t = {frame.time:.3f} s", position="upper_left", font_size=12, color="#33373b", name="time", render=False)
+        self.plotter.add_text(f"t = {frame.time:.3f} s", position="upper_left", font_size=12, color=INK, name="time", render=False)
         if self._slider is not None:
             self._slider.GetRepresentation().SetValue(self.place)
         self.plotter.render()
@@ -78,12 +79,12 @@ class Viewer:
 
     def _add_controls(self) -> None:
         last = len(self.recording.numbers) - 1
-        self.plotter.add_text(KEYS, position="upper_right", font_size=9, color="#6b7075", name="keys", render=False)
+        self.plotter.add_text(KEYS, position="upper_right", font_size=9, color=EDGE, name="keys", render=False)
         if last == 0 or self.plotter.iren is None:
             return
         self._slider = self.plotter.add_slider_widget(
             lambda value: None if round(value) == self.place else self.step(round(value) - self.place), rng=[0, last], value=0,
-            pointa=(0.25, 0.05), pointb=(0.75, 0.05), fmt="%.0f", color="#33373b", style="modern", slider_width=0.015, tube_width=0.004,
+            pointa=(0.25, 0.05), pointb=(0.75, 0.05), fmt="%.0f", color=INK, style="modern", slider_width=0.015, tube_width=0.004,
         )  # fmt: skip
         for key, action in (
             ("space", self.play), ("Right", lambda: self.step(1)), ("Left", lambda: self.step(-1)),

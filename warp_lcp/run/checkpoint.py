@@ -17,7 +17,7 @@ import numpy as np
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.archive import Archive, ArchiveError
 from warp_lcp.files.atomic import make_folder, replacing
-from warp_lcp.frames.rank_folder import in_ranks, rank_folder
+from warp_lcp.frames.pieces import in_ranks, rank_folder
 
 FORMAT = 2
 CHECKPOINT_FILE = re.compile(r"step_(?P<step>[0-9]{6,})\.npz")

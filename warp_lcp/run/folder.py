@@ -21,7 +21,7 @@ from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
 from warp_lcp.files.claims import one_line
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
-from warp_lcp.frames.rank_folder import in_ranks, remove_empty_ranks
+from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import CHECKPOINT_FILE, PIECES, REFUSED_FILE, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
 from warp_lcp.run.devices import versions

@@ -10,8 +10,7 @@ from typing import Self
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.atomic import make_folder
 from warp_lcp.frames.frames import FrameFolder, FrameWriter
-from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, write_whole
-from warp_lcp.frames.rank_folder import rank_folder
+from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, rank_folder, write_whole
 from warp_lcp.simulation import Cells, Part, Stopwatch, Volume
 
 Pieces = dict[str, Piece]  # of a rank, by their parts' names
