@@ -144,7 +144,6 @@ def _times(n: int, records: Sequence[Record]) -> Table:
 
 
 def _quality(n: int, records: Sequence[Record]) -> Table:
-    """Iterations, memory and ratios."""
     names = ["iterations", "linear_iterations", "warm_iterations", "residual", "bytes_per_cell", "resident_per_cell"]
     names += ["over_linear", "warm_over_linear", "over_unit", "iterations_over_unit"]
     rows = [[r.name.partition(" ")[2], *shown(r, names)] for r in records]

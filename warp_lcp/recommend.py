@@ -49,7 +49,6 @@ class Budget(Settings):
     bytes: Count | None = None
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         super().__post_init__()
         if self.seconds is None and self.iterations is None and self.bytes is None:
             raise ValueError("budget: give seconds, iterations or bytes")

@@ -48,7 +48,6 @@ class Promise:
     names: str = ""  # what the message of a refusal must contain
 
     def __str__(self) -> str:
-        """Return it in words."""
         detail = "/".join(sorted(self.statuses)) or self.names
         return f"{self.expected.value} ({detail})" if detail else self.expected.value
 

@@ -70,12 +70,10 @@ class Settings:
         self.options = options
 
     def __enter__(self) -> None:
-        """Set them."""
         for name, value in self.options.items():
             PETSc.Options()[name] = value
 
     def __exit__(self, *_: object) -> None:
-        """Forget them."""
         for name in self.options:
             PETSc.Options().delValue(name)
 

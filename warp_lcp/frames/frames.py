@@ -191,11 +191,9 @@ class FrameWriter:
         self._thread.shutdown()
 
     def __enter__(self) -> Self:
-        """Return the writer itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """End the thread."""
         self.end()
         if kind is None:
             self.flush()

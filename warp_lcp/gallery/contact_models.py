@@ -44,7 +44,6 @@ class ContactSystem:
     dim: int = 3
 
     def __post_init__(self) -> None:
-        """Check shapes and signs."""
         n = self.dim * len(self.friction) + len(self.lower)
         if self.dim not in (2, 3):
             raise ValueError(f"dim = {self.dim}: must be 2 or 3")

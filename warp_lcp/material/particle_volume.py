@@ -23,7 +23,6 @@ class ParticleVolume:
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int) -> None:
-        """Allocate the fields."""
         self._grid, self._boundary = grid, boundary
         self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell)
 

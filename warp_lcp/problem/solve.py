@@ -437,7 +437,6 @@ class _LoopInBox(_Loop):
         return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
 
     def _take(self, guess: wp.array[Any]) -> None:
-        """Start from a guess."""
         wp.copy(self.work.x, guess)
         self.residual.start(self.work.x, keep=True)
         self.work.round_iterate()

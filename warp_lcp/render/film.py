@@ -63,7 +63,6 @@ class Film:
             raise self._failure(error) from error
 
     def __enter__(self) -> Self:
-        """Return the film itself."""
         with ExitStack() as stack:
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)

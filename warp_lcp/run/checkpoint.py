@@ -61,13 +61,11 @@ class StoredPiece(Mapping[str, np.ndarray]):
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the arrays' names."""
         self.path = path
         with Archive(path) as archive:
             self._names = [name.removeprefix(STATE) for name in archive.headers if name.startswith(STATE)]
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Read an array."""
         if name not in self._names:
             raise KeyError(name)
         with Archive(self.path) as archive:
@@ -98,7 +96,6 @@ class CheckpointFolder:
     """
 
     def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None, collective: Collective | None = None) -> None:
-        """Look at a folder."""
         self.folder, self.collective, self._in_pieces = folder, collective or Collective.of_one(), collective is not None
         self._refused: dict[int, str] = {}  # why the pieces of a step cannot be used, as its ranks have found
         self._continued: int | None = None  # the step that ranks go on from, whose pieces are not to be replaced

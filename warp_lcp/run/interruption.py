@@ -35,7 +35,6 @@ class Interruption:
     """
 
     def __init__(self, say: Callable[[str], None], *, at_once: bool = True, last: Callable[[str], None] = lambda name: None) -> None:
-        """Wait for nothing yet."""
         self._say, self._early, self._last = say, at_once, last
         self._taken = threading.Event()
         self._name = ""
@@ -47,7 +46,6 @@ class Interruption:
         return self._name
 
     def __enter__(self) -> Self:
-        """Take the signals."""
         self._read, self._write = os.pipe()
         if hasattr(os, "set_blocking"):
             os.set_blocking(self._write, False)
@@ -60,7 +58,6 @@ class Interruption:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Give the signals back."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._wakeup)

@@ -53,7 +53,6 @@ class LoadedKernels:
     """
 
     def __init__(self) -> None:
-        """Begin with nothing."""
         self.loads = Stage()
         self._logger, self._level = wp.get_logger(), wp.config.log_level
 
@@ -90,7 +89,6 @@ class Profile:
     """
 
     def __init__(self, device: str) -> None:
-        """Begin with nothing."""
         self.stages: dict[str, Stage] = {}
         self._device = wp.get_device(device)
         self._loads = Stage()

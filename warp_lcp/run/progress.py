@@ -51,14 +51,12 @@ class Lines:
     """A plain line for each frame."""
 
     def __init__(self, console: Console) -> None:
-        """Write to `console`."""
         self._console = console
         self._progress = Progress(console=console, speed_estimate_period=WINDOW)  # never shown
         self._task = self._progress.add_task("", total=None)
         self._row: Mapping[str, Value] = {}
 
     def __enter__(self) -> Self:
-        """Return the observer itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -93,7 +91,6 @@ class Bar:
     """A bar of simulated time, the last step's numbers and the time left."""
 
     def __init__(self, console: Console) -> None:
-        """Draw on `console`."""
         text = TextColumn("{task.description}", table_column=Column(no_wrap=True))
         bar = BarColumn(bar_width=None, table_column=Column(ratio=1))  # what the text leaves of the line
         percent = TaskProgressColumn(table_column=Column(no_wrap=True, width=4))
@@ -102,7 +99,6 @@ class Bar:
         self._task = self._progress.add_task("first step: loading kernels", total=None)
 
     def __enter__(self) -> Self:
-        """Begin to draw."""
         self._progress.start()
         return self
 

@@ -95,7 +95,6 @@ class RankFrameWriter:
     """
 
     def __init__(self, frames: RankFrames, watch: Stopwatch) -> None:
-        """Begin without frames."""
         self.newest: int | None = None
         self._frames, self._collective, self._mine = frames, frames.collective, FrameWriter(frames, watch)
         self._waiting: deque[tuple[int, float, list[Pieces]]] = deque()
@@ -134,7 +133,6 @@ class RankFrameWriter:
         self._publish()
 
     def __enter__(self) -> Self:
-        """Return the writer itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -38,7 +38,6 @@ class RankSimulation:
     """
 
     def __init__(self, simulation: DistributedSimulation, collective: Collective) -> None:
-        """Take over a simulation."""
         self._simulation, self._collective = simulation, collective
         self.time, self.step_count = simulation.time, simulation.step_count
         self._watch: Stopwatch = NoStopwatch()

@@ -25,7 +25,6 @@ class Terminal(Console):
     """A console whose own colors and bars reach the terminal, and no control character of the text that it is given."""
 
     def __init__(self, **options: Any) -> None:
-        """Take rich's options."""
         super().__init__(**options)
         self.push_render_hook(_Harmless())
 

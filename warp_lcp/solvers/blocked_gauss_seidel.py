@@ -81,7 +81,6 @@ class BlockedGaussSeidel(Settings):
     precision: PrecisionName = "mixed"
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         super().__post_init__()
         if self.sub_solver is not None and self.omega != 1:
             raise ValueError(f"omega = {self.omega}: must be 1 with a sub_solver")

@@ -155,7 +155,6 @@ class MultigridWorkspace(IterateMemory):
         self._algebraic: AlgebraicSteps | None = None
 
     def _residual(self, problem: LCP, rounded: bool) -> AssessedResidual:
-        """Return what evaluates iterates."""
         return AssessedResidual(problem, self.A, self.hierarchy, rounded=rounded)
 
     def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
