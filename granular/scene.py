@@ -16,17 +16,17 @@ from warp_lcp.scene.scene import PRESET_KEY, Complaint, Domain, Table, Time
 from warp_lcp.scene.shapes import (
     FRICTIONS,
     STICKS,
-    Box,
-    Capsule,
+    BoxTable,
+    CapsuleTable,
     MaterialProperties,
-    Mesh,
-    Plane,
+    MeshTable,
+    PlaneTable,
     SolidBox,
     SolidCapsule,
     SolidMesh,
     SolidPlane,
     SolidSphere,
-    Sphere,
+    SphereTable,
     WallFriction,
 )
 from warp_lcp.settings import NonNegative, Positive, Share
@@ -140,23 +140,23 @@ class SandProperties(MaterialProperties):
     cohesion: NonNegative | None = Field(default=None, description="[Pa]; material.cohesion unless given")
 
 
-class SandBox(SandProperties, Box):
+class SandBox(SandProperties, BoxTable):
     """A box of sand."""
 
 
-class SandSphere(SandProperties, Sphere):
+class SandSphere(SandProperties, SphereTable):
     """A ball of sand."""
 
 
-class SandCapsule(SandProperties, Capsule):
+class SandCapsule(SandProperties, CapsuleTable):
     """A capsule of sand."""
 
 
-class SandPlane(SandProperties, Plane):
+class SandPlane(SandProperties, PlaneTable):
     """A half space of sand."""
 
 
-class SandMesh(SandProperties, Mesh):
+class SandMesh(SandProperties, MeshTable):
     """Sand inside a surface of triangles."""
 
 

@@ -12,12 +12,12 @@ from warp_lcp.material.particle_assembly import make_boundary, make_outlets, mak
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene import Domain, SceneError, validate
 from warp_lcp.scene.scene_file import keys
-from warp_lcp.scene.shapes import Box, MaterialProperties, SolidBox, SolidPlane
+from warp_lcp.scene.shapes import BoxTable, MaterialProperties, SolidBox, SolidPlane
 
 BOX = {"shape": "box", "min": [0.0, 0.0], "max": [0.4, 0.4]}
 
 
-class GrainBox(MaterialProperties, Box):
+class GrainBox(MaterialProperties, BoxTable):
     """A box of grains."""
 
     size: float = Field(default=1.0, gt=0, description="of a grain [mm]")

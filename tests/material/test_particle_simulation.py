@@ -14,14 +14,14 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.particle_assembly import make_boundary, make_outlets, make_particles, make_sources
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation, Row
-from warp_lcp.scene.shapes import Box, MaterialProperties
+from warp_lcp.scene.shapes import BoxTable, MaterialProperties
 from warp_lcp.simulation import Profiled, Recorded, Resampled, SimulationFailed
 
 GRAVITY = 9.81
 BLOCK = {"shape": "box", "min": [0.25, 0.5], "max": [0.75, 0.75], "velocity": [0.5, 0.0]}
 
 
-class DustBox(MaterialProperties, Box):
+class DustBox(MaterialProperties, BoxTable):
     """A box of dust."""
 
 

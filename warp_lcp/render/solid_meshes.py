@@ -14,7 +14,7 @@ from warp_lcp.grid.motion import Pose
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.render.actors import Drawn
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.shapes import Box, Capsule, Mesh, Plane, Shape, Sphere
+from warp_lcp.scene.shapes import BoxTable, CapsuleTable, MeshTable, PlaneTable, Shape, SphereTable
 
 OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
 FLAT_SOLID, SOLID, EDGE, FLOOR = "#bfc3c8", "#cdd1d5", "#6b7075", "#f1f2f3"
@@ -95,7 +95,7 @@ class RoomSolids:
         for outline, pose in solids:
             mesh = outline.inside(self.size, pose)
             looks = {"color": SOLID, "smooth_shading": True, "split_sharp_edges": True}
-            if outline.shape.invert and not isinstance(outline.shape, Plane):
+            if outline.shape.invert and not isinstance(outline.shape, PlaneTable):
                 mesh = _clipped(mesh, self.size, closed=False)  # beyond the walls of the domain there is nothing to contain
                 line = {"color": EDGE, "line_width": 0.5 * self.line_width, "lighting": False}
                 meshes += [(mesh, {"ambient": 0.3, "opacity": 0.3, "culling": "front", **looks}), (mesh.extract_feature_edges(30.0), line)]
@@ -120,19 +120,19 @@ class Outline:
 
         self.shape = shape
         match shape:
-            case Plane():
+            case PlaneTable():
                 mesh = pyvista.PolyData()  # depends on the domain
-            case Box():
+            case BoxTable():
                 mesh = pyvista.Box(np.stack([shape.min, shape.max], axis=-1).ravel())
-            case Sphere():
+            case SphereTable():
                 mesh = pyvista.Sphere(radius=shape.radius, center=shape.center, theta_resolution=96, phi_resolution=64)
-            case Capsule():
+            case CapsuleTable():
                 start, end = np.array(shape.start), np.array(shape.end)
                 mesh = pyvista.Capsule(
                     center=0.5 * (start + end), direction=end - start, radius=shape.radius,
                     cylinder_length=float(np.linalg.norm(end - start)), resolution=64,
                 )  # fmt: skip
-            case Mesh():
+            case MeshTable():
                 solid = cast(Any, shape.to_geometry(Path(), 3)).surface
                 mesh = pyvista.PolyData.from_regular_faces(solid.vertices, solid.triangles)
             case _:
@@ -149,7 +149,7 @@ class Outline:
         import pyvista
 
         placement = self.shape.placement(3).moved(pose)
-        if isinstance(self.shape, Plane):
+        if isinstance(self.shape, PlaneTable):
             normal = placement.rotation @ np.array(self.shape.normal) * (-1.0 if self.shape.invert else 1.0)
             domain = pyvista.Box(np.stack([np.zeros(3), size], axis=-1).ravel()).clean()
             return domain.clip_closed_surface(normal=-normal, origin=placement.apply(np.array(self.shape.point)))

@@ -11,7 +11,7 @@ from warp_lcp.run.devices import free_memory
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
 from warp_lcp.scene.simulator import DistributedSimulator, simulators
-from warp_lcp.scene.table import Problem, SceneError, written
+from warp_lcp.scene.table import KeyFault, SceneError, written
 from warp_lcp.simulation import Simulation
 
 
@@ -50,7 +50,7 @@ def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
             f"the run needs about {needed / 2**20:,.0f} MB of memory, most of it for {largest}, and {free / 2**20:,.0f} MB are free on "
             f"{device}; lower domain.resolution, or run it anyway with --force-memory"
         )
-        raise SceneError(scene.scene.name, [Problem("domain.resolution", message, str(scene.domain.resolution))])
+        raise SceneError(scene.scene.name, [KeyFault("domain.resolution", message, str(scene.domain.resolution))])
 
 
 def check_ranks(scene: Scene) -> None:
@@ -62,11 +62,11 @@ def check_ranks(scene: Scene) -> None:
     name = scene.scene.simulator
     problems = []
     if not isinstance(simulators()[name], DistributedSimulator):
-        problems.append(Problem("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
+        problems.append(KeyFault("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
     if scene.output.volume:
-        problems.append(Problem("output.volume", "--engine petsc has no volumes, which cannot be written in pieces", "true"))
+        problems.append(KeyFault("output.volume", "--engine petsc has no volumes, which cannot be written in pieces", "true"))
     if scene.output.surface_ply:
-        problems.append(Problem("output.surface_ply", "--engine petsc writes surfaces as .vtu pieces alone", "true"))
+        problems.append(KeyFault("output.surface_ply", "--engine petsc writes surfaces as .vtu pieces alone", "true"))
     if problems:
         raise SceneError(scene.scene.name, problems)
 
@@ -89,7 +89,7 @@ def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
         return simulator.create(scene, device=device, folder=Path.cwd())
     except ValueError as error:
         check_shapes(scene, scene.scene.name)  # whose message names the shape
-        raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
+        raise SceneError(scene.scene.name, [KeyFault("", str(error))]) from error
 
 
 def _check_bodies(scene: Scene, source: str) -> None:
@@ -101,4 +101,4 @@ def _check_bodies(scene: Scene, source: str) -> None:
     try:
         make_bodies(scene, placed_solids(scene, Path.cwd()))
     except ValueError as error:
-        raise SceneError(source, [Problem("", str(error))]) from error
+        raise SceneError(source, [KeyFault("", str(error))]) from error

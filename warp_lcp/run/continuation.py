@@ -13,7 +13,7 @@ from typing import Any
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import keys
 from warp_lcp.scene.shapes import BUILTIN
-from warp_lcp.scene.table import Problem, SceneError, written
+from warp_lcp.scene.table import KeyFault, SceneError, written
 
 RESOLUTION = "domain.resolution"
 MAY_CHANGE = (
@@ -57,7 +57,7 @@ def mesh_digests(scene: Scene) -> dict[str, str]:
             with open(Path(value), "rb") as file:
                 digests[key] = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
         except OSError as error:
-            raise SceneError(scene.scene.name, [Problem(key, f"cannot be read: {error.strerror}", written(value))]) from error
+            raise SceneError(scene.scene.name, [KeyFault(key, f"cannot be read: {error.strerror}", written(value))]) from error
     return digests
 
 

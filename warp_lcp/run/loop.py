@@ -24,7 +24,7 @@ from warp_lcp.run.progress import Observer, missed, residual_of
 from warp_lcp.run.rank_simulation import RankSimulation
 from warp_lcp.run.stepping import stable_dt, take_step
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.table import Problem, SceneError
+from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import (
     Cells,
     DistributedSimulation,
@@ -145,7 +145,7 @@ def _simulation(
         if continued and continued.checkpoint:
             notes = _go_on(simulation, folder, continued, on_ranks=collective is not None)
     except ValueError as error:
-        raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
+        raise SceneError(scene.scene.name, [KeyFault("", str(error))]) from error
     if request.record_problems is not None:
         _record_problems(simulation, scene, request.record_problems, more=request.resume)
     notes = simulation.notes() + notes

@@ -16,7 +16,7 @@ from warp_lcp.run.check import start
 from warp_lcp.run.loop import SAME_TIME
 from warp_lcp.run.stepping import plan_dt, stable_dt, take_step
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.table import Problem, SceneError
+from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import Points, Simulation
 
 FRONT = 99.0  # percentile of the particles that the front is of
@@ -183,7 +183,7 @@ class _Trial:
     def _points(self) -> np.ndarray:
         points = next((part.points for part in self.simulation.frame() if isinstance(part, Points)), None)
         if points is None:
-            raise SceneError(self.scene.scene.name, [Problem("scene.simulator", "shows no particles, which runs are compared by")])
+            raise SceneError(self.scene.scene.name, [KeyFault("scene.simulator", "shows no particles, which runs are compared by")])
         return points
 
     def _penetration(self) -> float | None:

@@ -12,7 +12,7 @@ from warp_lcp.run.trial import Bounds, Trial, spread_of, trial
 from warp_lcp.scene.presets import Preset, PresetName, Prices, changed, price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import HEADER, dump_scene
-from warp_lcp.scene.table import Problem, SceneError
+from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
 FRAMES = 18  # of the calibration, unless asked for otherwise: that many `warp-lcp bench tradeoff` compares
@@ -160,7 +160,7 @@ def tune(
     """
     prices = price_table().get(scene.scene.simulator)
     if prices is None:
-        raise SceneError(scene.scene.name, [Problem("scene.simulator", "has no settings to tune")])
+        raise SceneError(scene.scene.name, [KeyFault("scene.simulator", "has no settings to tune")])
     return _Search(scene, prices, prices.presets[accuracy], device, min(frames, scene.time.frame_count), say).run()
 
 

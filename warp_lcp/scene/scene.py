@@ -18,11 +18,11 @@ from warp_lcp.scene.camera import Camera
 from warp_lcp.scene.motions import SinusoidMotion
 from warp_lcp.scene.presets import PresetName, fill_in, preset_line
 from warp_lcp.scene.shapes import Liquid, Shape, Solid, Wall
-from warp_lcp.scene.table import Complaint, Problem, SceneError, Table, Vector, refuse, validate
+from warp_lcp.scene.table import Complaint, KeyFault, SceneError, Table, Vector, refuse, validate
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
 from warp_lcp.solvers.registry import grid_methods
 
-__all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
+__all__ = ["Complaint", "KeyFault", "Liquid", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
 
 GridMethod = Literal[grid_methods()]
 

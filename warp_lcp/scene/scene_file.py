@@ -16,7 +16,7 @@ import tomli_w
 from warp_lcp.scene.scene import Scene, file_name
 from warp_lcp.scene.shapes import BUILTIN
 from warp_lcp.scene.simulator import Simulator, simulators
-from warp_lcp.scene.table import Problem, SceneError, validate, written
+from warp_lcp.scene.table import KeyFault, SceneError, validate, written
 from warp_lcp.settings import nearest
 
 DEEPEST = 16  # tables and arrays in each other; a scene needs six
@@ -41,7 +41,7 @@ def installed_simulators() -> dict[str, Simulator]:
     try:
         return simulators()
     except (AttributeError, ImportError, TypeError) as error:
-        problem = Problem("", f"a simulator cannot be loaded: {error}; `warp-lcp info` tells whether another package has its name")
+        problem = KeyFault("", f"a simulator cannot be loaded: {error}; `warp-lcp info` tells whether another package has its name")
         raise SceneError("warp-lcp", [problem]) from error
 
 
@@ -107,7 +107,7 @@ def check_shapes(scene: Scene, source: str) -> None:
             try:
                 shape.to_geometry(Path.cwd(), scene.dimension)
             except ValueError as error:
-                problems.append(Problem(f"{table}[{index}]", str(error)))
+                problems.append(KeyFault(f"{table}[{index}]", str(error)))
     if problems:
         raise SceneError(source, problems)
 
@@ -147,23 +147,23 @@ def _find(text: str) -> Path | Traversable:
     if path.is_file():
         return path
     if path.suffix == ".toml" or len(path.parts) > 1:
-        raise SceneError(text, [Problem("", "is a folder, not a scene file" if path.is_dir() else "there is no such file")])
-    raise SceneError(text, [Problem("", f"no such file, and no such built-in scene; {nearest(text, scenes)}")])
+        raise SceneError(text, [KeyFault("", "is a folder, not a scene file" if path.is_dir() else "there is no such file")])
+    raise SceneError(text, [KeyFault("", f"no such file, and no such built-in scene; {nearest(text, scenes)}")])
 
 
 def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
     try:
         return tomllib.loads(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
     except OSError as error:
-        raise SceneError(source, [Problem("", f"cannot be read: {error.strerror}")]) from error
+        raise SceneError(source, [KeyFault("", f"cannot be read: {error.strerror}")]) from error
     except UnicodeDecodeError as error:
-        raise SceneError(source, [Problem("", f"is not UTF-8 text (byte {error.start})")]) from error
+        raise SceneError(source, [KeyFault("", f"is not UTF-8 text (byte {error.start})")]) from error
     except tomllib.TOMLDecodeError as error:
-        raise SceneError(source, [Problem("", f"is not valid TOML: {error}")]) from error
+        raise SceneError(source, [KeyFault("", f"is not valid TOML: {error}")]) from error
     except RecursionError as error:
-        raise SceneError(source, [Problem("", "is not valid TOML: nested too deeply")]) from error
+        raise SceneError(source, [KeyFault("", "is not valid TOML: nested too deeply")]) from error
     except ValueError as error:  # Python refuses to convert thousands of digits
-        raise SceneError(source, [Problem("", "is not valid TOML: a number has too many digits")]) from error
+        raise SceneError(source, [KeyFault("", "is not valid TOML: a number has too many digits")]) from error
 
 
 def _refuse_extremes(data: dict[str, Any], source: str) -> None:
@@ -173,18 +173,18 @@ def _refuse_extremes(data: dict[str, Any], source: str) -> None:
     while waiting:  # not recursive: dotted keys nest without limit
         path, value, depth = waiting.pop()
         if depth > DEEPEST:
-            raise SceneError(source, [Problem(path, "is nested too deeply")])
+            raise SceneError(source, [KeyFault(path, "is nested too deeply")])
         if isinstance(value, dict):
             waiting += [(f"{path}.{key}", entry, depth + 1) for key, entry in value.items()]
         elif isinstance(value, list) and len(value) > MOST_TABLES and isinstance(value[0], dict):
             message = f"has {len(value):,} entries, of which a scene may have {MOST_TABLES:,}; a mesh holds more of them in one"
-            problems.append(Problem(path, message))
+            problems.append(KeyFault(path, message))
         elif isinstance(value, list):
             waiting += [(f"{path}[{index}]", entry, depth + 1) for index, entry in enumerate(value)]
         elif isinstance(value, int) and abs(value) >= 2**63:
-            problems.append(Problem(path, "has too many digits: whole numbers have 64 bits"))
+            problems.append(KeyFault(path, "has too many digits: whole numbers have 64 bits"))
         elif isinstance(value, float) and LARGEST < abs(value) < math.inf:
-            problems.append(Problem(path, f"must not be beyond {LARGEST:g}", written(value)))
+            problems.append(KeyFault(path, f"must not be beyond {LARGEST:g}", written(value)))
     if problems:
         raise SceneError(source, problems)
 
@@ -194,7 +194,7 @@ def _override(data: dict[str, Any], override: str, source: str) -> None:
     name, equals, text = override.partition("=")
     keys = name.strip().split(".")
     if not equals or len(keys) < 2 or not all(keys):
-        raise SceneError(source, [Problem(f"--set {override}", "must read section.key=value, such as time.duration=0.5")])
+        raise SceneError(source, [KeyFault(f"--set {override}", "must read section.key=value, such as time.duration=0.5")])
     value = _value(text.strip())
     table: Any = data
     for depth in range(len(keys) - 1):
@@ -209,10 +209,10 @@ def _place(table: object, keys: list[str], depth: int, source: str) -> str | int
     if isinstance(table, dict):
         return key
     if not isinstance(table, list):
-        raise SceneError(source, [Problem(f"--set {path}", f"{parent} has no keys: it is {written(table)}")])
+        raise SceneError(source, [KeyFault(f"--set {path}", f"{parent} has no keys: it is {written(table)}")])
     if not key.isdecimal() or int(key) >= len(table):
         allowed = f"there are entries 0 to {len(table) - 1}" if table else "the array is empty"
-        raise SceneError(source, [Problem(f"--set {path}", f"is not an entry of {parent}; {allowed}")])
+        raise SceneError(source, [KeyFault(f"--set {path}", f"is not an entry of {parent}; {allowed}")])
     return int(key)
 
 
@@ -238,16 +238,16 @@ def _scene_model(data: dict[str, Any], source: str) -> type[Scene]:
     name = about.get("simulator") if isinstance(about, dict) else None
     installed = installed_simulators()
     if name is None:
-        raise SceneError(source, [Problem("scene.simulator", f"is missing; choose from {', '.join(sorted(installed))}")])
+        raise SceneError(source, [KeyFault("scene.simulator", f"is missing; choose from {', '.join(sorted(installed))}")])
     if not isinstance(name, str) or name not in installed:
-        raise SceneError(source, [Problem("scene.simulator", f"no such simulator; {nearest(str(name), installed)}", written(name))])
+        raise SceneError(source, [KeyFault("scene.simulator", f"no such simulator; {nearest(str(name), installed)}", written(name))])
     return installed[name].scene_model
 
 
 def _find_meshes(scene: Scene, source: str) -> None:
     """Refuse meshes whose file is not there, before anything is built."""
     problems = [
-        Problem(path, "there is no such file", written(file))
+        KeyFault(path, "there is no such file", written(file))
         for path, file in _leaves(scene.model_dump())
         if path.endswith("].file") and not file.startswith(BUILTIN) and not os.path.isfile(file)
     ]

@@ -130,7 +130,7 @@ class Shape(Table):
         return self.about is not None and self.rotate is None and self.scale == 1.0
 
 
-class Box(Shape):
+class BoxTable(Shape):
     """A box between two corners."""
 
     shape: Literal["box"] = "box"
@@ -151,7 +151,7 @@ class Box(Shape):
         return found
 
 
-class Sphere(Shape):
+class SphereTable(Shape):
     """A ball; a disc in 2-D."""
 
     shape: Literal["sphere"] = "sphere"
@@ -165,7 +165,7 @@ class Sphere(Shape):
         return solids.Sphere(center=self.center, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
 
 
-class Capsule(Shape):
+class CapsuleTable(Shape):
     """All points within a radius of a segment."""
 
     shape: Literal["capsule"] = "capsule"
@@ -187,7 +187,7 @@ class Capsule(Shape):
         return found
 
 
-class Plane(Shape):
+class PlaneTable(Shape):
     """The half space on the side of a plane that its normal points away from."""
 
     shape: Literal["plane"] = "plane"
@@ -208,7 +208,7 @@ class Plane(Shape):
         return found
 
 
-class Mesh(Shape):
+class MeshTable(Shape):
     """The inside of a closed surface of triangles; in 2-D, of its cut by the plane z = 0."""
 
     shape: Literal["mesh"] = "mesh"
@@ -295,43 +295,43 @@ class MaterialProperties(Shape):
     velocity: Vector | None = Field(default=None, description="at the start [m/s]; at rest unless given")
 
 
-class SolidBox(SolidProperties, Box):
+class SolidBox(SolidProperties, BoxTable):
     """A solid box."""
 
 
-class SolidSphere(SolidProperties, Sphere):
+class SolidSphere(SolidProperties, SphereTable):
     """A solid ball."""
 
 
-class SolidCapsule(SolidProperties, Capsule):
+class SolidCapsule(SolidProperties, CapsuleTable):
     """A solid capsule."""
 
 
-class SolidPlane(SolidProperties, Plane):
+class SolidPlane(SolidProperties, PlaneTable):
     """A solid half space."""
 
 
-class SolidMesh(SolidProperties, Mesh):
+class SolidMesh(SolidProperties, MeshTable):
     """A solid inside a surface of triangles."""
 
 
-class LiquidBox(MaterialProperties, Box):
+class LiquidBox(MaterialProperties, BoxTable):
     """A box of liquid."""
 
 
-class LiquidSphere(MaterialProperties, Sphere):
+class LiquidSphere(MaterialProperties, SphereTable):
     """A ball of liquid."""
 
 
-class LiquidCapsule(MaterialProperties, Capsule):
+class LiquidCapsule(MaterialProperties, CapsuleTable):
     """A capsule of liquid."""
 
 
-class LiquidPlane(MaterialProperties, Plane):
+class LiquidPlane(MaterialProperties, PlaneTable):
     """A half space of liquid."""
 
 
-class LiquidMesh(MaterialProperties, Mesh):
+class LiquidMesh(MaterialProperties, MeshTable):
     """Liquid inside a surface of triangles."""
 
 
@@ -369,43 +369,43 @@ class DrainProperties(Schedule, Shape):
         return super().complaints(dimension) + self.schedule_complaints()
 
 
-class SourceBox(SourceProperties, Box):
+class SourceBox(SourceProperties, BoxTable):
     """A box that material comes out of."""
 
 
-class SourceSphere(SourceProperties, Sphere):
+class SourceSphere(SourceProperties, SphereTable):
     """A ball that material comes out of."""
 
 
-class SourceCapsule(SourceProperties, Capsule):
+class SourceCapsule(SourceProperties, CapsuleTable):
     """A capsule that material comes out of."""
 
 
-class SourcePlane(SourceProperties, Plane):
+class SourcePlane(SourceProperties, PlaneTable):
     """A half space that material comes out of."""
 
 
-class SourceMesh(SourceProperties, Mesh):
+class SourceMesh(SourceProperties, MeshTable):
     """A surface of triangles that material comes out of."""
 
 
-class DrainBox(DrainProperties, Box):
+class DrainBox(DrainProperties, BoxTable):
     """A box that swallows material."""
 
 
-class DrainSphere(DrainProperties, Sphere):
+class DrainSphere(DrainProperties, SphereTable):
     """A ball that swallows material."""
 
 
-class DrainCapsule(DrainProperties, Capsule):
+class DrainCapsule(DrainProperties, CapsuleTable):
     """A capsule that swallows material."""
 
 
-class DrainPlane(DrainProperties, Plane):
+class DrainPlane(DrainProperties, PlaneTable):
     """A half space that swallows material."""
 
 
-class DrainMesh(DrainProperties, Mesh):
+class DrainMesh(DrainProperties, MeshTable):
     """A surface of triangles that swallows material."""
 
 

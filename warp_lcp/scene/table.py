@@ -68,7 +68,7 @@ class Table(BaseModel):
 
 
 @dataclass(frozen=True)
-class Problem:
+class KeyFault:
     """Something wrong in a scene: where (`liquid[0].max`), what the file says there, and what is allowed."""
 
     path: str
@@ -84,7 +84,7 @@ class Problem:
 class SceneError(InputError):
     """A scene that cannot be used; `problems` lists everything that is wrong with it."""
 
-    def __init__(self, source: str, problems: Iterable[Problem]) -> None:
+    def __init__(self, source: str, problems: Iterable[KeyFault]) -> None:
         """Compose the text from the file's name and its problems."""
         self.source = source
         self.problems = tuple(problems)
@@ -162,7 +162,7 @@ def _locate(model: type[Table], location: tuple[str | int, ...]) -> _Place:
     return place
 
 
-def _problem(model: type[Table], error: ErrorDetails) -> Problem:
+def _problem(model: type[Table], error: ErrorDetails) -> KeyFault:
     kind, context = error["type"], error.get("ctx", {})
     place = _locate(model, error["loc"])
     later = place.owner.later if place.owner else {}
@@ -172,22 +172,22 @@ def _problem(model: type[Table], error: ErrorDetails) -> Problem:
         return _unknown_variant(place, context["discriminator"].strip("'"), context.get("tag"))
     if kind == "extra_forbidden":
         known = _keys(place.owner) if place.owner else {}
-        return Problem(place.path, refusal if simulator or place.key in later else f"unknown key; {nearest(place.key, known)}")
+        return KeyFault(place.path, refusal if simulator or place.key in later else f"unknown key; {nearest(place.key, known)}")
     value = "" if kind == "missing" or error["input"] is None else written(error["input"])
     if kind == "literal_error" and error["input"] in tuple(later.get(place.key, ANY_VALUE)):
-        return Problem(place.path, refusal, value)
+        return KeyFault(place.path, refusal, value)
     if kind == "list_type" and place.below:
-        return Problem(place.path, f"must be an array of tables, written [[{place.path}]]", value)
+        return KeyFault(place.path, f"must be an array of tables, written [[{place.path}]]", value)
     message = MESSAGES[kind].format(**context) if kind in MESSAGES else error["msg"]
     hint = place.field.description if place.field and kind != "cross_check" else None
-    return Problem(place.path, f"{message} ({hint})" if hint else message, value)
+    return KeyFault(place.path, f"{message} ({hint})" if hint else message, value)
 
 
-def _unknown_variant(place: _Place, key: str, tag: object) -> Problem:
+def _unknown_variant(place: _Place, key: str, tag: object) -> KeyFault:
     known = _variants(place.below)
     if tag is None:
-        return Problem(f"{place.path}.{key}", f"is missing; choose from {', '.join(sorted(known))}")
-    return Problem(f"{place.path}.{key}", f"unknown {key}; {nearest(str(tag), known)}", written(tag))
+        return KeyFault(f"{place.path}.{key}", f"is missing; choose from {', '.join(sorted(known))}")
+    return KeyFault(f"{place.path}.{key}", f"unknown {key}; {nearest(str(tag), known)}", written(tag))
 
 
 def _keys(table: type[Table]) -> dict[str, FieldInfo]:
