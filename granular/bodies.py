@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.granular.bodies_kernels import (
+    FieldShape,
     Places,
-    Shape,
     body_kernels,
     flat_vector,
     force_kernel,
@@ -66,7 +66,7 @@ class SandBodies:
         self.velocity, self._force, self._start, self._error = (wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4))
         self._response, self._correction = (wp.zeros((count, k, k), dtype=wp.float64, device=device) for _ in range(2))
         _, rows, columns = grid.shape
-        self._shape = Shape()
+        self._shape = FieldShape()
         self._shape.dimension, self._shape.layer, self._shape.strides = grid.dimension, grid.size, wp.vec3i(1, columns, columns * rows)
         self.faces: BodyFaces | None = None
         self._walls: Walls

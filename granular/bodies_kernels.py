@@ -33,7 +33,7 @@ Vector = vector_struct(wp.float32)
 
 
 @wp.struct
-class Shape:
+class FieldShape:
     """Shape of the grid's fields."""
 
     dimension: int
@@ -98,7 +98,7 @@ def forget_kernel(slot: _INTS, now: _SINGLE, before: _SINGLE, point: _SINGLE):
 
 
 @wp.kernel(**options)
-def force_kernel(grid: Shape, spans: _SPANS, stress: _SINGLE, cells: Places, edges: Places, share: Vector, out: _ROW):
+def force_kernel(grid: FieldShape, spans: _SPANS, stress: _SINGLE, cells: Places, edges: Places, share: Vector, out: _ROW):
     """What a part of the cells and edges beside a body does to it: minus their rows times their stresses."""
     part = wp.tid()
     freedoms = out.shape[1]
@@ -164,7 +164,15 @@ def layer_kernel(faces: Places, mass: Vector, u: Vector, weight: Vector, out: _P
 
 @wp.kernel(**options)
 def stiffness_kernel(
-    grid: Shape, cells: Places, flags: _BYTES, drive: _SINGLE, stiff: _SINGLE, mass: Vector, inverse: Vector, numbers: _SINGLE, out: _PAIRS
+    grid: FieldShape,
+    cells: Places,
+    flags: _BYTES,
+    drive: _SINGLE,
+    stiff: _SINGLE,
+    mass: Vector,
+    inverse: Vector,
+    numbers: _SINGLE,
+    out: _PAIRS,
 ):
     """Inverses of what the steps of pressure and friction in a cell are scaled by; 0 where it has none."""
     n = wp.tid()
@@ -186,7 +194,7 @@ def stiffness_kernel(
 
 
 @wp.kernel(**options)
-def lightness_kernel(grid: Shape, edges: Places, share: Vector, inverse: Vector, out: _REALS):
+def lightness_kernel(grid: FieldShape, edges: Places, share: Vector, inverse: Vector, out: _REALS):
     """1 / sum of the inverse masses around an edge; 0 where it has no shear."""
     n = wp.tid()
     at = edges.at[n]
@@ -217,7 +225,7 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
         set_entry(moved, int(faces.axis[n]), faces.at[n], real(u))
 
     @wp.kernel(enable_backward=False, module=module)
-    def strain(grid: Shape, edges: Places, u: Velocity, rates: Velocity):
+    def strain(grid: FieldShape, edges: Places, u: Velocity, rates: Velocity):
         """Twice the shear rate of the edges beside bodies, times dx."""
         n = wp.tid()
         i = edges.at[n]

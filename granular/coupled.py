@@ -177,11 +177,11 @@ class InterleavedSweeps(Settings):
     friction_relaxation: Relaxation = 1.0
     check_every: Count = 4
 
-    def init(self, problem: Stress) -> SweepWorkspace:
+    def init(self, problem: Stress) -> StressSweepWorkspace:
         """Return what solves of these stresses keep beside them."""
-        return SweepWorkspace(problem)
+        return StressSweepWorkspace(problem)
 
-    def step(self, problem: Stress, work: SweepWorkspace, x: wp.array) -> wl.Step:
+    def step(self, problem: Stress, work: StressSweepWorkspace, x: wp.array) -> wl.Step:
         """Sweep `check_every` times over either."""
         for _ in range(self.check_every):
             self._round(problem)
@@ -200,7 +200,7 @@ class InterleavedSweeps(Settings):
             passes.wall.bind(rows, omega=omega, **cells, **share, **walls.fields(p)).launch()
 
 
-class SweepWorkspace(StressWorkspace):
+class StressSweepWorkspace(StressWorkspace):
     """The stresses under sweeps, which keep the velocity up to date."""
 
     def start(self, *, warm: bool, tolerance: float) -> None:

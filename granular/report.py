@@ -13,7 +13,7 @@ from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.particle_simulation import Row
 
 
-class Outcome:
+class SandReport:
     """Takes over what `Stress.checked` holds after a solve.
 
     Args:

@@ -13,7 +13,7 @@ import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.coupled import METHODS
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.report import Outcome
+from warp_lcp.granular.report import SandReport
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.solids import SandSolids
 from warp_lcp.granular.stress import Stress, YieldSet
@@ -88,7 +88,7 @@ class SandSimulation(ParticleSimulation):
         self.carried = None if bodies is None else SandBodies(grid, bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress = Stress(self.packing, solids.walls, box=box, rate=rate, bodies=self.carried)
-        self.outcome = Outcome(self.stress)
+        self.outcome = SandReport(self.stress)
         self._at_rest = scene.particles.per_axis**grid.dimension
         self._start = self._front()[0]
         self.mark()
@@ -163,7 +163,7 @@ class SandSimulation(ParticleSimulation):
 
         coupled_residual: natural residual of pressure and friction together, root mean square over the cells with sand, in units of
         rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded,
-        dissipation, predicted_excess: see `granular.report.Outcome.report`; max_fraction: of a cell at the start of the step, in units of
+        dissipation, predicted_excess: see `granular.report.SandReport.report`; max_fraction: of a cell at the start of the step, in units of
         the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s;
         kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
         """

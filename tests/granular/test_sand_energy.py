@@ -7,7 +7,7 @@ from test_sand_stress import Case, make, velocity
 
 from small_sands import advance, box, create, scene
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.report import Outcome
+from warp_lcp.granular.report import SandReport
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_kernels import DAMPED
@@ -32,7 +32,7 @@ def test_dissipation_is_the_power_of_friction(dimension: int, seed: int) -> None
     now = without_trace(case)
     case.stress.now.assign(now)
     case.stress.residual()
-    found = Outcome(case.stress).report(1.0)["dissipation"]
+    found = SandReport(case.stress).report(1.0)["dissipation"]
     u = velocity(case)
     friction = now.copy()
     friction[0] = 0.0

@@ -227,7 +227,7 @@ def spread(points: np.ndarray, size: Sequence[float], box: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Bounds:
+class Differences:
     """The largest differences from a reference run.
 
     Args:
@@ -242,22 +242,22 @@ class Bounds:
         """Return how many times its bound a run's larger difference is: at most 1 within both."""
         return max(own.distance(reference) / self.distance, own.volume_error(reference) / self.volume)
 
-    def beside(self, noise: Bounds) -> Bounds:
+    def beside(self, noise: Differences) -> Differences:
         """Return the bounds of what is measured where a difference and a noise, which know nothing of each other, add up.
 
         Their squares do: a run that lies a bound from the mean of runs as good as the reference lies so far from one of them.
         """
-        return Bounds(math.hypot(self.distance, noise.distance), math.hypot(self.volume, noise.volume))
+        return Differences(math.hypot(self.distance, noise.distance), math.hypot(self.volume, noise.volume))
 
 
-def spread_of(references: Sequence[Trial]) -> Bounds:
+def spread_of(references: Sequence[Trial]) -> Differences:
     """Return the largest differences between runs that are as good as each other, 0 of a single one.
 
     Nothing can be shown to be nearer to one of them.
     """
     pairs = list(itertools.combinations(references, 2))
     distance, volume = (max((of(b, a) for a, b in pairs), default=0.0) for of in (Trial.distance, Trial.volume_error))
-    return Bounds(distance, volume)
+    return Differences(distance, volume)
 
 
 def step_seconds(scene: Scene, *, device: str) -> tuple[float, int]:

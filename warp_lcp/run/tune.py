@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_lcp.files.atomic import write_text
-from warp_lcp.run.trial import Bounds, Trial, spread_of, trial
+from warp_lcp.run.trial import Differences, Trial, spread_of, trial
 from warp_lcp.scene.presets import Preset, PresetName, Prices, changed, price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import HEADER, dump_scene
@@ -65,9 +65,9 @@ class Tuning:
     scene: Scene
     chosen: Candidate
     preset: Preset
-    bounds: Bounds
+    bounds: Differences
     limit: float
-    noise: Bounds | None
+    noise: Differences | None
     reference: Trial
     tried: list[Candidate]
     failed: list[str]
@@ -197,7 +197,7 @@ class _Search:
         """Find the fastest settings within the bounds, or, where there are none, the fastest of the nearest."""
         self.reference = self._reference_run()
         self.say(f"reference: {self.reference.seconds:.3g} s, {self.reference.steps} steps")
-        self.bounds, self.limit, noise = Bounds(self.preset.distance, self.preset.volume), 1.0, None
+        self.bounds, self.limit, noise = Differences(self.preset.distance, self.preset.volume), 1.0, None
         start = {key: value for key, value in self.preset.settings.items() if self._has(key)}
         step = self._longest_step(start)
         if not self.tried:
@@ -236,7 +236,7 @@ class _Search:
         settings |= {key: part * settings[key] for key in ("time.cfl", "time.dt_max")}
         return trial(changed(self.scene, settings), device=self.device, frames=self.frames)
 
-    def _noise(self) -> Bounds:
+    def _noise(self) -> Differences:
         """Return what runs as good as the reference differ by."""
         self.say("nothing is within the bounds; how sure is the reference?")
         references = [self.reference]
