@@ -163,7 +163,7 @@ class SandSimulation(ParticleSimulation):
 
         coupled_residual: natural residual of pressure and friction together, root mean square over the cells with sand, in units of
         rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded,
-        dissipation, predicted_excess: see `granular.report.SandReport.report`; max_fraction: of a cell at the start of the step, in units of
+        dissipation, predicted_excess: see `SandReport.report`; max_fraction: of a cell at the start of the step, in units of
         the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s;
         kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
         """

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from warp_lcp.cli import commands as cli
 from warp_lcp.run import tune as tuning
-from warp_lcp.run.trial import Bounds, Look, Trial, look_times, spread, trial
+from warp_lcp.run.trial import Differences, Look, Trial, look_times, spread, trial
 from warp_lcp.scene.presets import price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
@@ -216,7 +216,7 @@ def test_the_reference_is_not_doubted_where_its_bounds_are_kept(monkeypatch: pyt
     found = tuned(monkeypatch, model)
     assert model.references == 1
     assert found.noise is None
-    assert found.bounds == Bounds(0.03, 0.05)
+    assert found.bounds == Differences(0.03, 0.05)
     assert found.verdict("standard")[0].startswith("standard: time.cfl=8 ")
 
 
