@@ -107,28 +107,6 @@ class Viewpoint:
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(right, forward), forward])
 
-    @property
-    def slope(self) -> float:
-        """Return half the image's height, a unit of length away."""
-        return math.tan(math.radians(self.angle / 2))
-
-    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return where points appear.
-
-        Args:
-            points: [m], shape (n, 3).
-            size: width and height of the image [pixels].
-
-        Returns:
-            x to the right and y down from the image's upper left corner [pixels], and the depth along the line of sight [m], shape (n, 3).
-            Where the depth is not positive, x and y mean nothing.
-        """
-        width, height = size
-        x, y, depth = ((points - self.position) @ self.axes.T).T
-        near = np.maximum(depth, 1e-9)
-        focal = 0.5 * height / self.slope
-        return np.stack([0.5 * width + focal * x / near, 0.5 * height - focal * y / near, depth], axis=-1)
-
 
 def viewpoint(scene: Scene, aspect: float) -> Viewpoint:
     """Return where images of this aspect are seen from: as the scene's [camera] says, or from as near as shows all of the domain."""
