@@ -58,7 +58,7 @@ def test_wrong_cameras(scene, text, size, message):
 
 
 def project(view, points, size):
-    """Where points [m] appear: x to the right and y down from the image's upper left corner [pixels], and the depth [m]; a pinhole camera."""
+    """Where points [m] appear to a pinhole: x to the right, y down from the upper left corner [pixels], and the depth [m]."""
     width, height = size
     x, y, depth = ((points - view.position) @ view.axes.T).T
     focal = 0.5 * height / np.tan(np.radians(view.angle / 2))
