@@ -19,7 +19,7 @@ LIGHTER = 0.5  # of the way to white: every other eighth of a ball
 BOX_POINTS = 8
 ROUND = 1e-3  # how much the distances from the middle of what is round may differ, relative
 SURFACES: dict[str, dict[str, Any]] = {  # in 3-D, by `Scene.palette`
-    "water": {"color": "#3f9fe6", "opacity": 0.45, "specular": 0.5, "specular_power": 40.0, "ambient": 0.5, "diffuse": 0.8},
+    "water": {"color": "#4aa9ee", "opacity": 0.5, "specular": 0.8, "specular_power": 30.0, "ambient": 0.3, "diffuse": 1.0},
     "sand": {"color": "#c9a15f", "specular": 0.0, "ambient": 0.4},
 }
 FILLS = {"water": ["#1254a2", "#78c4ee"], "sand": ["#aa7c46", "#deb87a"]}  # in 2-D, at the domain's bottom and at its top
