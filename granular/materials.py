@@ -51,8 +51,9 @@ def slope(angle: float, test: AngleOf, dimension: int) -> float:
     22.2. So triaxial compression has k = 2 sqrt(3) sin / (3 - sin), from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the
     difference of the principal stresses. In 2-D there is no other compression than plane strain's.
 
-    >>> [round(slope(angle, test, 3), 3) for angle, test in ((26.565, "repose"), (30.0, "plane-strain"), (22.23, "triaxial-compression"))]
-    [0.5, 0.5, 0.5]
+    >>> alike = (26.565, "repose"), (30.0, "plane-strain"), (22.23, "triaxial-compression")
+    >>> print(*(f"{slope(angle, test, 3):.3f}" for angle, test in alike))
+    0.500 0.500 0.500
     """
     if test == "repose":
         return math.tan(math.radians(angle))
