@@ -7,7 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -42,6 +42,11 @@ class Figure:
     def of(samples: Sequence[float], unit: str = "") -> Figure:
         """Return the median with its range."""
         return Figure(statistics.median(samples), unit, min(samples), max(samples), len(samples))
+
+    @staticmethod
+    def least(samples: Sequence[float], unit: str = "") -> Figure:
+        """Return the smallest sample with the range."""
+        return replace(Figure.of(samples, unit), value=min(samples))
 
     def as_dict(self) -> dict[str, float | int | str]:
         """Return what a file keeps."""

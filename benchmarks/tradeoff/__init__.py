@@ -12,7 +12,6 @@ from warp_lcp.benchmarks.tradeoff.charts import preset_table, run_chart, run_tab
 from warp_lcp.benchmarks.tradeoff.runs import FRAMES, Run, Runs
 from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
 from warp_lcp.benchmarks.tradeoff.solves import measure_solves
-from warp_lcp.benchmarks.tradeoff.steps import measure_steps
 from warp_lcp.scene.presets import PRESETS, price_table
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import StepFailed
@@ -44,10 +43,10 @@ def _measure_scene(name: str, resolution: int, frames: int, options: Options, re
     own = [_record(scene.scene.name, run, runs) for run in measured]
     if not any(run.trial for run in measured):
         raise StepFailed(f"{name}: no setting ran: {measured[0].failed}")
-    solves = measure_steps(scene, options, frames) if scene.scene.simulator == "granular" else measure_solves(scene, options, frames)
+    solves, title = measure_solves(scene, options, frames), scene.scene.name
     results.records.extend([*own, *solves])
-    results.tables.extend([preset_table(scene.scene.name, own), run_table(scene.scene.name, own), solve_table(scene.scene.name, solves)])
-    results.charts.extend([*run_chart(scene.scene.name, own), *solve_chart(scene.scene.name, solves)])
+    results.tables.extend([preset_table(title, own), run_table(title, own), solve_table(title, solves)])
+    results.charts.extend([*run_chart(title, own), *solve_chart(title, solves)])
 
 
 def _overrides(simulator: str, preset: str) -> tuple[str, ...]:

@@ -69,7 +69,7 @@ class Runs:
             return {}
         own, finest = self.reference(run.setting.scale), self.reference(REFERENCE)
         found = {
-            "seconds": Figure(min(run.seconds), "s", min(run.seconds), max(run.seconds), len(run.seconds)),
+            "seconds": Figure.least(run.seconds, "s"),
             "steps": Figure(ran.steps),
             "iterations": Figure(ran.iterations),
             "linear_iterations": Figure(ran.linear_iterations),
