@@ -105,8 +105,7 @@ def table(verdicts: Sequence[Verdict]) -> Table:
     for name, own in by_case.items():
         cells = {v.precision: f"{v.attempt.status}{v.attempt.at}, {v.attempt.seconds:.2g} s" for v in own}
         wrong = "; ".join(f"{v.precision}: {v.outcome}" for v in own if v.wrong)
-        rows.append(
-            [*name, "; ".join(dict.fromkeys(str(v.promise) for v in own)), *(cells.get(p, "-") for p in PRECISIONS), wrong or "yes"]
-        )
+        expected = "; ".join(dict.fromkeys(str(v.promise) for v in own))
+        rows.append([*name, expected, *(cells.get(p, "-") for p in PRECISIONS), wrong or "yes"])
     remark = "Status, residual relative to that of clip(0, l, u), seconds. It is computed by NumPy and SciPy from cells and faces."
     return Table("Cases", ("family", "case", "expected", *PRECISIONS, "as it must be?"), rows, remark)

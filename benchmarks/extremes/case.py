@@ -109,7 +109,9 @@ class Case:
         """Try; a ValueError is a refusal, other errors are the status by their names."""
         begun = time.perf_counter()
         try:
-            return self.tried(precision, device)
+            attempt = self.tried(precision, device)
+            attempt.seconds = attempt.seconds or time.perf_counter() - begun
+            return attempt
         except (ValueError, *BROKEN) as error:
             broken = isinstance(error, BROKEN)
             return Attempt(type(error).__name__ if broken else REFUSED, seconds=time.perf_counter() - begun, message=str(error))

@@ -73,9 +73,8 @@ def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
         for tolerance in probe.tolerances:
             facts = known | {"kind": "solve", "method": method, "precision": precision, "tolerance": tolerance}
             figures, status = _measured(probe.solves(method, precision, tolerance), probe.warm, options.repeat)
-            records.append(
-                Record(f"{scene.scene.name} {probe.kind} {name} {tolerance:g}", figures, facts | ({"status": status} if status else {}))
-            )
+            more = {"status": status} if status else {}
+            records.append(Record(f"{scene.scene.name} {probe.kind} {name} {tolerance:g}", figures, facts | more))
     return records
 
 
