@@ -25,7 +25,7 @@ LAST_CALL = 6.0  # multiples of the budget after which a case is interrupted
 MAX_ITERATIONS = 200
 EPS = float(np.finfo(np.float32).eps)
 AGREES = 1e-3  # of a residual: how far what a result says may be from what is found, besides rounding
-REFUSED = "refused"
+REFUSED, OUT_OF_TIME = "refused", "out of time"
 BROKEN = (ArithmeticError, TypeError, LookupError, AttributeError, np.linalg.LinAlgError)  # what no method may end with
 HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS", "NON_DESCENT"})  # the precision does not go further, or not in this time
 
@@ -239,22 +239,23 @@ class Verdict:
 
 def judge(case: Case, precision: str, device: str) -> Verdict:
     """Attempt a case and say what is wrong with what it comes to; one over its budget is tried again, kernels compile in the first."""
-    promise, attempt = case.promise(precision), _in_time(case, precision, device)
-    if attempt.seconds > case.budget and attempt.status != "out of time":
-        attempt = _in_time(case, precision, device)
+    promise, attempt = case.promise(precision), in_time(case, precision, device)
+    if attempt.seconds > case.budget and attempt.status != OUT_OF_TIME:
+        attempt = in_time(case, precision, device)
     wrong = violations(promise, attempt)
     if attempt.seconds > case.budget:
         wrong.append(f"{attempt.seconds:.1f} s, its budget is {case.budget:g} s")
     return Verdict(case, precision, promise, attempt, wrong)
 
 
-def _in_time(case: Case, precision: str, device: str) -> Attempt:
+def in_time(case: Case, precision: str, device: str) -> Attempt:
+    """Attempt a case; what takes far longer than its budget is interrupted."""
     begun = time.perf_counter()
     try:
         with interrupted_after(LAST_CALL * case.budget + 60.0):  # a minute for compilers
             return case.attempt(precision, device)
     except OverBudgetError:
-        return Attempt("out of time", seconds=time.perf_counter() - begun)
+        return Attempt(OUT_OF_TIME, seconds=time.perf_counter() - begun)
 
 
 def violations(promise: Promise, attempt: Attempt) -> list[str]:

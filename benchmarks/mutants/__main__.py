@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 HANGS = 40  # seconds of processor time that no single test takes
 PYTEST = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--hypothesis-seed=7"]
 FILES = (1, 4)  # of tests: these first, with one of its parameters for each function, then these with all where a mutant survives
-PRELOADED = "pyamg pydantic pytest rich scipy.sparse.linalg typer warp".split()  # Warp not initialized: no threads, no device
+PRELOADED = ("pyamg", "pydantic", "pytest", "rich", "scipy.sparse.linalg", "typer", "warp")  # Warp not initialized: no threads, no device
 TREE: Path
 SECONDS = 5.0
 SOUND: set[str] = set()  # tests that pass where nothing is changed, and those that do not

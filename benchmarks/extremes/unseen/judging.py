@@ -13,7 +13,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes import case, unseen
-from warp_lcp.benchmarks.extremes.case import HONEST, SOLVED, Attempt, Case, Expected, Promise, Verdict, checked
+from warp_lcp.benchmarks.extremes.case import HONEST, REFUSED, SOLVED, Attempt, Case, Expected, Promise, SolveCase, Verdict, checked
 from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, equality
 from warp_lcp.benchmarks.harness.record import Table
 from warp_lcp.problem.protocol import families
@@ -25,7 +25,7 @@ OFTEN_SHARE = 0.95  # on this share of the grids,
 ALWAYS = (3.0, 6)  # and never more than 3 e + 6
 WITHOUT_EQUATIONS = 100  # iterations where they have no solution: what a user gets by default
 WARM_MORE = 1  # iterations that a warm start may take beyond a cold one
-METHOD_SECONDS = 120.0  # after which a method hangs on a small problem, compilers included
+NO_END = (case.OUT_OF_TIME, "INFEASIBLE", "NON_FINITE")  # of a small problem that has a solution
 GAVE_UP = Promise(Expected.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
 GRIDS_A_KIND, MATRICES_A_KIND = 18, 10
 
@@ -114,23 +114,17 @@ class EveryMethodCase(Drawn):
 
 def by_method(name: str, problem: Problem, device: str, solve: Solve = wl.solve) -> tuple[str, list[str]]:
     """Return how a method ends on a small problem that has a solution, and what is wrong with that."""
-    method: Any = wl.METHODS[name]
-    lcp, unknowns = problem.lcp(device, wp.float64), len(problem.exact().b)
+    method, unknowns = wl.METHODS[name], len(problem.exact().b)
     operator = "grid" if isinstance(problem, GridProblem) else "sparse" if scipy.sparse.issparse(problem.matrix) else "dense"
     if operator not in families(method) or unknowns > getattr(method, "most_unknowns", np.inf):
         return "not for it", []
-    try:
-        with case.interrupted_after(METHOD_SECONDS):
-            result = solve(lcp, method(), stopping=wl.StoppingCriteria(**CRITERIA))
-    except ValueError as refusal:
-        return "refused", [] if str(refusal) else ["refused without a message"]
-    except case.OverBudgetError:
-        return "out of time", [f"more than {METHOD_SECONDS:g} s for {unknowns} unknowns"]
-    except case.BROKEN as error:
-        return type(error).__name__, [f"{type(error).__name__}: {error}"]
-    attempt = checked(problem, result, CRITERIA, 0.0, "mixed")
-    wrong = [f"{result.status.name} of a problem that has a solution"] if result.status.name in ("INFEASIBLE", "NON_FINITE") else []
-    return result.status.name, attempt.faults + wrong
+    asked = SolveCase(METHODS_FAMILY, name, lambda: problem, name, stopping=CRITERIA, solve=solve)
+    attempt = case.in_time(asked, getattr(method, "precision", "mixed"), device)
+    if attempt.status == REFUSED:
+        return REFUSED, [] if attempt.message else ["refused without a message"]
+    wrong = [f"{attempt.status}: {attempt.message}"] if attempt.message else []
+    wrong += [f"{attempt.status} of a problem that has a solution"] if attempt.status in NO_END else []
+    return attempt.status, attempt.faults + wrong
 
 
 def cases(first: int, grids: int = GRIDS_A_KIND, matrices: int = MATRICES_A_KIND) -> Iterator[Drawn]:
