@@ -17,7 +17,7 @@ from warp_lcp.benchmarks.cases import RTOL, Case
 from warp_lcp.benchmarks.harness.machine import COPIED, machine, present
 from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table, shown, spread
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
-from warp_lcp.benchmarks.peers.libraries import pyamg_aggregation, scipy_cg
+from warp_lcp.benchmarks.peers.libraries import pyamg, scipy_cg
 from warp_lcp.benchmarks.peers.peer import Answer, Question
 from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
 
@@ -61,7 +61,7 @@ def measure(options: Options, out: Path) -> Results:
 def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[Answer]], Question]:
     """Measure one sample of every case and peer in each round."""
     cases, question = _cases(n, options.device), Question(splash(n), "linear")
-    solves: dict[str, Callable[[Question, float], Answer]] = {"PyAMG SA-CG": pyamg_aggregation} if present("pyamg") else {}
+    solves: dict[str, Callable[[Question, float], Answer]] = {"PyAMG SA-CG": pyamg} if present("pyamg") else {}
     solves |= {"SciPy CG": scipy_cg} if n <= SCIPY_CELLS else {}
     answers: dict[str, list[Answer]] = {name: [] for name in solves}
     for turn in range(options.repeat + 1):  # the first one loads kernels

@@ -6,11 +6,11 @@ Solvers that are wrong on purpose are among the cases: the checks must catch eac
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from random import SystemRandom
-from typing import Any
 
 from warp_lcp.benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
 from warp_lcp.benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
@@ -46,8 +46,7 @@ def cases(seed: int) -> Iterator[Case]:
 
 def measure(options: Options, out: Path) -> Results:
     """Try every case in each of its precisions."""
-    verdicts: list[Verdict] = []
-    family = ""
+    verdicts, family = list[Verdict](), ""
     seed = SystemRandom().choice(FRESH) if options.seed is None else options.seed
     for case in cases(seed):
         if case.family != family:
@@ -57,26 +56,20 @@ def measure(options: Options, out: Path) -> Results:
             verdicts.append(judge(case, precision, options.device))
             if verdicts[-1].wrong:
                 options.say(f"{verdicts[-1].name}: {verdicts[-1].outcome}")
-    where = machine(options.device, elements=1 << 22, repeat=options.repeat)
-    records = [where, *by_family(verdicts)]
-    found = families(records[1:])
+    found = by_family(verdicts)
     unseen, beyond = judging.summary(verdicts, seed)
-    failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in verdicts if v.wrong] + beyond
-    records += [record(v) for v in verdicts if v.wrong]
-    return Results(records, [found, unseen, table(verdicts)], failures=failures)
+    wrong = [v for v in verdicts if v.wrong]
+    records = [machine(options.device, elements=1 << 22, repeat=options.repeat), *found, *map(record, wrong)]
+    failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in wrong] + beyond
+    return Results(records, [families(found), unseen, table(verdicts)], failures=failures)
 
 
 def record(verdict: Verdict) -> Record:
     """Return what the file keeps of a case that is not as it must be."""
-    attempt = verdict.attempt
-    facts: dict[str, Any] = {
-        "family": verdict.case.family,
-        "precision": verdict.precision,
-        "expected": str(verdict.promise),
-        "outcome": verdict.outcome,
-    }
-    facts |= {"status": attempt.status, "residual": attempt.residual, "message": attempt.message, **attempt.facts}
-    return Record(verdict.name, {"seconds": Figure(attempt.seconds, "s")}, facts)
+    attempt, case = verdict.attempt, verdict.case
+    facts = {"family": case.family, "precision": verdict.precision, "expected": str(verdict.promise), "outcome": verdict.outcome}
+    more = {"status": attempt.status, "residual": attempt.residual, "message": attempt.message, **attempt.facts}
+    return Record(verdict.name, {"seconds": Figure(attempt.seconds, "s")}, facts | more)
 
 
 def by_family(verdicts: Sequence[Verdict]) -> list[Record]:
@@ -85,9 +78,9 @@ def by_family(verdicts: Sequence[Verdict]) -> list[Record]:
     for family in dict.fromkeys(v.case.family for v in verdicts):
         own = [v for v in verdicts if v.case.family == family]
         counts = {"cases": len({v.case.name for v in own}), "attempts": len(own), "wrong": sum(bool(v.wrong) for v in own)}
-        figures = {name: Figure(count) for name, count in counts.items()}
-        figures |= {kind.value: Figure(n) for kind in Expected if (n := sum(v.promise.expected is kind for v in own))}
+        counts |= {kind.value: n for kind in Expected if (n := sum(v.promise.expected is kind for v in own))}
         seconds = [v.attempt.seconds for v in own]
+        figures = {name: Figure(count) for name, count in counts.items()}
         records.append(Record(family, figures | {"slowest": Figure(max(seconds), "s"), "seconds": Figure(sum(seconds), "s")}))
     return records
 
@@ -105,22 +98,14 @@ def families(records: Sequence[Record]) -> Table:
 
 def table(verdicts: Sequence[Verdict]) -> Table:
     """Return a row a case, with status, relative residual and seconds in each precision."""
-    rows = []
-    by_case: dict[tuple[str, str], list[Verdict]] = {}
+    by_case = defaultdict[tuple[str, str], list[Verdict]](list)
     for v in verdicts:
-        by_case.setdefault((v.case.family, v.case.name), []).append(v)
-    for (family, name), own in by_case.items():
-        tried = {v.precision: v for v in own}
-        wrong = [f"{v.precision}: {v.outcome}" for v in own if v.wrong]
+        by_case[v.case.family, v.case.name].append(v)
+    rows = []
+    for name, own in by_case.items():
+        cells = {v.precision: f"{v.attempt.status}{v.attempt.at}, {v.attempt.seconds:.2g} s" for v in own}
+        wrong = "; ".join(f"{v.precision}: {v.outcome}" for v in own if v.wrong)
         expected = "; ".join(dict.fromkeys(str(v.promise) for v in own))
-        rows.append([family, name, expected, *(_cell(tried.get(p)) for p in PRECISIONS), "; ".join(wrong) or "yes"])
+        rows.append([*name, expected, *(cells.get(p, "-") for p in PRECISIONS), wrong or "yes"])
     remark = "Status, residual relative to that of clip(0, l, u), seconds. It is computed by NumPy and SciPy from cells and faces."
     return Table("Cases", ("family", "case", "expected", *PRECISIONS, "as it must be?"), rows, remark)
-
-
-def _cell(verdict: Verdict | None) -> str:
-    if verdict is None:
-        return "-"
-    attempt = verdict.attempt
-    residual = "" if attempt.residual is None else f" {attempt.residual:.1e}"
-    return f"{attempt.status}{residual}, {attempt.seconds:.2g} s"

@@ -7,10 +7,10 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from enum import Enum
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -23,8 +23,10 @@ RTOL = {"single": 1e-3, "mixed": 1e-8, "double": 1e-8}
 BUDGET = 10.0  # seconds of a case, on a machine that others use too; usual ones take milliseconds
 LAST_CALL = 6.0  # multiples of the budget after which a case is interrupted
 MAX_ITERATIONS = 200
+EPS = float(np.finfo(np.float32).eps)
 AGREES = 1e-3  # of a residual: how far what a result says may be from what is found, besides rounding
-REFUSED = "refused"
+REFUSED, OUT_OF_TIME = "refused", "out of time"
+BROKEN = (ArithmeticError, TypeError, LookupError, AttributeError, np.linalg.LinAlgError)  # what no method may end with
 HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS", "NON_DESCENT"})  # the precision does not go further, or not in this time
 
 
@@ -41,9 +43,9 @@ class Expected(Enum):
 
 @dataclass(frozen=True)
 class Promise:
-    """What a case must come to."""
+    """What a case must come to: a kind, and what belongs to it."""
 
-    expected: Expected  # kind
+    expected: Expected
     statuses: frozenset[str] = frozenset()  # the statuses it may stop with
     names: str = ""  # what the message of a refusal must contain
 
@@ -54,8 +56,14 @@ class Promise:
 
 SOLVED = Promise(Expected.SOLVED)
 EITHER = Promise(Expected.EITHER, HONEST)
-INFEASIBLE = Promise(Expected.STOPPED, frozenset({"INFEASIBLE"}))
-BELOW_ROUNDING = Promise(Expected.STOPPED, frozenset({"FLOOR"}))
+
+
+def stopped(status: str, names: str = "") -> Promise:
+    """Return the promise of an end with a status."""
+    return Promise(Expected.STOPPED, frozenset({status}), names)
+
+
+INFEASIBLE, BELOW_ROUNDING = stopped("INFEASIBLE"), stopped("FLOOR")
 
 
 def refusal(names: str) -> Promise:
@@ -75,31 +83,42 @@ class Attempt:
     met: bool = False  # whether the independent residual meets the tolerance
     facts: dict[str, Any] = field(default_factory=dict)  # what else a record keeps
 
-
-class Case(Protocol):
-    """What can be attempted."""
-
     @property
-    def family(self) -> str:
-        """The cases that share an expectation."""
+    def at(self) -> str:
+        """The residual in words."""
+        return "" if self.residual is None else f" at {self.residual:.1e}"
 
-    @property
-    def name(self) -> str:
-        """Unique in its family."""
 
-    @property
-    def budget(self) -> float:
-        """Seconds that a precision may take."""
+@dataclass(frozen=True)
+class Case:
+    """What can be attempted; subclasses try."""
 
-    @property
-    def precisions(self) -> tuple[str, ...]:
-        """Those in which it is tried."""
+    family: str  # the cases that share an expectation
+    name: str  # unique in its family
+    _: KW_ONLY
+    expected: Promise = SOLVED  # what it must come to,
+    promises: Mapping[str, Promise] = field(default_factory=dict)  # in these precisions something else
+    budget: float = BUDGET  # seconds that a precision may take
+    precisions: tuple[str, ...] = PRECISIONS  # those in which it is tried
 
     def promise(self, precision: str) -> Promise:
         """Return what it must come to."""
+        return self.promises.get(precision, self.expected)
 
     def attempt(self, precision: str, device: str) -> Attempt:
-        """Try."""
+        """Try; a ValueError is a refusal, other errors are the status by their names."""
+        begun = time.perf_counter()
+        try:
+            attempt = self.tried(precision, device)
+            attempt.seconds = attempt.seconds or time.perf_counter() - begun
+            return attempt
+        except (ValueError, *BROKEN) as error:
+            broken = isinstance(error, BROKEN)
+            return Attempt(type(error).__name__ if broken else REFUSED, seconds=time.perf_counter() - begun, message=str(error))
+
+    def tried(self, precision: str, device: str) -> Attempt:
+        """Return what comes of it."""
+        raise NotImplementedError
 
 
 class OverBudgetError(Exception):
@@ -123,49 +142,32 @@ def interrupted_after(seconds: float) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class SolveCase:
-    """A problem given to a method."""
+class SolveCase(Case):
+    """A problem given to a method, in the precisions the method has; "double" of one that has no choice."""
 
-    family: str  # the cases that share an expectation
-    name: str  # unique in its family
     problem: Callable[[], Problem]  # makes the problem
     method: str = "projected-multigrid"  # of `wl.METHODS`
-    promises: Mapping[str, Promise] = field(default_factory=dict)  # by precision; SOLVED where there is none
-    options: Mapping[str, Any] = field(default_factory=dict)  # of the method
+    _: KW_ONLY
+    precisions: tuple[str, ...] = ()
     stopping: Mapping[str, Any] = field(default_factory=dict)  # criteria besides rtol and max_iterations, or instead of them
     x0: np.ndarray | None = None  # a guess
-    budget: float = BUDGET  # seconds that a precision may take
     solve: Callable[..., wl.SolveResult] = wl.solve  # stands in for `wl.solve`, where something wrong is to be caught
 
-    def promise(self, precision: str) -> Promise:
-        """Return what it must come to."""
-        return self.promises.get(precision, SOLVED)
+    def __post_init__(self) -> None:
+        """Fill in the precisions."""
+        fields = {field.name for field in dataclasses.fields(wl.METHODS[self.method])}
+        object.__setattr__(self, "precisions", PRECISIONS if "precision" in fields else ("double",))
 
-    @property
-    def precisions(self) -> tuple[str, ...]:
-        """Those the method has; "double" of one that has no choice."""
-        return PRECISIONS if "precision" in self._fields else ("double",)
-
-    @property
-    def _fields(self) -> set[str]:
-        return {field.name for field in dataclasses.fields(wl.METHODS[self.method])}
-
-    def attempt(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> Attempt:
         """Solve, and compare what the result says with the independent residual."""
-        storage = wp.float32 if precision == "single" else wp.float64
         criteria: dict[str, Any] = {"rtol": RTOL[precision], "max_iterations": MAX_ITERATIONS, **self.stopping}
-        problem = self.problem()
+        problem, method = self.problem(), wl.METHODS[self.method]
         begun = time.perf_counter()
-        try:
-            chosen = {"precision": precision} if "precision" in self._fields else {}
-            solver = wl.METHODS[self.method](**chosen, **self.options)
-            lcp = problem.lcp(device, storage)
-            result = self.solve(lcp, solver, stopping=wl.StoppingCriteria(**criteria), x0=self.x0)
-        except ValueError as refused:
-            return Attempt(REFUSED, seconds=time.perf_counter() - begun, message=str(refused))
+        solver = method(precision=precision) if self.precisions == PRECISIONS else method()
+        lcp = problem.lcp(device, wp.float32 if precision == "single" else wp.float64)
+        result = self.solve(lcp, solver, stopping=wl.StoppingCriteria(**criteria), x0=self.x0)
         wp.synchronize_device(device)
-        seconds = time.perf_counter() - begun
-        return checked(problem, result, criteria, seconds, precision)
+        return checked(problem, result, criteria, time.perf_counter() - begun, precision)
 
 
 def checked(problem: Problem, result: wl.SolveResult, criteria: Mapping[str, Any], seconds: float, precision: str) -> Attempt:
@@ -173,24 +175,23 @@ def checked(problem: Problem, result: wl.SolveResult, criteria: Mapping[str, Any
     exact, x = problem.exact(), problem.unknowns(result.x.numpy())
     if not np.isfinite(x).all():
         return Attempt(result.status.name, None, seconds, faults=["x is not finite"])
-    own, reference = exact.residual(x), exact.residual(exact.start)
-    rounding = 32 * np.finfo(np.float64).eps * exact.sizes(x)
-    if problem.rounded(wp.float32 if precision == "single" else wp.float64):
-        rounding += 4 * float(np.finfo(np.float32).eps) * exact.sizes(x)
+    own, reference, sizes, single = exact.residual(x), exact.residual(exact.start), exact.sizes(x), precision == "single"
+    rounding = 32 * np.finfo(np.float64).eps * sizes
+    if problem.rounded(wp.float32 if single else wp.float64):
+        rounding += 4 * EPS * sizes
     wanted = max(criteria["rtol"] * reference, criteria.get("atol", 0.0))
     met = own <= wanted * (1 + 1e-6) + rounding
     faults = []
     if result and not met:
         faults.append(f"CONVERGED at a residual of {own:.1e}, asked for {wanted:.1e}")
     # a result in single precision is rounded once more where it sits at a bound that is no float32 number
-    returned = 0.5 * float(np.finfo(np.float32).eps) * exact.sizes(x) if precision == "single" else 0.0
+    returned = 0.5 * EPS * sizes if single else 0.0
     known = np.isfinite(own) and result.status is not wl.SolveStatus.NON_FINITE  # its norm may overflow where the scaled one does not
     # projected multigrid scales by the diagonal without the bodies' term: any d > 0 has the same zeros
     says = [abs(result.residual - of) <= AGREES * of + rounding + returned for of in (own, exact.residual(x, bodies=False))]
     if known and not any(says):
         faults.append(f"says the residual is {result.residual:.3e}, it is {own:.3e}")
-    slack = float(np.finfo(np.float32).eps) * np.abs(x) if precision == "single" else 0.0  # bounds are rounded as x is
-    beyond = np.maximum(exact.lower - x, x - exact.upper) - slack
+    beyond = np.maximum(exact.lower - x, x - exact.upper) - (EPS * np.abs(x) if single else 0.0)  # bounds are rounded as x is
     if result and (beyond > 0).any():
         faults.append(f"x is {beyond.max():.1e} outside its bounds")
     if not result and own < 0.99 * wanted - rounding:
@@ -199,29 +200,20 @@ def checked(problem: Problem, result: wl.SolveResult, criteria: Mapping[str, Any
 
 
 @dataclass(frozen=True)
-class RefusalCase:
+class RefusalCase(Case):
     """A call that must raise ValueError before anything is solved."""
 
-    family: str  # the cases that share an expectation
-    name: str  # unique in its family
     call: Callable[[str, str], object]  # takes device and precision
     names: str  # what the message must contain: the argument
-    budget: float = BUDGET  # seconds it may take
-    precisions: tuple[str, ...] = PRECISIONS
 
     def promise(self, precision: str) -> Promise:
         """Return the refusal."""
         return refusal(self.names)
 
-    def attempt(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> Attempt:
         """Call."""
-        begun = time.perf_counter()
-        try:
-            made = self.call(device, precision)
-        except ValueError as refused:
-            return Attempt(REFUSED, seconds=time.perf_counter() - begun, message=str(refused))
-        status = made.status.name if isinstance(made, wl.SolveResult) else "accepted"
-        return Attempt(status, seconds=time.perf_counter() - begun)
+        made = self.call(device, precision)
+        return Attempt(made.status.name if isinstance(made, wl.SolveResult) else "accepted")
 
 
 @dataclass(frozen=True)
@@ -247,29 +239,28 @@ class Verdict:
 
 def judge(case: Case, precision: str, device: str) -> Verdict:
     """Attempt a case and say what is wrong with what it comes to; one over its budget is tried again, kernels compile in the first."""
-    promise = case.promise(precision)
-    attempt = _in_time(case, precision, device)
-    if attempt.seconds > case.budget and attempt.status != "out of time":
-        attempt = _in_time(case, precision, device)
+    promise, attempt = case.promise(precision), in_time(case, precision, device)
+    if attempt.seconds > case.budget and attempt.status != OUT_OF_TIME:
+        attempt = in_time(case, precision, device)
     wrong = violations(promise, attempt)
     if attempt.seconds > case.budget:
         wrong.append(f"{attempt.seconds:.1f} s, its budget is {case.budget:g} s")
     return Verdict(case, precision, promise, attempt, wrong)
 
 
-def _in_time(case: Case, precision: str, device: str) -> Attempt:
+def in_time(case: Case, precision: str, device: str) -> Attempt:
+    """Attempt a case; what takes far longer than its budget is interrupted."""
     begun = time.perf_counter()
     try:
         with interrupted_after(LAST_CALL * case.budget + 60.0):  # a minute for compilers
             return case.attempt(precision, device)
     except OverBudgetError:
-        return Attempt("out of time", seconds=time.perf_counter() - begun)
+        return Attempt(OUT_OF_TIME, seconds=time.perf_counter() - begun)
 
 
 def violations(promise: Promise, attempt: Attempt) -> list[str]:
     """Return what is wrong with an attempt for a promise."""
-    wrong, status = list(attempt.faults), attempt.status
-    expected = promise.expected
+    wrong, status, expected = list(attempt.faults), attempt.status, promise.expected
     if expected is Expected.CAUGHT:
         return [] if wrong or status != "CONVERGED" else ["a wrong solver passes"]
     if expected is Expected.REFUSED:
@@ -280,13 +271,9 @@ def violations(promise: Promise, attempt: Attempt) -> list[str]:
     elif status == REFUSED:
         wrong.append(f"refused: {attempt.message}")
     elif expected is Expected.SOLVED and not (status == "CONVERGED" and attempt.met):
-        wrong.append(f"{status}{_at(attempt)}, not solved")
+        wrong.append(f"{status}{attempt.at}, not solved")
     elif expected is Expected.STOPPED and status not in promise.statuses:
-        wrong.append(f"{status}{_at(attempt)}, not {'/'.join(sorted(promise.statuses))}")
+        wrong.append(f"{status}{attempt.at}, not {'/'.join(sorted(promise.statuses))}")
     elif expected in (Expected.EITHER, Expected.DONE) and status not in promise.statuses | {"CONVERGED", "done"}:
-        wrong.append(f"{status}{_at(attempt)} {attempt.message}".rstrip())
+        wrong.append(f"{status}{attempt.at} {attempt.message}".rstrip())
     return wrong
-
-
-def _at(attempt: Attempt) -> str:
-    return "" if attempt.residual is None else f" at {attempt.residual:.1e}"

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.extremes.case import EITHER, PRECISIONS, Case, SolveCase
-from warp_lcp.benchmarks.extremes.problem import GridProblem
-from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SEED, SOLID, both, noise, pool, same
+from warp_lcp.benchmarks.extremes.case import EITHER, SOLVED, Case
+from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of
+from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SOLID, chance, full, given, noise, pool
 
 SHAPES = ((48, 53), (17, 18, 19))
+Y, X = np.indices((48, 50))
 ROUGH = {"rtol": 1e-6}  # where the matrix's own rounding is felt: 12 decades beside each other
 SINGLE_MAY_STOP = {"single": EITHER}
 MIXED_MAY_STOP = {"single": EITHER, "mixed": EITHER}
@@ -21,116 +23,84 @@ LARGEST_CONTRAST = 1e4
 LIGHTEST = 1e6  # 1/mass beyond which float32 does not tell the force on a body from the pressures that it is the difference of
 
 
-def faces_of(shape: tuple[int, ...], value: Any) -> dict[str, np.ndarray]:
-    """Return arrays of coefficients; `value` takes an array's shape."""
-    sizes = {}
-    for axis, name in enumerate(("face_x", "face_y", "face_z")[: len(shape)]):
-        counts = list(shape)
-        counts[-1 - axis] += 1
-        sizes[name] = value(tuple(counts))
-    return sizes
+def may_stop(value: float, largest: float) -> dict[str, Any]:
+    """Return what is promised of a ratio whose documented limit is `largest`."""
+    return {"promises": SINGLE_MAY_STOP if value <= largest else MIXED_MAY_STOP, "stopping": ROUGH}
 
 
 def slivers() -> Iterator[Case]:
     """Yield cut cells whose open fractions go down to 1e-12 and below."""
-    case = partial(both, "cut fractions")
+    case = partial(given, "cut fractions", promises=SINGLE_MAY_STOP)
     for shape in SHAPES:
         for smallest in (1e-3, 1e-6, 1e-12, 1e-30):
-            name = f"one face in 20 open by {smallest:g}, {len(shape)}-D"
-            yield from case(name, partial(sprinkled, shape, smallest), promises=SINGLE_MAY_STOP)
-        yield from case(f"fractions 0 to 1, {len(shape)}-D", partial(uniform_fractions, shape), promises=SINGLE_MAY_STOP)
+            yield from case(f"one face in 20 open by {smallest:g}, {len(shape)}-D", partial(sprinkled, shape, smallest))
+        yield from case(f"fractions 0 to 1, {len(shape)}-D", partial(uniform_fractions, shape))
     for fraction in (1e-3, 1e-6, 1e-12):
-        name = f"pool behind a face open by {fraction:g}"
-        yield from case(name, partial(behind_a_gap, fraction), promises=SINGLE_MAY_STOP)
-        yield from case(f"lone cells behind {fraction:g}", partial(lone_cells, fraction), promises=SINGLE_MAY_STOP)
+        yield from case(f"pool behind a face open by {fraction:g}", partial(behind_a_gap, fraction))
+        yield from case(f"lone cells behind {fraction:g}", partial(lone_cells, fraction))
     for theta in (1e-2, 1e-6, 1e-12):
-        yield from case(f"surface at 1/{theta:g}", partial(ghost_fluid, theta), promises=SINGLE_MAY_STOP)
+        yield from case(f"surface at 1/{theta:g}", partial(ghost_fluid, theta))
 
 
 def sprinkled(shape: tuple[int, ...], smallest: float) -> GridProblem:
     """Return a pool with a few faces all but closed."""
-    chance = np.random.default_rng(SEED + 5)
-    return pool(shape, faces=faces_of(shape, lambda counts: np.where(chance.random(counts) < 0.05, smallest, 1.0)))
+    draw = chance(5)
+    return pool(shape, faces=faces_of(shape, lambda counts: np.where(draw.random(counts) < 0.05, smallest, 1.0)))
 
 
 def uniform_fractions(shape: tuple[int, ...]) -> GridProblem:
     """Return a pool with random fractions, a tenth of them 0; p >= 0 everywhere, so that enclosed cells with outflow have a solution."""
-    chance = np.random.default_rng(SEED + 6)
-
-    def fractions(counts: tuple[int, ...]) -> np.ndarray:
-        return np.maximum(chance.uniform(-0.1, 1.0, counts), 0.0)
-
-    return pool(shape, faces=faces_of(shape, fractions), lower=0.0, b=noise(shape) + 0.5)
+    draw = chance(6)
+    return pool(shape, faces=faces_of(shape, lambda counts: np.maximum(draw.uniform(-0.1, 1, counts), 0)), lower=0.0, b=noise(shape) + 0.5)
 
 
 def behind_a_gap(fraction: float) -> GridProblem:
     """Return two halves, one with air, joined by one face open by `fraction`; b that asks the gap for a flow in proportion to it."""
     shape = (32, 64)
-    cells = np.full(shape, FLUID)
+    cells, faces, b = np.full(shape, FLUID), faces_of(shape, np.ones), noise(shape)
     cells[-1, 32:] = AIR
-    face_x = np.ones((32, 65))
-    face_x[:, 32] = 0.0
-    face_x[10, 32] = fraction
-    b = noise(shape)
+    faces["face_x"][:, 32] = 0.0
+    faces["face_x"][10, 32] = fraction
     b[:, :32] += fraction / (32 * 32) - b[:, :32].mean()
-    return GridProblem(cells=cells, b=b, faces={"face_x": face_x, "face_y": np.ones((33, 64))}, lower=-np.inf)
+    return GridProblem(cells=cells, b=b, faces=faces, lower=-np.inf)
 
 
 def lone_cells(fraction: float) -> GridProblem:
     """Return a pool with cells all of whose faces are open by `fraction` only, and b in proportion."""
     shape = (40, 40)
-    face_x, face_y, b = np.ones((40, 41)), np.ones((41, 40)), noise(shape)
+    faces, b = faces_of(shape, np.ones), noise(shape)
     for j in range(3, 36, 4):
-        face_x[j, j : j + 2] = face_y[j : j + 2, j] = fraction
+        faces["face_x"][j, j : j + 2] = faces["face_y"][j : j + 2, j] = fraction
         b[j, j] *= fraction
-    return pool(shape, faces={"face_x": face_x, "face_y": face_y}, b=b)
+    return pool(shape, faces=faces, b=b)
 
 
 def ghost_fluid(theta: float) -> GridProblem:
     """Return a pool whose surface lies at random distances from cell centers, down to `theta` of a cell."""
-    shape = (40, 44)
-    chance = np.random.default_rng(SEED + 8)
-    face_y = np.ones((41, 44))
-    face_y[-2] = 1 / np.maximum(theta, 10 ** chance.uniform(np.log10(theta), 0, 44))
-    return pool(shape, faces={"face_x": np.ones((40, 45)), "face_y": face_y})
+    faces = faces_of((40, 44), np.ones)
+    faces["face_y"][-2] = 1 / np.maximum(theta, 10 ** chance(8).uniform(np.log10(theta), 0, 44))
+    return pool((40, 44), faces=faces)
 
 
 def contrasts() -> Iterator[Case]:
     """Yield coefficients over 12 decades, densities to 10^8 to 1, and cells a thousand times flatter than wide."""
-    case = partial(both, "contrasts")
+    case = partial(given, "contrasts")
     for ratio in (1e2, 1e4, 1e6, 1e8):
-        promises = SINGLE_MAY_STOP if ratio <= LARGEST_CONTRAST else MIXED_MAY_STOP
-        yield from case(f"layers of density 1:{ratio:g}", partial(layered, ratio), promises=promises, stopping=ROUGH)
-        yield from case(f"bubbles of density 1:{ratio:g}", partial(bubbles, ratio), promises=promises, stopping=ROUGH)
+        for name, light in (("layers", (Y // 6) % 2 == 1), ("bubbles", np.hypot(Y % 16 - 7.5, X % 16 - 7.5) < 5)):
+            made = partial(pool, Y.shape, faces=harmonic(np.where(light, 1.0, 1 / ratio)))
+            yield from case(f"{name} of density 1:{ratio:g}", made, **may_stop(ratio, LARGEST_CONTRAST))
     for shape in SHAPES:
-        for decades in (4, 12):
-            name = f"coefficients over {decades} decades, {len(shape)}-D"
-            promises = dict.fromkeys(PRECISIONS, EITHER) if decades == 12 else SINGLE_MAY_STOP
-            yield from case(name, partial(decades_of, shape, decades), promises=promises, stopping=ROUGH)
-        for axis in range(len(shape)):
+        for decades, expected in ((4, SOLVED), (12, EITHER)):
+            name, make = f"coefficients over {decades} decades, {len(shape)}-D", partial(decades_of, shape, decades)
+            yield from case(name, make, expected=expected, promises=SINGLE_MAY_STOP, stopping=ROUGH)
+        for axis in "xyz"[: len(shape)]:
             for ratio in (1e3, 1e-3):
-                name = f"anisotropy {ratio:g} along {'xyz'[axis]}, {len(shape)}-D"
-                yield from case(name, partial(pool, shape, faces={f"face_{'xyz'[axis]}": ratio}))
+                yield from case(f"anisotropy {ratio:g} along {axis}, {len(shape)}-D", partial(pool, shape, faces={f"face_{axis}": ratio}))
     for low, high in ((-6, 6), (0, 12), (-12, 0)):
-        name = f"shift from 1e{low} to 1e{high}"
-        yield from case(name, partial(shifted, low, high), promises=SINGLE_MAY_STOP, stopping=ROUGH)
+        made = partial(full, (40, 44), shift=10 ** chance(10).uniform(low, high, (40, 44)))
+        yield from case(f"shift from 1e{low} to 1e{high}", made, promises=SINGLE_MAY_STOP, stopping=ROUGH)
     for scale in (1e-12, 1e12, 1e-30, 1e30):
-        name = f"all coefficients {scale:g}"
-        yield from case(name, partial(pool, (40, 44), faces={"face_x": scale, "face_y": scale}))
-
-
-def layered(ratio: float) -> GridProblem:
-    """Return layers across y whose coefficients alternate between 1 and 1 / ratio."""
-    shape = (48, 50)
-    light = (np.arange(48) // 6) % 2 == 1
-    cell = np.where(light, 1.0, 1 / ratio)[:, None] * np.ones(shape)
-    return pool(shape, faces=harmonic(cell))
-
-
-def bubbles(ratio: float) -> GridProblem:
-    """Return light discs in heavy liquid."""
-    y, x = np.indices((48, 50)) % 16 - 7.5
-    return pool((48, 50), faces=harmonic(np.where(np.hypot(x, y) < 5, 1.0, 1 / ratio)))
+        yield from case(f"all coefficients {scale:g}", partial(pool, (40, 44), faces={"face_x": scale, "face_y": scale}))
 
 
 def harmonic(cell: np.ndarray) -> dict[str, np.ndarray]:
@@ -141,89 +111,55 @@ def harmonic(cell: np.ndarray) -> dict[str, np.ndarray]:
 
 def decades_of(shape: tuple[int, ...], decades: int) -> GridProblem:
     """Return a pool of coefficients that are random over so many decades, face by face."""
-    chance = np.random.default_rng(SEED + 9)
-    faces = faces_of(shape, lambda counts: 10 ** chance.uniform(-decades / 2, decades / 2, counts))
-    return pool(shape, faces=faces)
-
-
-def shifted(low: int, high: int) -> GridProblem:
-    """Return a closed pool with a shift that is random over decades."""
-    shape = (40, 44)
-    shift = 10 ** np.random.default_rng(SEED + 10).uniform(low, high, shape)
-    return GridProblem(cells=np.full(shape, FLUID), b=noise(shape), shift=shift)
+    draw = chance(9)
+    return pool(shape, faces=faces_of(shape, lambda counts: 10 ** draw.uniform(-decades / 2, decades / 2, counts)))
 
 
 def bodies() -> Iterator[Case]:
     """Yield rigid bodies in the liquid, as a term U W U' of masses from 10^-8 to 10^8 of the liquid's."""
-    family = "rigid bodies"
-    case = partial(both, family)
+    case = partial(given, "rigid bodies")
     for inverse in (1e-8, 1e-4, 1.0, 1e4, 1e8):
-        promises = SINGLE_MAY_STOP if inverse <= LIGHTEST else MIXED_MAY_STOP
-        yield from case(f"one body, 1/mass = {inverse:g}", partial(swimming, [inverse]), promises=promises, stopping=ROUGH)
-    name, four = "four, 1/mass from 1e-8 to 1e8", partial(swimming, [1e-8, 1e8, 1.0, 1e4])
-    yield SolveCase(family, f"{name}, projected-multigrid", four, promises=MIXED_MAY_STOP, stopping=ROUGH)
-    yield SolveCase(family, f"{name}, minimum-map-newton", four, "minimum-map-newton", same(EITHER), stopping=ROUGH)
+        yield from case(f"one body, 1/mass = {inverse:g}", partial(swimming, [inverse]), **may_stop(inverse, LIGHTEST))
+    four, promises, but = partial(swimming, [1e-8, 1e8, 1.0, 1e4]), MIXED_MAY_STOP, {"minimum-map-newton": EITHER}
+    yield from case("four, 1/mass from 1e-8 to 1e8", four, promises=promises, but=but, stopping=ROUGH)
     yield from case("held: W = 0", lambda: swimming([0.0, 0.0]))
     for inverse in (1e2, 1e4, 1e6, 1e8):
-        promises = SINGLE_MAY_STOP if inverse <= LIGHTEST else MIXED_MAY_STOP
-        yield from case(f"two, 1/mass = {inverse:g}, 3-D", partial(swimming_3d, [inverse, inverse]), promises=promises, stopping=ROUGH)
+        yield from case(f"two, 1/mass = {inverse:g}, 3-D", partial(swimming_3d, [inverse, inverse]), **may_stop(inverse, LIGHTEST))
     yield from case("heavy bodies, 3-D", lambda: swimming_3d([1e-8, 1e-8]))
-    yield from case("a column that touches nothing", with_empty_column)
-    yield from case("two equal columns", doubled_column)
+    yield from case("a column that touches nothing", lambda: with_column(swimming([1.0]), 0.0, 1e8))  # of a body in air
+    yield from case("two equal columns", lambda: with_column(swimming([10.0]), 1.0, 3.0))  # of a body counted twice
     yield from case("a piston closes a chamber", piston)
 
 
-def swimming(inverse_masses: list[float]) -> GridProblem:
+def swimming(inverse_masses: Sequence[float]) -> GridProblem:
     """Return a pool around square bodies: solid cells, whose pressure force along x and y is a column each."""
-    shape = (48, 50)
-    problem = pool(shape)
-    cells, columns = problem.cells.copy(), []
+    problem, n = pool((48, 50)), 8
+    cells, U = problem.cells.copy(), np.zeros((*problem.cells.shape, len(inverse_masses), 2))
     for number in range(len(inverse_masses)):
         j, i = 6 + 20 * (number // 2), 8 + 20 * (number % 2)
-        cells[j : j + 8, i : i + 8] = SOLID
-        columns += square(shape, j, i, 8)
-    W = np.diag(np.repeat(np.array(inverse_masses), 2))
-    return GridProblem(cells=cells, b=problem.b, lower=problem.lower, columns=np.stack(columns, axis=-1), weights=W)
+        cells[j : j + n, i : i + n] = SOLID
+        U[j : j + n, i - 1, number, 0], U[j : j + n, i + n, number, 0] = 1.0, -1.0
+        U[j - 1, i : i + n, number, 1], U[j + n, i : i + n, number, 1] = 1.0, -1.0
+    return replace(problem, cells=cells, columns=U.reshape(*cells.shape, -1), weights=np.diag(np.repeat(np.array(inverse_masses), 2)))
 
 
-def square(shape: tuple[int, ...], j: int, i: int, n: int) -> list[np.ndarray]:
-    """Return how much a square body displaces in each cell when it moves along x, and along y."""
-    x, y = np.zeros(shape), np.zeros(shape)
-    x[j : j + n, i - 1], x[j : j + n, i + n] = 1.0, -1.0
-    y[j - 1, i : i + n], y[j + n, i : i + n] = 1.0, -1.0
-    return [x, y]
-
-
-def swimming_3d(inverse_masses: list[float]) -> GridProblem:
+def swimming_3d(inverse_masses: Sequence[float]) -> GridProblem:
     """Return bodies of three cells a side in a 3-D pool, each moving along y."""
-    shape = (14, 15, 24)
-    problem = pool(shape)
-    cells, columns = problem.cells.copy(), []
+    problem = pool((14, 15, 24))
+    cells, U = problem.cells.copy(), np.zeros((*problem.cells.shape, len(inverse_masses)))
     for number in range(len(inverse_masses)):
         i = 4 + 10 * number
         cells[5:8, 5:8, i : i + 3] = SOLID
-        u = np.zeros(shape)
-        u[5:8, 4, i : i + 3], u[5:8, 8, i : i + 3] = 1.0, -1.0
-        columns.append(u)
-    return GridProblem(
-        cells=cells, b=problem.b, lower=problem.lower, columns=np.stack(columns, axis=-1), weights=np.diag(np.array(inverse_masses))
-    )
+        U[5:8, 4, i : i + 3, number], U[5:8, 8, i : i + 3, number] = 1.0, -1.0
+    return replace(problem, cells=cells, columns=U, weights=np.diag(np.array(inverse_masses)))
 
 
-def with_empty_column() -> GridProblem:
-    """Return a body in air beside one in the liquid."""
-    made = swimming([1.0])
+def with_column(made: GridProblem, factor: float, weight: float) -> GridProblem:
+    """Return the problem with its first column once more, times a factor: the columns are linearly dependent."""
     assert made.columns is not None
-    columns = np.concatenate([made.columns, np.zeros((*made.cells.shape, 1))], axis=-1)
-    return GridProblem(cells=made.cells, b=made.b, lower=made.lower, columns=columns, weights=np.diag([1.0, 1.0, 1e8]))
-
-
-def doubled_column() -> GridProblem:
-    """Return one body counted twice: the columns are linearly dependent."""
-    made = swimming([10.0])
-    assert made.columns is not None
-    columns = np.concatenate([made.columns, made.columns[..., :1]], axis=-1)
-    return GridProblem(cells=made.cells, b=made.b, lower=made.lower, columns=columns, weights=np.diag([10.0, 10.0, 3.0]))
+    assert made.weights is not None
+    weights = np.diag([*made.weights.diagonal(), weight])
+    return replace(made, columns=np.concatenate([made.columns, factor * made.columns[..., :1]], axis=-1), weights=weights)
 
 
 def piston() -> GridProblem:

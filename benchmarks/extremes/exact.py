@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ AXES = "xyz"
 class Exact:
     """The equations of the unknowns alone, in float64."""
 
-    matrix: Any  # shape (n, n)
+    matrix: Any  # sparse, shape (n, n)
     b: np.ndarray  # shape (n,), units of y
     lower: np.ndarray  # shape (n,)
     upper: np.ndarray  # shape (n,)
@@ -35,10 +36,15 @@ class Exact:
         """clip(0, l, u)."""
         return np.clip(np.zeros(len(self.b)), self.lower, self.upper)
 
+    @cached_property
+    def scale(self) -> np.ndarray:
+        """The matrix's d."""
+        return equilibrated_scale(self.matrix)
+
     def diagonal(self, *, bodies: bool = True) -> np.ndarray:
         """Return d; without the term of bodies, which is semi-definite, if so asked."""
         if self.columns is None or self.weights is None:
-            return equilibrated_scale(self.matrix)
+            return self.scale
         d = np.asarray(self.matrix.diagonal(), dtype=np.float64)
         if bodies:
             d = d + np.einsum("ij,jk,ik->i", self.columns, self.weights, self.columns)
@@ -131,8 +137,6 @@ def stencil(
         columns += [q[between], p[between]]
         values += [-c[between], -c[between]]
     fluid = grid.ravel() == FLUID
-    number = np.cumsum(fluid) - 1
-    n = int(fluid.sum())
-    at = (number[np.concatenate(rows)], number[np.concatenate(columns)])
-    coupling = scipy.sparse.coo_array((np.concatenate(values), at), shape=(n, n)).tocsr()
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    coupling = scipy.sparse.coo_array(entries, shape=(grid.size, grid.size)).tocsr()[fluid][:, fluid]
     return (coupling + scipy.sparse.diags_array(d[fluid])).tocsr(), fluid

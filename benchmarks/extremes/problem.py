@@ -1,33 +1,22 @@
-"""Problems as NumPy arrays: what the library is given, and what the independent residual is computed from."""
+"""Problems as NumPy arrays: what the library is given, what the independent residual is computed from, and when there is a solution."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse
+import scipy.sparse.csgraph
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.exact import Exact, stencil
 
-
-class Problem(Protocol):
-    """Something to solve."""
-
-    def lcp(self, device: str, storage: Any) -> wl.LCP:
-        """Return it for the library; `storage` is the type of coefficients, wp.float32 or wp.float64."""
-
-    def exact(self) -> Exact:
-        """Return it for the independent residual."""
-
-    def unknowns(self, x: np.ndarray) -> np.ndarray:
-        """Return the unknowns of a field x, shape (n,), float64."""
-
-    def rounded(self, storage: Any) -> bool:
-        """Return whether `storage` rounds the coefficients."""
+BALANCED = 1e-10  # of sum |b|: sums of b that are 0 but for rounding
+GENTLY = 0.01  # of the mean |b|: what a pool's b is raised by where its sum has the sign that no bound takes up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +34,7 @@ class GridProblem:
     weights: np.ndarray | None = None  # W, shape (k, k)
 
     def lcp(self, device: str, storage: Any) -> wl.LCP:
-        """Return it for the library."""
+        """Return it for the library; `storage` is the type of coefficients, wp.float32 or wp.float64."""
         A: Any = wl.GridPoisson(self.cells, shift=self.shift, periodic=self.periodic, device=device, dtype=storage, **self.faces)
         if self.columns is not None:
             A = wl.SumOperator(A, wl.LowRankOperator(self.columns, self.weights, device=device))
@@ -55,21 +44,18 @@ class GridProblem:
         """Return it for the independent residual."""
         matrix, fluid = stencil(self.cells, self.faces, self.shift, self.periodic)
         b, lower, upper = (np.broadcast_to(f, self.cells.shape).ravel()[fluid].astype(np.float64) for f in (self.b, self.lower, self.upper))
-        if self.columns is None:
-            return Exact(matrix, b, lower, upper)
-        U = self.columns.reshape(-1, self.columns.shape[-1])[fluid]
+        U = None if self.columns is None else self.columns.reshape(-1, self.columns.shape[-1])[fluid]
         return Exact(matrix, b, lower, upper, U, self.weights)
 
     def unknowns(self, x: np.ndarray) -> np.ndarray:
-        """Return the unknowns of a field."""
+        """Return the unknowns of a field x, shape (n,), float64."""
         return x.astype(np.float64).ravel()[self.cells.ravel() == wl.FLUID]
 
     def rounded(self, storage: Any) -> bool:
-        """Return whether coefficients are arrays or unequal."""
-        if storage is wp.float64:
-            return False
+        """Return whether `storage` rounds the coefficients: arrays or unequal numbers."""
         faces = [self.faces.get(f"face_{axis}", 1.0) for axis in "xyz"[: self.cells.ndim]]
-        return self.shift is not None or any(np.ndim(f) > 0 for f in faces) or len({float(f) for f in faces}) > 1
+        uneven = self.shift is not None or any(np.ndim(f) > 0 for f in faces) or len({float(f) for f in faces}) > 1
+        return uneven and storage is not wp.float64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +66,12 @@ class MatrixProblem:
     b: np.ndarray
     lower: Any = 0.0
     upper: Any = np.inf
+
+    @staticmethod
+    def of(problem: gallery.Problem | Exact) -> MatrixProblem:
+        """Return a problem of the gallery, or that of a grid."""
+        matrix = problem.matrix if isinstance(problem, Exact) else problem.A
+        return MatrixProblem(matrix=matrix, b=problem.b, lower=problem.lower, upper=problem.upper)
 
     def lcp(self, device: str, storage: Any) -> wl.LCP:
         """Return it for the library."""
@@ -98,3 +90,66 @@ class MatrixProblem:
     def rounded(self, storage: Any) -> bool:
         """Return whether entries are rounded."""
         return storage is wp.float32
+
+
+Problem = GridProblem | MatrixProblem
+
+
+def faces_of(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], Any]) -> dict[str, Any]:
+    """Return arrays of coefficients; `value` takes an array's shape."""
+    axes = list(zip("xyz", range(len(shape))[::-1], strict=False))
+    return {f"face_{name}": value(tuple(n + (q == axis) for q, n in enumerate(shape))) for name, axis in axes}
+
+
+def with_solution(cells: np.ndarray, x: np.ndarray, y: np.ndarray) -> GridProblem:
+    """Return a problem with p >= 0 whose solution is x on the FLUID cells, with A x + b = y."""
+    made, inside = GridProblem(cells=cells, b=np.zeros(cells.shape)), cells == wl.FLUID
+    made.b[inside] = y[inside] - made.exact().matrix @ x[inside]
+    return made
+
+
+@dataclass(frozen=True)
+class Pools:
+    """Connected unknowns, and which of them no AIR, shift or bound holds."""
+
+    label: np.ndarray  # pool of each unknown
+    loose: np.ndarray  # whether a pool's constants are in the null space, by pool
+    net: np.ndarray  # sum of b, by pool; 0 where that is rounding
+    size: np.ndarray  # sum of |b|, by pool
+    cells: np.ndarray  # unknowns, by pool
+    below: np.ndarray  # whether one of a pool's lower bounds is finite
+    above: np.ndarray  # whether one of its upper bounds is
+
+    @staticmethod
+    def of(exact: Exact) -> Pools:
+        """Return the pools of a symmetric problem whose off-diagonal entries are <= 0."""
+        count, label = scipy.sparse.csgraph.connected_components(exact.matrix != 0, directed=False)
+        tied = np.asarray(exact.matrix.sum(axis=1)).ravel() > 1e-12 * exact.matrix.diagonal()
+        held, below, above = (np.bincount(label, v, count) > 0 for v in (tied, np.isfinite(exact.lower), np.isfinite(exact.upper)))
+        net, size = (np.bincount(label, v, count) for v in (exact.b, np.abs(exact.b)))
+        net = np.where(np.abs(net) <= BALANCED * size, 0.0, net)
+        return Pools(label, ~held, net, size, np.bincount(label, minlength=count), below, above)
+
+    @property
+    def lost(self) -> np.ndarray:
+        """Pools without a solution: constants lower the energy for ever."""
+        return self.loose & (((self.net > 0) & ~self.below) | ((self.net < 0) & ~self.above))
+
+
+def solvable(problem: GridProblem) -> GridProblem:
+    """Return the problem with b moved, on the pools that have no solution, by the least that gives them one and a little more."""
+    pools = Pools.of(problem.exact())
+    # a sum of 0 is on the verge of having none: where one bound can take up a sign, b gets some of that sign
+    moved = pools.lost | (pools.loose & (pools.net == 0) & (pools.below ^ pools.above))
+    taken_up = pools.below.astype(float) - pools.above
+    shift = np.where(moved, (taken_up * GENTLY * (pools.size + (pools.size == 0)) - pools.net) / pools.cells, 0.0)
+    b = np.where(problem.cells == wl.FLUID, problem.b, 0.0)
+    b[problem.cells == wl.FLUID] += shift[pools.label]
+    return replace(problem, b=b)
+
+
+def equality(problem: GridProblem) -> GridProblem | None:
+    """Return the problem without bounds, None if it has no solution; where b = 0 solves it at once, that of a constant b."""
+    b = problem.b if np.any(problem.b[problem.cells == wl.FLUID]) else -np.ones(problem.cells.shape)
+    free = replace(problem, b=b, lower=-np.inf, upper=np.inf)
+    return None if Pools.of(free.exact()).lost.any() else free

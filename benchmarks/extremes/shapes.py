@@ -2,47 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.extremes.case import EITHER, INFEASIBLE, PRECISIONS, Case, Promise, RefusalCase, SolveCase
-from warp_lcp.benchmarks.extremes.exact import stencil
-from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.case import EITHER, INFEASIBLE, SOLVED, Case, RefusalCase, SolveCase
+from warp_lcp.benchmarks.extremes.problem import GridProblem, solvable
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SEED = 7919
-METHODS = ("projected-multigrid", "minimum-map-newton")
+METHODS = ("projected-multigrid", "minimum-map-newton")  # which must take everything
 LARGE_BUDGET = 60.0  # of 10^6 unknowns
 
 
-def same(promise: Promise) -> Mapping[str, Promise]:
-    """Return the promise for every precision."""
-    return dict.fromkeys(PRECISIONS, promise)
+def given(family: str, name: str, make: Callable[[], Any], methods: tuple[str, ...] = METHODS, **more: Any) -> Iterator[Case]:
+    """Yield the case for each method; `more` as of SolveCase, `but` holds what single methods come to instead."""
+    but = more.pop("but", {})
+    for method in methods:
+        own = {"expected": but[method]} if method in but else {}
+        yield SolveCase(family, f"{name}, {method}", make, method, **(more | own))
 
 
-def both(family: str, name: str, make: Callable[[], Any], **more: Any) -> Iterator[SolveCase]:
-    """Yield the case for both methods that must take everything."""
-    for method in METHODS:
-        yield SolveCase(family, f"{name}, {method}", make, method, **more)
+def chance(number: int) -> np.random.Generator:
+    """Return the random numbers of a problem."""
+    return np.random.default_rng(SEED + number)
 
 
-def noise(shape: tuple[int, ...], seed: int = SEED) -> np.ndarray:
+def noise(shape: tuple[int, ...], number: int = 0) -> np.ndarray:
     """Return normal noise of zero mean as a right-hand side."""
-    b = np.random.default_rng(seed).standard_normal(shape)
+    b = chance(number).standard_normal(shape)
     return b - b.mean()
+
+
+def full(shape: tuple[int, ...], **more: Any) -> GridProblem:
+    """Return a closed box of liquid, with p >= 0."""
+    return GridProblem(cells=np.full(shape, FLUID), **({"b": noise(shape)} | more))
 
 
 def pool(shape: tuple[int, ...], **more: Any) -> GridProblem:
     """Return liquid with AIR as its topmost layer along y, walls that hold and pull nothing: half of the cells p >= 0."""
     cells = np.full(shape, FLUID)
     cells[(..., -1, slice(None))] = AIR
-    lower = np.where(np.random.default_rng(SEED + 1).random(shape) < 0.5, 0.0, -np.inf)
+    lower = np.where(chance(1).random(shape) < 0.5, 0.0, -np.inf)
     return GridProblem(cells=cells, **({"b": noise(shape), "lower": lower} | more))
 
 
@@ -50,12 +54,12 @@ def grounded(shape: tuple[int, ...]) -> GridProblem:
     """Return a grid without room for AIR, held by a shift in its first cell."""
     shift = np.zeros(shape)
     shift.flat[0] = 1.0
-    return GridProblem(cells=np.full(shape, FLUID), b=noise(shape) if np.prod(shape) > 1 else np.full(shape, -1.5), shift=shift)
+    return full(shape, b=noise(shape) if np.prod(shape) > 1 else np.full(shape, -1.5), shift=shift)
 
 
 def sizes() -> Iterator[Case]:
     """Yield grids of one cell, one layer, prime sizes, 10^6 cells and long ones."""
-    case = partial(both, "sizes")
+    case = partial(given, "sizes")
     for shape in ((1, 1), (1, 1, 1), (1, 2), (2, 1), (1, 1, 7), (1, 7, 1), (7, 1, 1), (1, 1, 4096), (4096, 1, 1), (1, 13, 17)):
         yield from case("x".join(map(str, shape)), partial(grounded, shape))
     for shape in ((2, 2), (3, 1), (127, 131), (1, 127, 131), (31, 37, 41), (2, 3, 5)):
@@ -69,45 +73,31 @@ def sizes() -> Iterator[Case]:
 
 def sponge(shape: tuple[int, ...], liquid: float) -> GridProblem:
     """Return cells of random type, and b that every component without AIR or bound can meet."""
-    chance = np.random.default_rng(SEED + 2)
-    cells = chance.choice([AIR, FLUID, SOLID], shape, p=[(1 - liquid) / 2, liquid, (1 - liquid) / 2])
-    return GridProblem(cells=cells, b=without_inflow(cells, chance.standard_normal(shape)), lower=0.0)
-
-
-def without_inflow(cells: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return b raised on each pool without air so far that it adds up to 0.01 a cell: p >= 0 has a solution then, and else has none."""
-    matrix, fluid = stencil(cells, {})
-    count, label = scipy.sparse.csgraph.connected_components(matrix, directed=False)
-    held = np.bincount(label, np.asarray(matrix.sum(axis=1)).ravel(), count) > 0.5
-    mean = np.bincount(label, b.ravel()[fluid], count) / np.bincount(label, minlength=count)
-    raised = b.copy().ravel()
-    raised[fluid] += np.where(held | (mean >= 0), 0.0, 0.01 - mean)[label]
-    return raised.reshape(b.shape)
+    draw = chance(2)
+    cells = draw.choice([AIR, FLUID, SOLID], shape, p=[(1 - liquid) / 2, liquid, (1 - liquid) / 2])
+    return solvable(GridProblem(cells=cells, b=draw.standard_normal(shape)))
 
 
 def masks() -> Iterator[Case]:
     """Yield grids of few or no unknowns, checkerboards, needles and walls of one cell."""
-    family = "masks"
-    case = partial(both, family)
+    case = partial(given, "masks")
     for name, kind in (("solid", SOLID), ("air", AIR)):
-        yield RefusalCase(family, f"all {name}", partial(without_unknowns, kind), "A ")
+        yield RefusalCase("masks", f"all {name}", partial(without_unknowns, kind), "A ")
     for name, around in (("air", AIR), ("solid", SOLID)):
         for shape in ((3, 3), (5, 5, 5)):
             for b in (-1.0, 1.0, 0.0):
                 if not (around == SOLID and b < 0):
                     yield from case(f"one cell in {name}, {len(shape)}-D, b = {b:g}", partial(single, shape, around, b))
-    yield from case("one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), promises=same(INFEASIBLE))
+    yield from case("one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), expected=INFEASIBLE)
     for shape in ((40, 41), (12, 13, 14)):
-        for other in (AIR, SOLID):
-            name = f"checkerboard of liquid and {'air' if other == AIR else 'solid'}, {len(shape)}-D"
-            yield from case(name, partial(checkerboard, shape, other))
-    yield SolveCase(family, "labyrinth 65x65, minimum-map-newton", lambda: labyrinth(65), "minimum-map-newton")
-    yield SolveCase(family, "labyrinth 65x65, projected-multigrid", lambda: labyrinth(65), promises=same(EITHER))  # LIMITS
+        for name, other in (("air", AIR), ("solid", SOLID)):
+            yield from case(f"checkerboard of liquid and {name}, {len(shape)}-D", partial(checkerboard, shape, other))
+    yield from case("labyrinth 65x65", lambda: labyrinth(65), but={"projected-multigrid": EITHER})  # LIMITS
     yield from case("labyrinth 33x33 without bounds", lambda: labyrinth(33, lower=-np.inf))
     yield from case("two pools joined by a needle", lambda: needle(64))
     yield from case("chambers behind walls of one cell", lambda: chambers(59))
-    yield from case("one air cell in 64x64", lambda: punctured((64, 64)))
-    yield from case("one air cell in 24x24x24", lambda: punctured((24, 24, 24)))
+    for shape in ((64, 64), (24, 24, 24)):
+        yield from case(f"one air cell in {'x'.join(map(str, shape))}", partial(punctured, shape))
     for liquid in (0.1, 0.5, 0.9):
         yield from case(f"sponge, {liquid:.0%} liquid", partial(sponge, (67, 71), liquid))
     yield from case("3-D sponge, 60% liquid", lambda: sponge((19, 23, 29), 0.6))
@@ -127,8 +117,7 @@ def single(shape: tuple[int, ...], around: int, b: float) -> GridProblem:
 
 def checkerboard(shape: tuple[int, ...], other: int) -> GridProblem:
     """Return liquid in every second cell; among solid ones each is closed off, so that b >= 0 there."""
-    odd = np.indices(shape).sum(axis=0) % 2 == 1
-    b = noise(shape)
+    odd, b = np.indices(shape).sum(axis=0) % 2 == 1, noise(shape)
     return GridProblem(cells=np.where(odd, FLUID, other), b=np.abs(b) if other == SOLID else b)
 
 
@@ -136,8 +125,7 @@ def labyrinth(n: int, **more: Any) -> GridProblem:
     """Return one channel of liquid a cell wide, in bends from the bottom to the top, where it meets air."""
     cells = np.full((n, n), FLUID)
     cells[1::2] = SOLID
-    cells[1::4, -1] = FLUID
-    cells[3::4, 0] = FLUID
+    cells[1::4, -1] = cells[3::4, 0] = FLUID
     cells[-1] = AIR
     return GridProblem(cells=cells, b=noise((n, n)), **more)
 
@@ -157,7 +145,7 @@ def chambers(n: int) -> GridProblem:
     cells[5::6], cells[:, 5::6] = SOLID, SOLID
     cells[5::6, 2::6], cells[2::6, 5::6] = FLUID, FLUID
     cells[:5, :5] = AIR
-    return GridProblem(cells=cells, b=noise((n, n)), lower=np.where(noise((n, n), SEED + 3) > 0, 0.0, -np.inf))
+    return GridProblem(cells=cells, b=noise((n, n)), lower=np.where(noise((n, n), 3) > 0, 0.0, -np.inf))
 
 
 def punctured(shape: tuple[int, ...]) -> GridProblem:
@@ -169,32 +157,18 @@ def punctured(shape: tuple[int, ...]) -> GridProblem:
 
 def closed_pools() -> Iterator[Case]:
     """Yield liquid without air: b that adds up to 0 can be met, others only where a bound lets go."""
-    family = "closed pools"
-    case = partial(both, family)
+    case = partial(given, "closed pools")
     for shape in ((48, 53), (17, 18, 19)):
-        full = np.full(shape, FLUID)
-        name = f"{len(shape)}-D"
-        for method in METHODS:
-            yield SolveCase(
-                family, f"compatible, {name}, {method}", partial(GridProblem, cells=full, b=noise(full.shape), lower=-np.inf), method
-            )
-            for sign in (1.0, -1.0):
-                off = f"{'outflow' if sign > 0 else 'inflow'}, {name}, {method}"
-                b = noise(shape) + sign * 0.1
-                yield SolveCase(
-                    family, f"incompatible {off}", partial(GridProblem, cells=full, b=b, lower=-np.inf), method, same(INFEASIBLE)
-                )
-                promises = {} if sign > 0 else same(INFEASIBLE)
-                yield SolveCase(family, f"p >= 0, {off}", partial(GridProblem, cells=full, b=b), method, promises)
-    yield from case("one of 40 is incompatible", lambda: many_pools(0.05), promises=same(INFEASIBLE))
+        yield from case(f"compatible, {len(shape)}-D", partial(full, shape, lower=-np.inf))
+        for flow, b in (("outflow", noise(shape) + 0.1), ("inflow", noise(shape) - 0.1)):
+            off = f"{flow}, {len(shape)}-D"
+            yield from case(f"incompatible {off}", partial(full, shape, b=b, lower=-np.inf), expected=INFEASIBLE)
+            yield from case(f"p >= 0, {off}", partial(full, shape, b=b), expected=SOLVED if flow == "outflow" else INFEASIBLE)
+    yield from case("one of 40 is incompatible", lambda: many_pools(0.05), expected=INFEASIBLE)
     yield from case("40 compatible ones", lambda: many_pools(0.0))
-    yield from case("boxed, inflow", lambda: GridProblem(cells=np.full((9, 9), FLUID), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0))
-    yield from case(
-        "incompatible by rounding only", lambda: GridProblem(cells=np.full((64, 64), FLUID), b=noise((64, 64)) * 1e6, lower=-np.inf)
-    )
-    yield from case("periodic in x and y, compatible",
-        lambda: GridProblem(cells=np.full((31, 32), FLUID), b=noise((31, 32)), lower=-np.inf, periodic=(True, True, False)),
-    )  # fmt: skip
+    yield from case("boxed, inflow", lambda: full((9, 9), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0))
+    yield from case("incompatible by rounding only", lambda: full((64, 64), b=noise((64, 64)) * 1e6, lower=-np.inf))
+    yield from case("periodic in x and y, compatible", lambda: full((31, 32), lower=-np.inf, periodic=(True, True, False)))
 
 
 def many_pools(net: float) -> GridProblem:

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.extremes.case import PRECISIONS, Attempt, Case, Expected, Promise
+from warp_lcp.benchmarks.extremes.case import PRECISIONS, Attempt, Case, Expected, Promise, stopped
 from warp_lcp.benchmarks.extremes.problem import GridProblem
 from warp_lcp.fluids import SIMULATOR as FLUIDS
-from warp_lcp.fluids import LiquidScene, LiquidSimulation
+from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.granular import SIMULATOR as GRANULAR
-from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.grid.particles import MARGIN
+from warp_lcp.scene.simulator import Simulator
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
 ParticleSimulation = LiquidSimulation | SandSimulation
@@ -31,44 +32,24 @@ CROWDED = 10_000_000
 
 def ended_with(names: str) -> Promise:
     """Return the promise of a simulation that ends with a message that contains `names`."""
-    return Promise(Expected.STOPPED, frozenset({f"failed: {names}"}), names)
+    return stopped(f"failed: {names}", names)
 
 
 @dataclass(frozen=True)
-class RunCase:
-    """A simulation that takes a few steps.
+class RunCase(Case):
+    """A simulation that takes a few steps."""
 
-    Args:
-        family: the cases that share an expectation.
-        name: unique in its family.
-        make: returns it, for a precision and a device.
-        dt: of every step [s]; what the CFL number allows if None.
-        steps: how many.
-        prepare: changes it before the first step.
-        check: returns what is wrong with it afterwards, besides what is checked of all.
-        expected: what it must come to.
-        leaves: whether particles may leave.
-        budget: seconds a precision may take.
-        precisions: those of the pressure solve that it is tried in.
-    """
-
-    family: str
-    name: str
-    make: Callable[[str, str], ParticleSimulation]
-    dt: float | None = None
-    steps: int = STEPS
-    prepare: Callable[[ParticleSimulation], object] = lambda simulation: None
-    check: Callable[[ParticleSimulation], list[str]] = lambda simulation: []
+    make: Callable[[str, str], ParticleSimulation]  # returns it, for a precision and a device
+    _: KW_ONLY
+    dt: float | None = None  # of every step [s]; what the CFL number allows if None
+    steps: int = STEPS  # how many
+    prepare: Callable[[ParticleSimulation], object] = lambda simulation: None  # changes it before the first step
+    check: Callable[[ParticleSimulation], list[str]] = lambda simulation: []  # what is wrong with it, besides what is checked of all
+    leaves: bool = False  # whether particles may leave
     expected: Promise = DONE
-    leaves: bool = False
     budget: float = BUDGET
-    precisions: tuple[str, ...] = PRECISIONS
 
-    def promise(self, precision: str) -> Promise:
-        """Return what it must come to."""
-        return self.expected
-
-    def attempt(self, precision: str, device: str) -> Attempt:
+    def tried(self, precision: str, device: str) -> Attempt:
         """Make it and step."""
         simulation = self.make(precision, device)
         self.prepare(simulation)
@@ -126,91 +107,97 @@ def independent(kept: Mapping[str, np.ndarray], simulation: LiquidSimulation) ->
     return (own / reference if reference > 0 else own), fault
 
 
-def liquid(precision: str, device: str, **tables: Any) -> ParticleSimulation:
-    """Return a small dam break, whose tables may be overwritten."""
-    time_table = {"duration": 10.0, "dt_max": 10.0, "dt_min": 1e-12} | tables.pop("time", {})
-    data = {
-        "scene": {"simulator": "fluids"},
-        "time": time_table,
-        "domain": {"size": [1.0, 0.5], "resolution": 16} | tables.pop("domain", {}),
-        "solver": {"precision": precision},
-        "liquid": [{"shape": "box", "min": [0.0, 0.0], "max": [0.375, 0.375], "velocity": tables.pop("velocity", [0.0, 0.0])}],
-    }
-    return FLUIDS.create(LiquidScene.model_validate(data | tables), device=device, folder=Path())
+@dataclass(frozen=True)
+class Material:
+    """A small column of it is what all scenes start from; sand's solver has one precision."""
+
+    name: str
+    simulator: Simulator
+    precisions: tuple[str, ...]
 
 
-def sand(precision: str, device: str, **tables: Any) -> ParticleSimulation:
-    """Return a small column of sand; its solver has one precision."""
-    data = {
-        "scene": {"simulator": "granular"},
-        "time": {"duration": 10.0, "dt_max": 10.0, "dt_min": 1e-12} | tables.pop("time", {}),
-        "domain": {"size": [1.0, 0.5], "resolution": 16},
-        "sand": [{"shape": "box", "min": [0.0, 0.0], "max": [0.375, 0.375], "velocity": tables.pop("velocity", [0.0, 0.0])}],
-    }
-    return GRANULAR.create(SandScene.model_validate(data | tables), device=device, folder=Path())
+liquid, sand = Material("liquid", FLUIDS, PRECISIONS), Material("sand", GRANULAR, ("single",))
 
 
-def made(kind: Callable[..., ParticleSimulation], **tables: Any) -> Callable[[str, str], ParticleSimulation]:
-    """Return what makes the scene."""
-    return lambda precision, device: kind(precision, device, **{k: dict(v) if isinstance(v, dict) else v for k, v in tables.items()})
+def box(low: Sequence[float], high: Sequence[float], **more: Any) -> dict[str, Any]:
+    """Return the table of a box."""
+    return {"shape": "box", "min": low, "max": high, **more}
+
+
+def made(kind: Material, **tables: Any) -> Callable[[str, str], ParticleSimulation]:
+    """Return what makes a small column, whose tables may be overwritten; `velocity` is the column's."""
+
+    def make(precision: str, device: str) -> ParticleSimulation:
+        usual: dict[str, Any] = {
+            "time": {"duration": 10.0, "dt_max": 10.0, "dt_min": 1e-12},
+            "domain": {"size": [1.0, 0.5], "resolution": 16},
+        }
+        data: dict[str, Any] = {name: values | tables.get(name, {}) for name, values in usual.items()}
+        data["scene"] = {"simulator": kind.simulator.name}
+        data[kind.name] = [box([0.0, 0.0], [0.375, 0.375], velocity=tables.get("velocity", [0.0, 0.0]))]
+        data |= {"solver": {"precision": precision}} if kind is liquid else {}
+        data |= {name: values for name, values in tables.items() if name not in (*usual, "velocity")}
+        simulation = kind.simulator.create(kind.simulator.scene_model.model_validate(data), device=device, folder=Path())
+        assert isinstance(simulation, ParticleSimulation)
+        return simulation
+
+    return make
 
 
 def steps_and_forces() -> Iterator[Case]:
     """Yield time steps from 1e-9 to 10 s, CFL numbers from 0.01 to 50, gravity from none to 1e6 m/s^2, speeds to 1e6 m/s."""
-    for kind, precisions in ((liquid, PRECISIONS), (sand, ("single",))):
-        family = "liquid" if kind is liquid else "sand"
-        more: dict[str, Any] = {"precisions": precisions}
+    for kind in (liquid, sand):
+
+        def case(name: str, kind: Material = kind, *, tables: Mapping[str, Any] | None = None, **more: Any) -> RunCase:
+            return RunCase(kind.name, name, made(kind, **(tables or {})), precisions=kind.precisions, **more)
+
         for dt in (1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0):
-            yield RunCase(family, f"dt = {dt:g} s", made(kind), dt=dt, **more)
+            yield case(f"dt = {dt:g} s", dt=dt)
         for cfl in (0.01, 0.1, 1.0, 10.0, 50.0):
-            yield RunCase(family, f"CFL {cfl:g}", made(kind, time={"cfl": cfl}), **more)
+            yield case(f"CFL {cfl:g}", tables={"time": {"cfl": cfl}})
         for g in (0.0, 1e-9, 1e3, 1e6):
-            yield RunCase(
-                family, f"gravity of {g:g} m/s^2", made(kind, physics={"gravity": [0.0, -g]}), dt=0.01 if g == 0 else None, **more
-            )
-        yield RunCase(family, "gravity sideways and up", made(kind, physics={"gravity": [300.0, 400.0]}), **more)
+            yield case(f"gravity of {g:g} m/s^2", tables=gravity(0.0, -g), dt=0.01 if g == 0 else None)
+        yield case("gravity sideways and up", tables=gravity(300.0, 400.0))
         for speed in ([1e6, 0.0], [-1e6, 1e6], [1e-6, 0.0]):
-            yield RunCase(family, f"speed of {speed} m/s", made(kind, velocity=speed), **more)
-        yield RunCase(family, "1e6 m/s for 1 s a step", made(kind, velocity=[1e6, 0.0]), dt=1.0, **more)
+            yield case(f"speed of {speed} m/s", tables={"velocity": speed})
+        yield case("1e6 m/s for 1 s a step", tables={"velocity": [1e6, 0.0]}, dt=1.0)
         for bad in (0.0, -1.0, np.nan, np.inf):
-            yield RunCase(family, f"dt = {bad}", made(kind), dt=bad, expected=ended_with("dt ="), **more)
-        still = {"physics": {"gravity": [0.0, 0.0]}}
-        yield RunCase(
-            family, "at rest without gravity", made(kind, **still), dt=0.1, check=at_rest if kind is liquid else all_but_at_rest, **more
-        )
-    yield RunCase(
-        "liquid", "all sides open", made(liquid, domain={"open": ["left", "right", "top", "bottom"]}, velocity=[9.0, 0.0]), leaves=True
-    )
-    yield RunCase("liquid", "full and closed", made(liquid, liquid=[{"shape": "box", "min": [0, 0], "max": [1, 0.5], "velocity": [3, 1]}]))
-    yield RunCase("liquid", "free-slip, full and closed", made(
-        liquid, domain={"wall": "free-slip"}, liquid=[{"shape": "box", "min": [0, 0], "max": [1, 0.5], "velocity": [3, 1]}]
-    ))  # fmt: skip
-    yield RunCase("liquid", "flat domain, 2 x 0.0625 m", made(liquid, domain={"size": [2.0, 0.0625], "resolution": 64}, liquid=[FLAT]))
+            yield case(f"dt = {bad}", dt=bad, expected=ended_with("dt ="))
+        still = at_rest if kind is liquid else all_but_at_rest
+        yield case("at rest without gravity", tables=gravity(0.0, 0.0), dt=0.1, check=still)
+    all_open = made(liquid, domain={"open": ["left", "right", "top", "bottom"]}, velocity=[9.0, 0.0])
+    yield RunCase("liquid", "all sides open", all_open, leaves=True)
+    whole = [box([0, 0], [1, 0.5], velocity=[3, 1])]
+    yield RunCase("liquid", "full and closed", made(liquid, liquid=whole))
+    yield RunCase("liquid", "free-slip, full and closed", made(liquid, domain={"wall": "free-slip"}, liquid=whole))
+    flat = made(liquid, domain={"size": [2.0, 0.0625], "resolution": 64}, liquid=[box([0.0, 0.0], [0.5, 0.03])])
+    yield RunCase("liquid", "flat domain, 2 x 0.0625 m", flat)
     for density in (1e-6, 1e9):
         yield RunCase("liquid", f"density of {density:g} kg/m^3", made(liquid, physics={"density": density}))
 
 
+def gravity(*components: float) -> dict[str, Any]:
+    """Return the tables of a gravity [m/s^2]."""
+    return {"physics": {"gravity": list(components)}}
+
+
 def solids_and_depth() -> Iterator[Case]:
     """Yield 3-D liquid, and rigid bodies of 10^-8 to 10^8 of its density, solids that move too fast, and liquid between them."""
-    family = "liquid, 3-D and with bodies"
-    size = {"domain": {"size": [0.5, 0.5, 0.25], "resolution": 12}, "liquid": [COLUMN]}
+    case, pond = partial(RunCase, "liquid, 3-D and with bodies"), [box([0.0, 0.0], [1.0, 0.25])]
+    column, size = box([0.0, 0.0, 0.0], [0.25, 0.3, 0.25]), {"domain": {"size": [0.5, 0.5, 0.25], "resolution": 12}}
+    deep = partial(made, liquid, **size, liquid=[column])
     for dt in (1e-9, 0.1, 10.0):
-        yield RunCase(family, f"3-D, dt = {dt:g} s", made(liquid, **size), dt=dt)
-    yield RunCase(family, "3-D, gravity of 1e6 m/s^2", made(liquid, **size, physics={"gravity": [0.0, -1e6, 0.0]}))
-    yield RunCase(family, "3-D, 1e6 m/s", made(liquid, **size | {"liquid": [COLUMN | {"velocity": [1e6, 1e5, -1e6]}]}))
+        yield case(f"3-D, dt = {dt:g} s", deep(), dt=dt)
+    yield case("3-D, gravity of 1e6 m/s^2", deep(**gravity(0.0, -1e6, 0.0)))
+    yield case("3-D, 1e6 m/s", deep(liquid=[column | {"velocity": [1e6, 1e5, -1e6]}]))
     for ratio in (1e-8, 1e-4, 1e-2, 1.0, 1e4, 1e8):
-        body = {"shape": "box", "min": [0.2, 0.14], "max": [0.4, 0.3], "density": 1000.0 * ratio}
-        yield RunCase(family, f"a body of {ratio:g} of its density", made(liquid, solid=[body], liquid=[POND]), check=bodies_inside)
+        body = box([0.2, 0.14], [0.4, 0.3], density=1000.0 * ratio)
+        yield case(f"a body of {ratio:g} of its density", made(liquid, solid=[body], liquid=pond), check=bodies_inside)
     for speed in (1e-6, 1.0, 1e3):
-        motion = {"kind": "translation", "velocity": [speed, 0.0]}
-        paddle = {"shape": "box", "min": [0.05, -0.1], "max": [0.15, 0.6], "motion": motion}
-        yield RunCase(family, f"a paddle of {speed:g} m/s", made(liquid, solid=[paddle], liquid=[POND]))
-    gap = [{"shape": "box", "min": [0.1, -0.1], "max": [0.4, 0.35]}, {"shape": "box", "min": [0.402, -0.1], "max": [0.9, 0.35]}]
-    yield RunCase(family, "between solids 2 mm apart", made(liquid, solid=gap, liquid=[POND | {"max": [1.0, 0.45]}]))
-
-
-COLUMN = {"shape": "box", "min": [0.0, 0.0, 0.0], "max": [0.25, 0.3, 0.25]}
-POND = {"shape": "box", "min": [0.0, 0.0], "max": [1.0, 0.25]}
+        paddle = box([0.05, -0.1], [0.15, 0.6], motion={"kind": "translation", "velocity": [speed, 0.0]})
+        yield case(f"a paddle of {speed:g} m/s", made(liquid, solid=[paddle], liquid=pond))
+    gap = [box([0.1, -0.1], [0.4, 0.35]), box([0.402, -0.1], [0.9, 0.35])]
+    yield case("between solids 2 mm apart", made(liquid, solid=gap, liquid=[box([0.0, 0.0], [1.0, 0.45])]))
 
 
 def bodies_inside(simulation: ParticleSimulation) -> list[str]:
@@ -220,108 +207,72 @@ def bodies_inside(simulation: ParticleSimulation) -> list[str]:
     return [f"a body is at {body.position}" for body in bodies if not ((body.position >= 0) & (body.position <= size)).all()]
 
 
-FLAT = {"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.03]}
-
-
-def at_rest(simulation: ParticleSimulation) -> list[str]:
+def at_rest(simulation: ParticleSimulation, most: float = 1e-6) -> list[str]:
     """Return that something moves, if it does."""
     speed = float(np.abs(simulation.particles.velocity.numpy()).max())
-    return [] if speed <= 1e-6 else [f"moves at {speed:.1e} m/s"]
+    return [] if speed <= most else [f"moves at {speed:.1e} m/s"]
 
 
 def all_but_at_rest(simulation: ParticleSimulation) -> list[str]:
     """Return that something moves by more than 1 % of a cell in 0.1 s, if it does: sand evens out how it is packed."""
-    speed = float(np.abs(simulation.particles.velocity.numpy()).max())
-    return [] if speed * 0.1 <= 0.01 * simulation.grid.spacing else [f"moves at {speed:.1e} m/s"]
+    return at_rest(simulation, 0.1 * simulation.grid.spacing)
 
 
 def particles_anywhere() -> Iterator[Case]:
     """Yield particles on nodes, on walls, outside, all in one cell, and with values that are no numbers."""
-    family = "particles"
     for kind in (liquid, sand):
-        name = "liquid" if kind is liquid else "sand"
-        more: dict[str, Any] = {"precisions": PRECISIONS if kind is liquid else ("single",)}
-        yield RunCase(family, f"{name} on nodes", made(kind), prepare=on_nodes, **more)
-        yield RunCase(family, f"{name} on walls and in corners", made(kind), prepare=on_walls, **more)
-        yield RunCase(family, f"all {name} at one point", made(kind), prepare=at_one_point, **more)
+        name, case = kind.name, partial(RunCase, "particles", make=made(kind), precisions=kind.precisions)
+        yield case(f"{name} on nodes", prepare=on_nodes)
+        yield case(f"{name} on walls and in corners", prepare=on_walls)
+        yield case(f"all {name} at one point", prepare=put("position", (slice(None), slice(0, 2)), [0.21, 0.11]))
         for where, bad in (("outside", 7.0), ("far outside", 1e30), ("just outside", -1e-3), ("at the far end", 1.0)):
-            yield RunCase(family, f"{name} {where}", made(kind), prepare=placed(bad), expected=ended_with("outside the domain"), **more)
+            yield case(f"{name} {where}", prepare=put("position", (5, 0), bad), expected=ended_with("outside the domain"))
         for bad in (np.nan, np.inf):
-            yield RunCase(family, f"{name} at {bad}", made(kind), prepare=placed(bad), expected=ended_with("position"), **more)
-            yield RunCase(family, f"{name} of speed {bad}", made(kind), prepare=moving(bad), expected=ended_with("velocity"), **more)
-        yield RunCase(family, f"{CROWD:.0e} of {name} in one cell", made(kind), prepare=crowded(CROWD), steps=2, **more)
-    yield RunCase(
-        family, f"{CROWDED:.0e} of liquid in one cell", made(liquid), prepare=crowded(CROWDED), steps=1, budget=90.0, precisions=("mixed",)
-    )
-    yield RunCase(
-        family,
-        "10^6 in a cell that flies",
-        made(liquid, physics={"gravity": [0.0, 0.0]}),
-        prepare=flying(CROWD),
-        check=flies,
-        dt=1e-3,
-        steps=2,
-    )
+            yield case(f"{name} at {bad}", prepare=put("position", (5, 0), bad), expected=ended_with("position"))
+            yield case(f"{name} of speed {bad}", prepare=put("velocity", (5, 0), bad), expected=ended_with("velocity"))
+        yield case(f"{CROWD:.0e} of {name} in one cell", prepare=crowd(CROWD), steps=2)
+    more = {"prepare": crowd(CROWDED), "steps": 1, "budget": 90.0, "precisions": ("mixed",)}
+    yield RunCase("particles", f"{CROWDED:.0e} of liquid in one cell", made(liquid), **more)  # type: ignore[arg-type]
+    weightless = made(liquid, **gravity(0.0, 0.0))
+    yield RunCase("particles", "10^6 in a cell that flies", weightless, prepare=crowd(CROWD, 1.0), check=flies, dt=1e-3, steps=2)
 
 
-def changed(simulation: ParticleSimulation, change: Callable[[np.ndarray, np.ndarray], object]) -> None:
-    """Change positions and velocities in place."""
-    position, velocity = simulation.particles.position.numpy().copy(), simulation.particles.velocity.numpy().copy()
-    change(position, velocity)
-    simulation.particles.position.assign(position)
-    simulation.particles.velocity.assign(velocity)
+def put(field: str, at: Any, value: Any) -> Callable[[ParticleSimulation], None]:
+    """Return what overwrites some of the particles' positions or velocities."""
+
+    def change(simulation: ParticleSimulation) -> None:
+        array = getattr(simulation.particles, field)
+        changed = array.numpy().copy()
+        changed[at] = value
+        array.assign(changed)
+
+    return change
 
 
 def on_nodes(simulation: ParticleSimulation) -> None:
     """Round all positions to nodes of the grid."""
     h = simulation.grid.spacing
-    changed(simulation, lambda x, v: np.copyto(x, np.round(x / h) * h))
+    put("position", ..., np.round(simulation.particles.position.numpy() / h) * h)(simulation)
 
 
 def on_walls(simulation: ParticleSimulation) -> None:
     """Put a third of the particles on the floor, a third on a wall, the first four into corners, as near to the far ends as any comes."""
     right, top = np.array(simulation.scene.domain.size) - MARGIN * simulation.grid.spacing
-
-    def change(x: np.ndarray, v: np.ndarray) -> None:
-        x[::3, 1], x[1::3, 0] = 0.0, 0.0
-        x[:4, :2] = [[0.0, 0.0], [right, 0.0], [0.0, top], [right, top]]
-
-    changed(simulation, change)
+    put("position", (slice(0, None, 3), 1), 0.0)(simulation)
+    put("position", (slice(1, None, 3), 0), 0.0)(simulation)
+    put("position", (slice(0, 4), slice(0, 2)), [[0.0, 0.0], [right, 0.0], [0.0, top], [right, top]])(simulation)
 
 
-def at_one_point(simulation: ParticleSimulation) -> None:
-    """Put all particles at one point."""
-    changed(simulation, lambda x, v: x.__setitem__((slice(None), slice(0, 2)), [0.21, 0.11]))
+def crowd(count: int, speed: float = 0.0) -> Callable[[ParticleSimulation], None]:
+    """Return what adds particles in one cell of the air, with a speed [m/s] along x."""
 
+    def add(simulation: ParticleSimulation) -> None:
+        chance, position, velocity = np.random.default_rng(6007), *(np.zeros((count, 3), dtype=np.float32) for _ in range(2))
+        position[:, :2] = (np.array([11, 5]) + chance.random((count, 2), dtype=np.float32)) * simulation.grid.spacing
+        velocity[:, 0] = speed
+        simulation.particles.append(position, velocity)
 
-def placed(value: float) -> Callable[[ParticleSimulation], object]:
-    """Return what puts one particle there along x."""
-    return lambda simulation: changed(simulation, lambda x, v: x.__setitem__((5, 0), value))
-
-
-def moving(value: float) -> Callable[[ParticleSimulation], object]:
-    """Return what gives one particle that speed along x."""
-    return lambda simulation: changed(simulation, lambda x, v: v.__setitem__((5, 0), value))
-
-
-def crowd(simulation: ParticleSimulation, count: int, speed: float) -> None:
-    """Add particles in one cell of the air."""
-    chance, h = np.random.default_rng(6007), simulation.grid.spacing
-    position = np.zeros((count, 3), dtype=np.float32)
-    position[:, :2] = (np.array([11, 5]) + chance.random((count, 2), dtype=np.float32)) * h
-    velocity = np.zeros((count, 3), dtype=np.float32)
-    velocity[:, 0] = speed
-    simulation.particles.append(position, velocity)
-
-
-def crowded(count: int) -> Callable[[ParticleSimulation], object]:
-    """Return what adds a crowd at rest."""
-    return lambda simulation: crowd(simulation, count, 0.0)
-
-
-def flying(count: int) -> Callable[[ParticleSimulation], object]:
-    """Return what adds a crowd that moves at 1 m/s."""
-    return lambda simulation: crowd(simulation, count, 1.0)
+    return add
 
 
 def flies(simulation: ParticleSimulation) -> list[str]:

@@ -15,16 +15,8 @@ TO_PEERS = ("pyamg_over_this", "over_engine", "over_ours", "over Numba product",
 
 def bounds(old: Figure, new: Figure) -> tuple[float, float]:
     """Return the smallest and the largest ratio new / old that the samples allow."""
-    old_low, old_high = (old.value, old.value) if old.low is None or old.high is None else (old.low, old.high)
-    new_low, new_high = (new.value, new.value) if new.low is None or new.high is None else (new.low, new.high)
+    (old_low, old_high), (new_low, new_high) = old.range, new.range
     return new_low / old_high, new_high / old_low
-
-
-def verdict(low: float, high: float) -> str:
-    """Return what the bounds of a ratio say."""
-    if low > 1:
-        return "more"
-    return "less" if high < 1 else "within noise"
 
 
 def losses(old: Mapping[str, Record], new: Mapping[str, Record], allowed: float = ALLOWED) -> list[str]:
@@ -56,7 +48,8 @@ def comparison(old: Path, new: Path) -> str:
             low, high = bounds(figure, other)
             ratio, noise = other.value / figure.value, f"[{low:.3f}, {high:.3f}]"
             numbers = f"{figure.value:>11.4g} {other.value:>11.4g} {ratio:>8.3f}"
-            lines.append(f"{name:<72} {label:<18} {numbers}  {noise:<17} {verdict(low, high)}")
+            change = "more" if low > 1 else "less" if high < 1 else "within noise"
+            lines.append(f"{name:<72} {label:<18} {numbers}  {noise:<17} {change}")
     if len(lines) == 1:
         raise ValueError(f"{old} and {new} have no figure in common")
     lost = losses(before, after)

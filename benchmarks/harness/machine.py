@@ -30,16 +30,15 @@ COPIED = 1 << 26  # float32 elements of the arrays that are copied: 256 MiB, bey
 def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> Record:
     """Return the record of the machine, with its measured copy bandwidth (bytes read and bytes written)."""
     chosen = wp.get_device(device)
-    hardware = {
-        "cpu": cpu_model(),
-        "cores": os.cpu_count(),
-        "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
-        "device": f"{chosen.alias} {chosen.name}" if chosen.is_cuda else chosen.alias,
-        "load": f"{os.getloadavg()[0]:.1f}",
-    }
     facts = {
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "hardware": hardware,
+        "hardware": {
+            "cpu": cpu_model(),
+            "cores": os.cpu_count(),
+            "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
+            "device": f"{chosen.alias} {chosen.name}" if chosen.is_cuda else chosen.alias,
+            "load": f"{os.getloadavg()[0]:.1f}",
+        },
         "versions": versions(),
         SOURCE: source_digest(),
         "peers": {name: _version(name) for name in PEERS},

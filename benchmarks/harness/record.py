@@ -133,11 +133,7 @@ def read_json(path: Path) -> dict[str, Record]:
     """
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
-        records = [Record(r["name"], {k: Figure.from_dict(f) for k, f in r["figures"].items()}, _facts(r)) for r in kept]
+        figures = [{k: Figure.from_dict(f) for k, f in r.pop("figures").items()} for r in kept]
+        return {name: Record(name, own, r) for r, own in zip(kept, figures, strict=True) if (name := r.pop("name"))}
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: no results of a benchmark: {error}") from error
-    return {record.name: record for record in records}
-
-
-def _facts(kept: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in kept.items() if k not in ("name", "figures")}

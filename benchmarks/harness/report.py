@@ -27,8 +27,7 @@ def write(name: str, title: str, results: Results, out: Path) -> list[str]:
     write_json(out / f"{name}.json", results.records)
     images = draw(results.charts, out, name)
     write_markdown(out / f"{name}.md", title, machine, results.tables, images)
-    missing = [] if present("matplotlib") else [NO_PLOTS]
-    return [*missing, f"wrote {out / name}.json, {name}.md and {len(images)} plots"]
+    return [*([] if present("matplotlib") else [NO_PLOTS]), f"wrote {out / name}.json, {name}.md and {len(images)} plots"]
 
 
 def write_markdown(path: Path, title: str, machine: Record, tables: Sequence[Table], images: Sequence[Path]) -> None:
@@ -95,12 +94,7 @@ def _lines(axes: Axes, chart: Lines) -> None:
             axes.plot(x, y, marker="o", linestyle="none", fillstyle="none", color="black", label=label)
         else:
             axes.plot(x, y, marker="." if len(x) < MARKERS else "", linestyle=STYLES[number // 10 % len(STYLES)], label=label)
-    if "y" in chart.log:
-        axes.set_yscale("log")
-    if "x" in chart.log:
-        axes.set_xscale("log")
-    axes.set_xlabel(chart.x_label)
-    axes.set_ylabel(chart.y_label)
+    axes.set(**{f"{axis}scale": "log" for axis in chart.log}, xlabel=chart.x_label, ylabel=chart.y_label)
     axes.grid(alpha=0.3)
     beside = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)} if len(chart.curves) >= CROWDED else {}
     axes.legend(fontsize=7, **beside)

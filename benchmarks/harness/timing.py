@@ -6,10 +6,11 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
+from unittest.mock import patch
 
 import warp as wp
 
@@ -43,12 +44,20 @@ class Figure:
         """Return the median with its range."""
         return Figure(statistics.median(samples), unit, min(samples), max(samples), len(samples))
 
+    @staticmethod
+    def least(samples: Sequence[float], unit: str = "") -> Figure:
+        """Return the smallest sample with the range."""
+        return replace(Figure.of(samples, unit), value=min(samples))
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The smallest and the largest sample."""
+        return (self.value, self.value) if self.low is None or self.high is None else (self.low, self.high)
+
     def as_dict(self) -> dict[str, float | int | str]:
         """Return what a file keeps."""
-        kept: dict[str, float | int | str] = {"value": self.value, "unit": self.unit}
-        if self.low is not None and self.high is not None:
-            kept |= {"min": self.low, "max": self.high, "samples": self.samples}
-        return kept
+        more = {} if self.low is None or self.high is None else {"min": self.low, "max": self.high, "samples": self.samples}
+        return {"value": self.value, "unit": self.unit, **more}
 
     @staticmethod
     def from_dict(kept: Mapping[str, float | int | str]) -> Figure:
@@ -111,7 +120,6 @@ def timed(device: str, functions: dict[str, tuple[ModuleType | type, str]]) -> I
         Seconds of the calls so far, by label.
     """
     seconds: dict[str, list[float]] = defaultdict(list)
-    plain = {label: getattr(module, name) for label, (module, name) in functions.items()}
 
     def watch(label: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **options: Any) -> Any:
@@ -125,10 +133,7 @@ def timed(device: str, functions: dict[str, tuple[ModuleType | type, str]]) -> I
 
         return call
 
-    for label, (module, name) in functions.items():
-        setattr(module, name, watch(label, plain[label]))
-    try:
-        yield seconds
-    finally:
+    with ExitStack() as stack:
         for label, (module, name) in functions.items():
-            setattr(module, name, plain[label])
+            stack.enter_context(patch.object(module, name, watch(label, getattr(module, name))))
+        yield seconds

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import importlib
 import json
 import multiprocessing
 import os
@@ -27,6 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 HANGS = 40  # seconds of processor time that no single test takes
 PYTEST = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--hypothesis-seed=7"]
 FILES = (1, 4)  # of tests: these first, with one of its parameters for each function, then these with all where a mutant survives
+PRELOADED = ("pyamg", "pydantic", "pytest", "rich", "scipy.sparse.linalg", "typer", "warp")  # Warp not initialized: no threads, no device
 TREE: Path
 SECONDS = 5.0
 SOUND: set[str] = set()  # tests that pass where nothing is changed, and those that do not
@@ -39,13 +41,8 @@ def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) 
     TREE, FILES, SECONDS = Path(tempfile.mkdtemp(dir=folder)), files, seconds
     ignore = shutil.ignore_patterns(".git", ".venv*", "out", "build", "results", ".*_cache", ".hypothesis")
     shutil.copytree(ROOT, TREE, ignore=ignore, dirs_exist_ok=True)
-    import pyamg  # noqa: F401
-    import pydantic  # noqa: F401
-    import pytest  # noqa: F401
-    import rich  # noqa: F401
-    import scipy.sparse.linalg  # noqa: F401
-    import typer  # noqa: F401
-    import warp  # noqa: F401  # not yet initialized: no threads, no device
+    for name in PRELOADED:
+        importlib.import_module(name)
 
 
 class Budget:
@@ -173,9 +170,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=ROOT / "out/mutants", help="folder of the report; of a run that was stopped: go on")
     parser.add_argument("--again", type=Path, help="a mutants.json whose survivors are tried, instead of new ones")
     parser.add_argument("--files", type=int, nargs=2, default=FILES, help="so many test files, then so many where a mutant survives")
-    parser.add_argument(
-        "--seconds", type=float, default=5.0, help="of processor time for the tests of a file: one that starts later is left out"
-    )
+    parser.add_argument("--seconds", type=float, default=5.0, help="of a file's tests on a processor: those that start later are left out")
     return parser.parse_args()
 
 

@@ -98,8 +98,7 @@ def measure(options: Options, out: Path) -> Results:
     n = max(sizes)
     asked = Table("Who was asked", ["library", "version"], [[name, text] for name, text in there.versions.items()])
     tables = [_targets(records, n), asked, *(_table(m, records) for m in sizes)]
-    charts = [Bars(bounds, f"{bounds}, {m}^3, cold, to {RTOL:g}", "s", values, logarithmic=True) for m, bounds, values in _bars(records)]
-    return Results(records, tables, list(charts))
+    return Results(records, tables, [_bars(bounds, records) for bounds in BOUNDS])
 
 
 def _measure_size(n: int, there: Roster, seconds: dict[tuple[str, str], tuple[int, float]], options: Options) -> list[Record]:
@@ -131,27 +130,16 @@ def _measure_size(n: int, there: Roster, seconds: dict[tuple[str, str], tuple[in
 
 
 def _engine(case: Case) -> Record:
-    facts = {
-        "n": case.scene.n,
-        "bounds": case.bounds,
-        "method": case.method,
-        "precision": "float64, corrections float32",
-        "settings": "defaults",
-    }
-    figures = case.figures()
-    return Record(f"{case.scene.n}^3 {case.bounds} {case.method}", figures, facts)
+    facts = {"n": case.scene.n, "bounds": case.bounds, "method": case.method, "precision": "float64, corrections float32"}
+    return Record(f"{case.scene.n}^3 {case.bounds} {case.method}", case.figures(), facts | {"settings": "defaults"})
 
 
 def _targets(records: Sequence[Record], n: int) -> Table:
     """Return the figures to reach at the largest size."""
 
     def least(bounds: str, *names: str) -> Figure | None:
-        there = [
-            r.figures["over_engine"]
-            for r in records
-            if r.facts.get("n") == n and r.facts["bounds"] == bounds and r.facts["method"].startswith(names) and "over_engine" in r.figures
-        ]
-        return min(there, key=lambda f: f.value, default=None)
+        here = [r for r in records if r.facts.get("n") == n and r.facts["bounds"] == bounds and r.facts["method"].startswith(names)]
+        return min((r.figures["over_engine"] for r in here if "over_engine" in r.figures), key=lambda f: f.value, default=None)
 
     targets = [
         Target("linear: PyAMG's best", 20, least("linear", "PyAMG"), " x", True),
@@ -182,12 +170,10 @@ def _table(n: int, records: Sequence[Record]) -> Table:
     return Table(f"{n}^3 cells", [*columns, "x the engine's time"], rows, remark)
 
 
-def _bars(records: Sequence[Record]) -> list[tuple[int, str, dict[str, float]]]:
-    """Return seconds by solver at the largest size where there are any, for each kind of bounds."""
-    shown = []
-    for bounds in BOUNDS:
-        here = [r for r in records if r.name != MACHINE and r.facts["bounds"] == bounds and "total" in r.figures]
-        n = max((r.facts["n"] for r in here if r.facts["method"] != ENGINE), default=max((r.facts["n"] for r in here), default=0))
-        values = {r.facts["method"]: r.value("total") or 0.0 for r in here if r.facts["n"] == n}
-        shown.append((n, bounds, dict(sorted(values.items(), key=lambda item: item[1]))))
-    return shown
+def _bars(bounds: str, records: Sequence[Record]) -> Bars:
+    """Return seconds by solver at the largest size where there are any."""
+    here = [r for r in records if r.name != MACHINE and r.facts["bounds"] == bounds and "total" in r.figures]
+    n = max((r.facts["n"] for r in here if r.facts["method"] != ENGINE), default=max((r.facts["n"] for r in here), default=0))
+    values = {r.facts["method"]: r.value("total") or 0.0 for r in here if r.facts["n"] == n}
+    ordered = dict(sorted(values.items(), key=lambda item: item[1]))
+    return Bars(bounds, f"{bounds}, {n}^3, cold, to {RTOL:g}", "s", ordered, logarithmic=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import warnings
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,26 +14,15 @@ from warp_lcp.benchmarks.peers.peer import Answer, Question
 CG_PATIENCE, OSQP_PATIENCE = 20_000, 100_000  # iterations
 
 
-def pyamg_aggregation(question: Question, tolerance: float) -> Answer:
-    """Smoothed aggregation before CG, all defaults."""
-    import pyamg
+def pyamg(question: Question, tolerance: float, *, build: str = "smoothed_aggregation_solver") -> Answer:
+    """One of PyAMG's hierarchies before CG, all defaults."""
+    import pyamg as library
 
-    return _pyamg(pyamg.smoothed_aggregation_solver, question, tolerance)
-
-
-def pyamg_classical(question: Question, tolerance: float) -> Answer:
-    """Ruge-Stueben before CG, all defaults."""
-    import pyamg
-
-    return _pyamg(pyamg.ruge_stuben_solver, question, tolerance)
-
-
-def _pyamg(build: Any, question: Question, tolerance: float) -> Answer:
     A, residuals = sp.csr_matrix(question.matrix), list[float]()
     begun = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # its own, of its use of SciPy
-        hierarchy = build(A)
+        hierarchy = getattr(library, build)(A)
         middle = time.perf_counter()
         x = hierarchy.solve(-question.b, tol=tolerance, accel="cg", residuals=residuals)
     return Answer(x, middle - begun, time.perf_counter() - middle, len(residuals) - 1)

@@ -22,14 +22,15 @@ VARIABLE = "WARP_LCP_PETSC_PYTHON"  # environment variable that names the interp
 PROBE_SECONDS = 120.0
 DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"  # where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
 CYCLE = "V-cycle, Galerkin, SSOR"
-METHODS = {  # name, method of the worker, problems, cells a side beyond which it is not asked, settings
-    "PETSc CG+MG": ("cg-mg", BOUNDS[:1], 256, f"geometric 2x2x2 aggregates, {CYCLE}"),
-    "PETSc CG+GAMG": ("cg-gamg", BOUNDS[:1], 256, "-pc_type gamg"),
-    "PETSc CG+BoomerAMG": ("cg-boomeramg", BOUNDS[:1], 256, "-pc_type hypre"),
-    "PETSc CG+ICC": ("cg-icc", BOUNDS[:1], 128, "-pc_type icc"),
-    "PETSc SNESVI+MG": ("snesvi-mg", INEQUALITIES, 128, f"vinewtonrsls, -ksp_rtol 1e-2, aggregates of the free set, {CYCLE}"),
-    "PETSc SNESVI+ICC": ("snesvi-icc", INEQUALITIES, 128, "vinewtonrsls, -ksp_rtol 1e-2 -pc_type icc"),
-    "PETSc SNESVI+BoomerAMG": ("snesvi-boomeramg", INEQUALITIES, 64, "vinewtonrsls, -ksp_rtol 1e-2 -pc_type hypre"),
+ICC, HYPRE = {"pc_type": "icc"}, {"pc_type": "hypre", "pc_hypre_type": "boomeramg"}
+METHODS: dict[str, tuple[dict[str, str], tuple[str, ...], int, str]] = {  # options, problems, cells a side beyond which it is not asked
+    "PETSc CG+MG": ({}, BOUNDS[:1], 256, f"geometric 2x2x2 aggregates, {CYCLE}"),
+    "PETSc CG+GAMG": ({"pc_type": "gamg"}, BOUNDS[:1], 256, "-pc_type gamg"),
+    "PETSc CG+BoomerAMG": (HYPRE, BOUNDS[:1], 256, "-pc_type hypre"),
+    "PETSc CG+ICC": (ICC, BOUNDS[:1], 128, "-pc_type icc"),
+    "PETSc SNESVI+MG": ({}, INEQUALITIES, 128, f"vinewtonrsls, -ksp_rtol 1e-2, aggregates of the free set, {CYCLE}"),
+    "PETSc SNESVI+ICC": (ICC, INEQUALITIES, 128, "vinewtonrsls, -ksp_rtol 1e-2 -pc_type icc"),
+    "PETSc SNESVI+BoomerAMG": (HYPRE, INEQUALITIES, 64, "vinewtonrsls, -ksp_rtol 1e-2 -pc_type hypre"),
 }
 
 
@@ -72,10 +73,10 @@ def peers(folder: Path) -> Iterator[tuple[list[Peer], str]]:
         yield [], missing()
         return
     worker = Worker("petsc4py", [python, str(Path(__file__).with_name("petsc_worker.py"))])
-    desk = Desk(worker, folder)
+    ask = partial(asked, worker=worker, folder=folder)
     try:
-        made = [Peer(name, "petsc", partial(desk.solve, m), bounds, most, text) for name, (m, bounds, most, text) in METHODS.items()]
-        yield made, worker.version
+        found = METHODS.items()
+        yield [Peer(name, "petsc", partial(ask, options=o), bounds, most, text) for name, (o, bounds, most, text) in found], worker.version
     finally:
         worker.close()
 
@@ -130,39 +131,22 @@ class Worker:
         return reply
 
 
-class Desk:
-    """Hands problems to a worker through files: one for each scene, written when it is first asked about.
+def asked(question: Question, tolerance: float, *, worker: Worker, folder: Path, options: Mapping[str, str]) -> Answer:
+    """Ask a worker through files: one for each scene, written when it is first asked about.
 
-    Args:
-        worker: who is asked.
-        folder: of the files.
+    Raises:
+        PeerFailed: it gave no answer.
     """
-
-    def __init__(self, worker: Worker, folder: Path) -> None:
-        self.worker, self.folder = worker, folder
-        self._written = 0
-
-    def solve(self, method: str, question: Question, tolerance: float) -> Answer:
-        """Ask the worker.
-
-        Raises:
-            PeerFailed: it gave no answer.
-        """
-        n, answer = question.scene.n, self.folder / "x.npy"
-        path = self.folder / f"{n}.npz"
-        if n != self._written:
-            for old in self.folder.glob("*.npz"):
-                old.unlink()
-            self._write(path, question)
-            self._written = n
-        request = {"method": method, "problem": str(path), "answer": str(answer), "tolerance": tolerance, "bounds": question.bounds}
-        reply = self.worker.ask(request)
-        if reply["reason"] <= 0:
-            raise PeerFailed(f"{method} did not converge: reason {reply['reason']} after {reply['iterations']} iterations")
-        return Answer(np.load(answer), reply["setup"], reply["solve"], reply["iterations"], reply["linear_iterations"])
-
-    def _write(self, path: Path, question: Question) -> None:
-        A = question.matrix
+    path, answer, A = folder / f"{question.scene.n}.npz", folder / "x.npy", question.matrix
+    if not path.exists():
+        for old in folder.glob("*.npz"):
+            old.unlink()
         fields: dict[str, Any] = {f"lower_{name}": Question(question.scene, name).lower for name in INEQUALITIES}
         fields |= {"data": A.data, "indices": A.indices, "indptr": A.indptr, "shape": np.array(question.scene.cells.shape)}
         np.savez(path, b=question.b, where=question.where, **fields)
+    method = "inequality" if question.bounds in INEQUALITIES else "linear"
+    request = {"method": method, "options": dict(options), "tolerance": tolerance, "bounds": question.bounds}
+    reply = worker.ask(request | {"problem": str(path), "answer": str(answer)})
+    if reply["reason"] <= 0:
+        raise PeerFailed(f"PETSc did not converge: reason {reply['reason']} after {reply['iterations']} iterations")
+    return Answer(np.load(answer), reply["setup"], reply["solve"], reply["iterations"], reply["linear_iterations"])

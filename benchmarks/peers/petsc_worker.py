@@ -10,8 +10,9 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,6 @@ NEWTON_STEPS = 200
 LINEAR_ITERATIONS = 10_000
 # two sweeps of symmetric SOR per level or PETSc's own choices; of what was tried these take the least time on the splash
 MULTIGRID = {"pc_mg_galerkin": "both", "mg_levels_ksp_type": "richardson", "mg_levels_ksp_max_it": 1, "mg_levels_pc_type": "sor"}
-HYPRE = {"pc_type": "hypre", "pc_hypre_type": "boomeramg"}
-GAMG, ICC = {"pc_type": "gamg"}, {"pc_type": "icc"}
 LOOSE = {"ksp_rtol": 1e-2}  # of a Newton step; tighter ones take fewer steps and more time
 
 
@@ -48,33 +47,18 @@ class Problem:
         self.A.setOption(PETSc.Mat.Option.SPD, True)
 
 
-class Desk:
-    """Keeps the problem that was asked for last."""
-
-    def __init__(self) -> None:
-        self.path = ""
-        self.problem: Problem | None = None
-
-    def get(self, request: Request) -> Problem:
-        """Return the problem of a request."""
-        if request["problem"] != self.path:
-            self.path, self.problem = request["problem"], Problem(request["problem"])
-        assert self.problem is not None
-        return self.problem
+problem_of = lru_cache(maxsize=1)(Problem)  # the one that was asked for last
 
 
-class Settings:
-    """PETSc options that hold while a solver reads them."""
-
-    def __init__(self, options: dict[str, Any]) -> None:
-        self.options = options
-
-    def __enter__(self) -> None:
-        for name, value in self.options.items():
-            PETSc.Options()[name] = value
-
-    def __exit__(self, *_: object) -> None:
-        for name in self.options:
+@contextmanager
+def options(values: dict[str, Any]) -> Iterator[None]:
+    """Set PETSc options that hold while a solver reads them."""
+    for name, value in values.items():
+        PETSc.Options()[name] = value
+    try:
+        yield
+    finally:
+        for name in values:
             PETSc.Options().delValue(name)
 
 
@@ -104,13 +88,13 @@ def give(pc: Any, prolongations: list[Any]) -> None:
         pc.setMGInterpolation(number, P)
 
 
-def linear(request: Request, desk: Desk, options: dict[str, Any]) -> Reply:
-    """Solve A x = -b by CG; without `pc_type` among the options with geometric multigrid."""
-    problem = desk.get(request)
+def linear(request: Request) -> Reply:
+    """Solve A x = -b by CG; without options with geometric multigrid."""
+    problem, own = problem_of(request["problem"]), request["options"]
     right = PETSc.Vec().createWithArray(-problem.b)
     x = right.duplicate()
-    transfers = [] if "pc_type" in options else aggregates(problem.where, problem.shape)
-    with Settings(options):
+    transfers = [] if own else aggregates(problem.where, problem.shape)
+    with options(own or MULTIGRID):
         begun = time.perf_counter()
         ksp = PETSc.KSP().create()
         ksp.setOperators(problem.A)
@@ -147,7 +131,7 @@ class ReducedMultigrid:
         self.ksp.setOperators(A)
         self.ksp.setType("preonly")
         give(self.ksp.getPC(), transfers)
-        with Settings(MULTIGRID):
+        with options(MULTIGRID):
             self.ksp.setFromOptions()
             self.ksp.setUp()
 
@@ -156,9 +140,9 @@ class ReducedMultigrid:
         self.ksp.solve(r, z)
 
 
-def inequality(request: Request, desk: Desk, options: dict[str, Any]) -> Reply:
-    """Solve the LCP by SNESVI's reduced-space active-set Newton method with CG; without `pc_type` with geometric multigrid."""
-    problem = desk.get(request)
+def inequality(request: Request) -> Reply:
+    """Solve the LCP by SNESVI's reduced-space active-set Newton method with CG; without options with geometric multigrid."""
+    problem = problem_of(request["problem"])
     lower = problem.lower[request["bounds"]]
     b = PETSc.Vec().createWithArray(problem.b)
     low = PETSc.Vec().createWithArray(np.where(np.isinf(lower), PETSc.NINFINITY, lower))
@@ -169,7 +153,7 @@ def inequality(request: Request, desk: Desk, options: dict[str, Any]) -> Reply:
         problem.A.mult(x, y)
         y.axpy(1.0, b)
 
-    with Settings(LOOSE | options):
+    with options(LOOSE | request["options"]):
         begun = time.perf_counter()
         snes = PETSc.SNES().create()
         snes.setType("vinewtonrsls")
@@ -179,7 +163,7 @@ def inequality(request: Request, desk: Desk, options: dict[str, Any]) -> Reply:
         snes.setTolerances(rtol=request["tolerance"], atol=0.0, stol=0.0, max_it=NEWTON_STEPS)
         snes.ksp.setType("cg")
         own = None
-        if "pc_type" not in options:
+        if not request["options"]:
             own = ReducedMultigrid(problem, snes)
             snes.ksp.getPC().setType("python")
             snes.ksp.getPC().setPythonContext(own)
@@ -223,20 +207,5 @@ def serve(version: str, methods: Mapping[str, Callable[[Request], Reply]], failu
             send({"error": (str(error).splitlines() or [type(error).__name__])[-1]})
 
 
-def main() -> None:
-    """Serve."""
-    desk = Desk()
-    methods = {
-        "cg-mg": partial(linear, desk=desk, options=MULTIGRID),
-        "cg-gamg": partial(linear, desk=desk, options=GAMG),
-        "cg-boomeramg": partial(linear, desk=desk, options=HYPRE),
-        "cg-icc": partial(linear, desk=desk, options=ICC),
-        "snesvi-mg": partial(inequality, desk=desk, options={}),
-        "snesvi-icc": partial(inequality, desk=desk, options=ICC),
-        "snesvi-boomeramg": partial(inequality, desk=desk, options=HYPRE),
-    }
-    serve(".".join(map(str, PETSc.Sys.getVersion())), methods, (PETSc.Error,))
-
-
 if __name__ == "__main__":
-    main()
+    serve(".".join(map(str, PETSc.Sys.getVersion())), {"linear": linear, "inequality": inequality}, (PETSc.Error,))

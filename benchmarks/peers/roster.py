@@ -32,21 +32,36 @@ class Roster:
     versions: dict[str, str]  # of all libraries that were looked for; of missing ones, how to get them
 
 
+def _linear(device: str) -> list[Peer]:
+    """Return the peers of the linear solve in this process."""
+    warp, classical = partial(libraries.warp_cg, device=device), partial(libraries.pyamg, build="ruge_stuben_solver")
+    most = 256 if device.startswith("cuda") else 32  # Warp's CG takes 15 ms an iteration at 24^3 on the CPU
+    return [
+        Peer("PyAMG SA-CG", "pyamg", libraries.pyamg, most=256),
+        Peer("PyAMG RS-CG", "pyamg", classical, most=256),
+        Peer("AMGCL SA-CG", "pyamgcl", libraries.amgcl, most=256, settings="smoothed aggregation, ILU(0), one thread"),
+        Peer("SciPy CG", "scipy", libraries.scipy_cg, most=128, settings="no preconditioner"),
+        Peer("Warp CG", "warp.optim.linear", warp, most=most, settings="diagonal, BSR, one thread a row"),
+        Peer("CuPy CG", "cupy", libraries.cupy_cg, settings="no preconditioner"),
+    ]
+
+
+QUADRATIC = (
+    Peer("OSQP", "osqp", libraries.osqp, INEQUALITIES, FACTORS, "defaults, no polishing"),
+    Peer("PIQP", "piqp", libraries.piqp, INEQUALITIES, FACTORS, "sparse"),
+    Peer("Clarabel", "clarabel", libraries.clarabel, INEQUALITIES, FACTORS, "one thread"),
+)
+
+
 @contextmanager
 def roster(device: str) -> Iterator[Roster]:
     """Find the peers; those in interpreters of their own run until the end of the block."""
-    cuda = device.startswith("cuda")
     with tempfile.TemporaryDirectory(prefix="peers-") as folder, petsc.peers(Path(folder)) as (others, petsc_version):
-        peers = [*_linear(device), *_quadratic(), *others]
         libraries = ["scipy", "pyamg", "pyamgcl", "osqp", "piqp", "clarabel", "numba", "cupy", "siconos"]
         versions = {name: _version(name) for name in libraries} | {"petsc": petsc_version, "warp.optim.linear": version("warp-lang")}
-        if not cuda:
+        if not device.startswith("cuda"):
             versions["cupy"] = f"not asked: {device} is no CUDA device"
-        yield Roster(tuple(p for p in peers if p.library == "petsc" or _present(versions[p.library])), versions)
-
-
-def _present(text: str) -> bool:
-    return text[:1].isdigit()
+        yield Roster(tuple(p for p in (*_linear(device), *QUADRATIC, *others) if versions[p.library][:1].isdigit()), versions)
 
 
 def _version(name: str) -> str:
@@ -58,27 +73,3 @@ def _version(name: str) -> str:
         return version(name)
     except PackageNotFoundError:
         return "0 (no distribution tells)"
-
-
-def _linear(device: str) -> list[Peer]:
-    """Return the peers of the linear solve in this process."""
-    most = 256 if device.startswith("cuda") else 32  # Warp's CG takes 15 ms an iteration at 24^3 on the CPU
-    return [
-        Peer("PyAMG SA-CG", "pyamg", libraries.pyamg_aggregation, most=256),
-        Peer("PyAMG RS-CG", "pyamg", libraries.pyamg_classical, most=256),
-        Peer("AMGCL SA-CG", "pyamgcl", libraries.amgcl, most=256, settings="smoothed aggregation, ILU(0), one thread"),
-        Peer("SciPy CG", "scipy", libraries.scipy_cg, most=128, settings="no preconditioner"),
-        Peer(
-            "Warp CG", "warp.optim.linear", partial(libraries.warp_cg, device=device), most=most, settings="diagonal, BSR, one thread a row"
-        ),
-        Peer("CuPy CG", "cupy", libraries.cupy_cg, settings="no preconditioner"),
-    ]
-
-
-def _quadratic() -> list[Peer]:
-    """Return the solvers of quadratic programs."""
-    return [
-        Peer("OSQP", "osqp", libraries.osqp, INEQUALITIES, FACTORS, "defaults, no polishing"),
-        Peer("PIQP", "piqp", libraries.piqp, INEQUALITIES, FACTORS, "sparse"),
-        Peer("Clarabel", "clarabel", libraries.clarabel, INEQUALITIES, FACTORS, "one thread"),
-    ]

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from warp_lcp.benchmarks.harness.machine import machine
-from warp_lcp.benchmarks.harness.record import Record, Results
+from warp_lcp.benchmarks.harness.record import Results
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.tradeoff.charts import preset_table, run_chart, run_table, solve_chart, solve_table
-from warp_lcp.benchmarks.tradeoff.runs import FRAMES, Run, Runs
+from warp_lcp.benchmarks.tradeoff.runs import FRAMES, Runs
 from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
 from warp_lcp.benchmarks.tradeoff.solves import measure_solves
-from warp_lcp.benchmarks.tradeoff.steps import measure_steps
 from warp_lcp.scene.presets import PRESETS, price_table
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import StepFailed
@@ -41,24 +39,16 @@ def _measure_scene(name: str, resolution: int, frames: int, options: Options, re
     settings = settings_of(scene.scene.simulator)
     presets = [Setting(f"preset {preset}", _overrides(scene.scene.simulator, preset)) for preset in PRESETS]
     measured = runs.measure([*presets, *settings])
-    own = [_record(scene.scene.name, run, runs) for run in measured]
+    own = [runs.record(run) for run in measured]
     if not any(run.trial for run in measured):
         raise StepFailed(f"{name}: no setting ran: {measured[0].failed}")
-    solves = measure_steps(scene, options, frames) if scene.scene.simulator == "granular" else measure_solves(scene, options, frames)
+    solves, title = measure_solves(scene, options, frames), scene.scene.name
     results.records.extend([*own, *solves])
-    results.tables.extend([preset_table(scene.scene.name, own), run_table(scene.scene.name, own), solve_table(scene.scene.name, solves)])
-    results.charts.extend([*run_chart(scene.scene.name, own), *solve_chart(scene.scene.name, solves)])
+    results.tables.extend([preset_table(title, own), run_table(title, own), solve_table(title, solves)])
+    results.charts.extend([*run_chart(title, own), *solve_chart(title, solves)])
 
 
 def _overrides(simulator: str, preset: str) -> tuple[str, ...]:
     """Return a preset's settings but for those of models that a scene may not have."""
     settings = price_table()[simulator].presets[preset].settings
     return tuple(f"{key}={value:g}" for key, value in settings.items() if not key.startswith("density_correction"))
-
-
-def _record(scene: str, run: Run, runs: Runs) -> Record:
-    facts: dict[str, Any] = {"scene": scene, "kind": "run", "curve": run.setting.curve, "settings": run.setting.name}
-    resolution = round(run.setting.scale * runs.resolution)
-    facts |= {"device": runs.options.device, "frames": runs.frames, "resolution": resolution, "scale": run.setting.scale}
-    facts |= {"failed": run.failed} if run.failed else {}
-    return Record(f"{scene} {run.setting.curve}: {run.setting.name}", runs.figures(run), facts)

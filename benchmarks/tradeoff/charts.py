@@ -5,12 +5,19 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 
-from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Table
+from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Table, shown
 from warp_lcp.benchmarks.tradeoff.runs import front_of
 
 PARETO = "Pareto front"
 FINEST = "distance_to_finest"
 SMALLEST = 1e-16  # that a logarithmic axis shows
+RUN_REMARK = (
+    "seconds: the least of all rounds, of the steps alone. distance: share of the mass that is elsewhere than in a run of the same "
+    "resolution with the smallest steps and tolerance, in boxes of two cells of the scene, the mean over the frames compared; to the "
+    "finest: than in such a run of twice the resolution. Pareto: no other setting of this resolution is faster and nearer to its "
+    "reference; Pareto, all: no other one at all is faster and nearer to the finest. energy, front: largest relative and last "
+    "difference from the reference. volume: its growth. packing: of the densest cell of sand."
+)
 
 
 def run_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
@@ -27,48 +34,17 @@ def solve_chart(scene: str, records: Sequence[Record]) -> list[Chart]:
 
 def _chart(scene: str, figure: str, label: str, kind: str, records: Sequence[tuple[str, Record]]) -> list[Chart]:
     """Return the chart of a figure over seconds, none where no record has it."""
-    curves: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
-    points = []
+    points = defaultdict[str, list[tuple[float, float]]](list)
     for curve, r in records:
         if (seconds := r.value("seconds")) is not None and (error := r.value(figure)) is not None:
-            points.append((seconds, max(abs(error), SMALLEST)))
-            for axis, value in zip(curves[curve], points[-1], strict=True):
-                axis.append(value)
+            points[curve].append((seconds, max(abs(error), SMALLEST)))
     if not points:
         return []
-    best = [points[i] for i in front_of(points)]
-    curves[PARETO] = ([p[0] for p in best], [p[1] for p in best])
+    every = [point for curve in points.values() for point in curve]
+    points[PARETO] = [every[i] for i in front_of(every)]
+    curves = {curve: ([x for x, _ in own], [y for _, y in own]) for curve, own in points.items()}
     name = f"{scene}-{kind}-{figure.replace('_', '-')}"
     return [Lines(name, f"{scene}: {label}", f"seconds of a {kind}", label, curves, marked=frozenset({PARETO}))]
-
-
-def run_table(scene: str, records: Sequence[Record]) -> Table:
-    """Return the runs, the Pareto front of seconds and distance marked."""
-    ran = [r for r in records if r.figures]
-    own = [r for r in ran if r.facts["scale"] == 1.0]
-    best, best_of_all = _front(own, "distance"), _front(ran, FINEST)
-    columns = ["settings", "", "seconds", "steps", "iterations", "MB", "distance", "to the finest", "energy", "front [m]", "volume"]
-    columns.append("packing")
-    rows = []
-    for r in records:
-        preset = str(r.facts["curve"]).startswith("preset ")
-        name = f"{r.facts['curve']}: {r.facts['settings']}" if preset else str(r.facts["settings"])
-        if not r.figures:
-            rows.append([name, "failed", *[""] * (len(columns) - 3), str(r.facts["failed"])[:120]])
-            continue
-        f = {key: figure.value for key, figure in r.figures.items()}
-        seen = [f"{f['distance']:.4f}", f"{f['distance_to_finest']:.4f}", f"{f['energy_error']:.4f}", f"{f['front_error']:+.4f}"]
-        more = [f"{f[key]:+.4f}" if key in f else "" for key in ("volume_drift", "packing")]
-        cost = [f"{f['seconds']:.3f}", f"{f['steps']:.0f}", f"{f['iterations']:.0f}", f"{f['bytes'] / 1e6:.1f}"]
-        rows.append([name, _mark(r, best, best_of_all), *cost, *seen, *more])
-    remark = (
-        "seconds: the least of all rounds, of the steps alone. distance: share of the mass that is elsewhere than in a run of the same "
-        "resolution with the smallest steps and tolerance, in boxes of two cells of the scene, the mean over the frames compared; to the "
-        "finest: than in such a run of twice the resolution. Pareto: no other setting of this resolution is faster and nearer to its "
-        "reference; Pareto, all: no other one at all is faster and nearer to the finest. energy, front: largest relative and last "
-        "difference from the reference. volume: its growth. packing: of the densest cell of sand."
-    )
-    return Table(f"{scene}: runs", columns, rows, remark)
 
 
 def _front(records: Sequence[Record], figure: str) -> set[str]:
@@ -76,8 +52,23 @@ def _front(records: Sequence[Record], figure: str) -> set[str]:
     return {records[i].name for i in front_of([(r.figures["seconds"].value, r.figures[figure].value) for r in records])}
 
 
-def _mark(record: Record, best: set[str], best_of_all: set[str]) -> str:
-    return ", ".join(["Pareto"] * (record.name in best) + ["Pareto, all"] * (record.name in best_of_all))
+def run_table(scene: str, records: Sequence[Record]) -> Table:
+    """Return the runs, the Pareto front of seconds and distance marked."""
+    ran = [r for r in records if r.figures]
+    best, best_of_all = _front([r for r in ran if r.facts["scale"] == 1.0], "distance"), _front(ran, FINEST)
+    columns = ["settings", "", "seconds", "steps", "iterations", "MB", "distance", "to the finest", "energy", "front [m]", "volume"]
+    rows = []
+    for r in records:
+        curve, settings = str(r.facts["curve"]), str(r.facts["settings"])
+        name = f"{curve}: {settings}" if curve.startswith("preset ") else settings
+        if not r.figures:
+            rows.append([name, "failed", *[""] * (len(columns) - 2), str(r.facts["failed"])[:120]])
+            continue
+        mark = ", ".join(["Pareto"] * (r.name in best) + ["Pareto, all"] * (r.name in best_of_all))
+        cost = [*shown(r, ["seconds"], ".3f"), *shown(r, ["steps", "iterations"], ".0f"), *shown(r, ["bytes"], ".1f", 1e-6)]
+        seen = shown(r, ["distance", FINEST, "energy_error"], ".4f") + shown(r, ["front_error", "volume_drift", "packing"], "+.4f")
+        rows.append([name, mark, *cost, *seen])
+    return Table(f"{scene}: runs", [*columns, "packing"], rows, RUN_REMARK)
 
 
 def solve_table(scene: str, records: Sequence[Record]) -> Table:
@@ -86,11 +77,9 @@ def solve_table(scene: str, records: Sequence[Record]) -> Table:
     best = _front(solved, "error")
     rows = []
     for r in solved:
-        f = {key: figure.value for key, figure in r.figures.items()}
-        size = f"{f['bytes'] / 1e6:.1f}" if "bytes" in f else ""
         named = [str(r.facts["method"]), str(r.facts["precision"]), f"{r.facts['tolerance']:g}", "Pareto" if r.name in best else ""]
-        cost = [f"{f['seconds']:.4f}", f"{f['iterations']:.0f}", size]
-        rows.append([*named, *cost, f"{f['residual']:.2e}", f"{f['error']:.2e}", str(r.facts.get("status", ""))])
+        cost = [*shown(r, ["seconds"], ".4f"), *shown(r, ["iterations"], ".0f"), *shown(r, ["bytes"], ".1f", 1e-6)]
+        rows.append([*named, *cost, *shown(r, ["residual", "error"], ".2e"), str(r.facts.get("status", ""))])
     reference = next(r for r in records if r.facts["kind"] == "reference")
     remark = (
         "Liquid: problems recorded in a run, from its own first guess; error: relative, in the energy norm, against a float64 solution of "
@@ -107,10 +96,9 @@ def preset_table(scene: str, records: Sequence[Record]) -> Table:
     slowest = max((r.figures["seconds"].value for r in presets), default=0.0)
     rows = []
     for r in presets:
-        f = {key: figure.value for key, figure in r.figures.items()}
-        last = f.get("volume_drift", f.get("packing", 0.0))
-        seen = [f"{f['distance']:.4f}", f"{f['energy_error']:.4f}", f"{f['front_error']:+.4f}", f"{last:+.4f}"]
-        name = str(r.facts["curve"]).removeprefix("preset ")
-        rows.append([name, str(r.facts["settings"]), f"{f['seconds']:.3f}", f"{slowest / f['seconds']:.1f}", *seen])
+        last = [figure for figure in ("volume_drift", "packing") if figure in r.figures][:1]
+        seen = shown(r, ["distance", "energy_error"], ".4f") + [*shown(r, ["front_error", *last], "+.4f"), "+0.0000"][:2]
+        times = [*shown(r, ["seconds"], ".3f"), f"{slowest / r.figures['seconds'].value:.1f}"]
+        rows.append([str(r.facts["curve"]).removeprefix("preset "), str(r.facts["settings"]), *times, *seen])
     columns = ["preset", "settings", "seconds", "times faster", "distance", "energy", "front [m]", "volume or packing"]
     return Table(f"{scene}: presets", columns, rows, "At the same resolution; columns as below.")

@@ -6,8 +6,10 @@ import gc
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from typing import Any
 
 from warp_lcp.benchmarks.harness.machine import array_bytes
+from warp_lcp.benchmarks.harness.record import Record
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, Setting
 from warp_lcp.run.trial import BIN, Trial, trial
@@ -69,37 +71,40 @@ class Runs:
             return {}
         own, finest = self.reference(run.setting.scale), self.reference(REFERENCE)
         found = {
-            "seconds": Figure(min(run.seconds), "s", min(run.seconds), max(run.seconds), len(run.seconds)),
-            "steps": Figure(ran.steps),
-            "iterations": Figure(ran.iterations),
-            "linear_iterations": Figure(ran.linear_iterations),
+            "seconds": Figure.least(run.seconds, "s"),
             "bytes": Figure(run.bytes, "B"),
-            "residual": Figure(ran.residual),
             "distance": Figure(ran.distance(own)),
             "distance_to_finest": Figure(ran.distance(finest)),
             "energy_error": Figure(ran.energy_error(own)),
             "front": Figure(ran.looks[-1].front - ran.looks[0].front, "m"),
             "front_error": Figure(ran.front_error(own), "m"),
         }
-        more = {"volume_drift": ran.volume_drift, "packing": ran.packing, "penetration": ran.penetration}
-        return found | {name: Figure(value) for name, value in more.items() if value is not None}
+        names = ("steps", "iterations", "linear_iterations", "residual", "volume_drift", "packing", "penetration")
+        return found | {name: Figure(value) for name in names if (value := getattr(ran, name)) is not None}
+
+    def record(self, run: Run) -> Record:
+        """Return what a run took and showed."""
+        setting, scene = run.setting, self.scene().scene.name
+        facts: dict[str, Any] = {"scene": scene, "kind": "run", "curve": setting.curve, "settings": setting.name}
+        facts |= {"device": self.options.device, "frames": self.frames, "resolution": round(setting.scale * self.resolution)}
+        facts |= {"scale": setting.scale} | ({"failed": run.failed} if run.failed else {})
+        return Record(f"{scene} {setting.curve}: {setting.name}", self.figures(run), facts)
 
     def _reference(self, scale: float) -> Trial:
         """Return the run of the smallest steps and tolerance at a resolution."""
         scene = self.scene(scale=scale)
         self.options.say(f"{self.name}: reference at resolution {scene.domain.resolution}")
-        return trial(
-            changed(scene, price_table()[scene.scene.simulator].reference), device=self.options.device, frames=self.frames, box=self.box
-        )
+        best = changed(scene, price_table()[scene.scene.simulator].reference)
+        return trial(best, device=self.options.device, frames=self.frames, box=self.box)
 
     def _add(self, run: Run) -> None:
         """Run a setting once more."""
         gc.collect()
-        before, after = array_bytes(), []
+        before, after = array_bytes(), list[int]()
         try:
-            if not run.seconds:  # loads kernels
-                trial(self.scene(run.setting.overrides, run.setting.scale), device=self.options.device, frames=1, box=self.box)
             scene = self.scene(run.setting.overrides, run.setting.scale)
+            if not run.seconds:  # loads kernels
+                trial(scene, device=self.options.device, frames=1, box=self.box)
             ran = trial(scene, device=self.options.device, frames=self.frames, box=self.box, inspect=lambda _: after.append(array_bytes()))
         except (SceneError, StepFailed, SimulationFailed) as error:
             run.failed = str(error).replace("\n", " ")

@@ -1,8 +1,8 @@
-"""The settings that trade speed for accuracy: one list for each simulator."""
+"""The settings that trade speed for accuracy: one table for each simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from warp_lcp.solvers.registry import grid_methods
@@ -34,73 +34,55 @@ def settings_of(simulator: str) -> list[Setting]:
     Raises:
         ValueError: there are none for the simulator.
     """
-    lists = {"fluids": _liquid, "granular": _sand}
+    lists: dict[str, Callable[[], Iterator[Setting]]] = {"fluids": _liquid, "granular": _sand}
     if simulator not in lists:
         raise ValueError(f"simulator {simulator}: has no settings to compare")
     return list(dict.fromkeys(lists[simulator]()))
 
 
-def _step(step: Step) -> tuple[str, str]:
-    return f"time.cfl={step[0]:g}", f"time.dt_max={step[1]:g}"
+def _along(curve: str, steps: Sequence[Step], tolerance: float, *overrides: str, scale: float = 1.0) -> Iterator[Setting]:
+    """Yield a setting with time steps of all lengths."""
+    for cfl, dt in steps:
+        yield Setting(curve, (f"time.cfl={cfl:g}", f"time.dt_max={dt:g}", f"solver.tolerance={tolerance:g}", *overrides), scale)
 
 
-def _tolerance(value: float) -> str:
-    return f"solver.tolerance={value:g}"
+def _usual(steps: Sequence[Step], tolerances: Sequence[float], scaled: Sequence[float]) -> Iterator[Setting]:
+    """Yield tolerances, and resolutions with some of them."""
+    for tolerance in tolerances:
+        yield from _along(f"tolerance {tolerance:g}", steps, tolerance)
+    for scale in RESOLUTIONS:
+        for tolerance in scaled:
+            yield from _along(f"resolution x {scale:g}, tolerance {tolerance:g}", steps[:4], tolerance, scale=scale)
 
 
 def _liquid() -> Iterator[Setting]:
-    for tolerance in (1e-1, 1e-2, 1e-4, 1e-6):
-        for step in LIQUID_STEPS:
-            yield Setting(f"tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance)))
-    for scale in RESOLUTIONS:
-        for tolerance in (1e-2, 1e-4):
-            for step in LIQUID_STEPS[:4]:
-                yield Setting(f"resolution x {scale:g}, tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance)), scale)
+    steps = LIQUID_STEPS
+    yield from _usual(steps, (1e-1, 1e-2, 1e-4, 1e-6), (1e-2, 1e-4))
     for precision in ("single", "double"):
-        for step in LIQUID_STEPS[1:4:2]:
-            yield Setting(f"{precision} precision", (*_step(step), _tolerance(1e-4), f"solver.precision={precision}"))
-    for method in grid_methods():
-        if method != "projected-multigrid":
-            yield Setting(
-                "other methods", (*_step(LIQUID_STEPS[2]), _tolerance(1e-4), f"solver.method={method}", "solver.max_iterations=2000")
-            )
+        yield from _along(f"{precision} precision", steps[1:4:2], 1e-4, f"solver.precision={precision}")
+    for method in (m for m in grid_methods() if m != "projected-multigrid"):
+        yield from _along("other methods", steps[2:3], 1e-4, f"solver.method={method}", "solver.max_iterations=2000")
     for tolerance in (1e-2, 1e-4):
-        for step in LIQUID_STEPS[1:4]:
-            yield Setting(f"unilateral, tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance), "pressure.model=unilateral"))
-    for step in LIQUID_STEPS[1:4]:
-        yield Setting("surface on faces", (*_step(step), _tolerance(1e-4), "pressure.surface=voxel"))
-    yield from _particles(LIQUID_STEPS[1:3], 1e-4, (1, 4))
+        yield from _along(f"unilateral, tolerance {tolerance:g}", steps[1:4], tolerance, "pressure.model=unilateral")
+    yield from _along("surface on faces", steps[1:4], 1e-4, "pressure.surface=voxel")
+    yield from _particles(steps[1:3], 1e-4, (1, 4))
 
 
 def _sand() -> Iterator[Setting]:
-    for tolerance in (1e-1, 1e-2, 1e-3, 1e-4):
-        for step in SAND_STEPS:
-            yield Setting(f"tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance)))
-    for scale in RESOLUTIONS:
-        for tolerance in (1e-2, 1e-3):
-            for step in SAND_STEPS[:4]:
-                yield Setting(f"resolution x {scale:g}, tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance)), scale)
+    steps = SAND_STEPS
+    yield from _usual(steps, (1e-1, 1e-2, 1e-3, 1e-4), (1e-2, 1e-3))
     for tolerance in (1e-1, 1e-2, 1e-3):
-        for step in SAND_STEPS[1:4:2]:
-            yield Setting(
-                f"interleaved sweeps, tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance), "solver.method=interleaved-sweeps")
-            )
-    for step in SAND_STEPS[1:4]:
-        yield Setting("friction in a box", (*_step(step), _tolerance(1e-3), "friction.model=box"))
+        yield from _along(f"interleaved sweeps, tolerance {tolerance:g}", steps[1:4:2], tolerance, "solver.method=interleaved-sweeps")
+    yield from _along("friction in a box", steps[1:4], 1e-3, "friction.model=box")
     for iterations in (20, 40):
-        for step in SAND_STEPS[1:4:2]:
-            yield Setting(f"{iterations} iterations", (*_step(step), _tolerance(1e-3), f"solver.max_iterations={iterations}"))
-    yield from _particles(SAND_STEPS[1:4:2], 1e-3, (2, 4, 8))
+        yield from _along(f"{iterations} iterations", steps[1:4:2], 1e-3, f"solver.max_iterations={iterations}")
+    yield from _particles(steps[1:4:2], 1e-3, (2, 4, 8))
 
 
-def _particles(steps: tuple[Step, ...], tolerance: float, corrections: tuple[int, ...]) -> Iterator[Setting]:
-    """Return what both materials' particles offer."""
-    for step in steps:
-        base = (*_step(step), _tolerance(tolerance))
-        for per_axis in (1, 3):
-            yield Setting(f"{per_axis} particles along a cell", (*base, f"particles.per_axis={per_axis}"))
-        for transfer in ("pic", "flip"):
-            yield Setting(f"transfer {transfer}", (*base, f"particles.transfer={transfer}"))
-        for every in corrections:
-            yield Setting(f"density correction every {every}", (*base, f"density_correction.every={every}"))
-        yield Setting("reseeding", (*base, "particles.reseed.every=2"))
+def _particles(steps: Sequence[Step], tolerance: float, corrections: Sequence[int]) -> Iterator[Setting]:
+    """Yield what both materials' particles offer."""
+    offered = [(f"{n} particles along a cell", f"particles.per_axis={n}") for n in (1, 3)]
+    offered += [(f"transfer {transfer}", f"particles.transfer={transfer}") for transfer in ("pic", "flip")]
+    offered += [(f"density correction every {every}", f"density_correction.every={every}") for every in corrections]
+    for curve, override in [*offered, ("reseeding", "particles.reseed.every=2")]:
+        yield from _along(curve, steps, tolerance, override)

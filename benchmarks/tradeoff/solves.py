@@ -1,47 +1,110 @@
-"""Single problems of a run of liquid: what a method, a tolerance and a precision cost, and the error they leave."""
+"""Single problems of a run: what a method, a tolerance and a precision cost, and the error they leave."""
 
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.benchmarks.extremes.exact import Exact
 from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.record import Record
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
 from warp_lcp.gallery.recorded import RecordedProblem, files, load
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.run.stepping import plan_dt
+from warp_lcp.scene.presets import changed
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.simulator import simulators
-from warp_lcp.simulation import Recorded
+from warp_lcp.simulation import Recorded, Simulation
 from warp_lcp.solvers.registry import grid_methods
 
-PROBLEMS = 4  # of a run, at equal distances
-TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
-PRECISIONS = ("mixed", "single", "double")
-THOROUGH = ("projected-multigrid", "minimum-map-newton")  # in all precisions
+PROBLEMS, STATES = 4, 3  # of a run of liquid or sand, at equal distances
 EXACT = wl.StoppingCriteria(rtol=1e-13, max_iterations=500)
-MAX_ITERATIONS = 1000
+EXACT_STEP = {"solver.tolerance": 1e-7, "solver.max_iterations": 30000, "solver.method": "accelerated-projection"}
+MOST_LIQUID, MOST_SAND = 1000, 3000  # iterations
 
 
-@dataclass
-class Solves:
-    """What a method took for all problems."""
+@dataclass(frozen=True)
+class Found:
+    """What came of a problem."""
 
-    seconds: list[float] = field(default_factory=list)  # of each round
-    iterations: int = 0  # in all problems
-    bytes: int = 0  # of device arrays that the method holds for the largest problem
-    residual: float = 0.0  # the largest relative one, recomputed
-    error: float = 0.0  # the largest, relative, in the energy norm
-    statuses: set[str] = field(default_factory=set)  # of the solves
+    seconds: float
+    iterations: int
+    residual: float  # recomputed
+    error: float
+    status: str = ""
+    bytes: int | None = None  # of device arrays that the method holds
 
 
-class Exact:
+class Probe:
+    """Problems of a run that are solved once for each setting."""
+
+    kind: str  # of problem
+    warm = 0  # solves before the first that counts: they load kernels
+    tolerances: tuple[float, ...]
+    residual: float  # the largest of the reference solutions
+    problems: list[Any]
+    methods: dict[str, tuple[str, str]]  # method and precision by what records call the two
+
+    def __init__(self, scene: Scene, device: str) -> None:
+        self.scene, self.device, self.read = scene, device, clock(device)
+
+    def solves(self, method: str, precision: str, tolerance: float) -> Iterator[Callable[[], Found]]:
+        """Yield what solves each problem."""
+        raise NotImplementedError
+
+
+def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
+    """Solve problems of a run by all methods to all tolerances; return a record of each setting, that of the reference first."""
+    options.say(f"{scene.scene.name}: problems of a run")
+    probe: Probe = PROBES[scene.scene.simulator](scene, options.device, frames)
+    known, figures = {"scene": scene.scene.name}, {"residual": Figure(probe.residual), "problems": Figure(len(probe.problems))}
+    records = [Record(f"{scene.scene.name} {probe.kind} reference", figures, known | {"kind": "reference"})]
+    for name, (method, precision) in probe.methods.items():
+        options.say(f"{scene.scene.name}: {name}")
+        for tolerance in probe.tolerances:
+            facts = known | {"kind": "solve", "method": method, "precision": precision, "tolerance": tolerance}
+            figures, status = _measured(probe.solves(method, precision, tolerance), probe.warm, options.repeat)
+            more = {"status": status} if status else {}
+            records.append(Record(f"{scene.scene.name} {probe.kind} {name} {tolerance:g}", figures, facts | more))
+    return records
+
+
+def _measured(solves: Iterator[Callable[[], Found]], warm: int, repeat: int) -> tuple[dict[str, Figure], str]:
+    """Solve all problems as often as asked for; return the figures of all together and how they ended."""
+    samples = [[solve() for _ in range(warm + repeat)][warm:] for solve in solves]
+    last = [found[-1] for found in samples]
+    figures = {
+        "seconds": Figure.least([sum(f.seconds for f in turn) for turn in zip(*samples, strict=True)], "s"),
+        "iterations": Figure(sum(f.iterations for f in last)),
+        "residual": Figure(max(f.residual for f in last)),
+        "error": Figure(max(f.error for f in last)),
+    }
+    held = [f.bytes for f in last if f.bytes is not None]
+    return figures | ({"bytes": Figure(max(held), "B")} if held else {}), ", ".join(sorted({f.status for f in last}))
+
+
+def _run(scene: Scene, simulation: Simulation, frames: int) -> Iterator[int]:
+    """Step through frames; yield the number of each."""
+    for frame in range(1, frames + 1):
+        while scene.time.frame_time(frame) - simulation.time > 1e-9:
+            simulation.step(plan_dt(simulation.stable_dt(), scene.time.frame_time(frame) - simulation.time, scene.time))
+        yield frame
+
+
+def _simulation(scene: Scene, device: str) -> Simulation:
+    return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+
+
+class Reference:
     """A problem's solution by a solve in float64 that converged as far as rounding allows, to measure errors from.
 
     Residuals are recomputed in float64 from the assembled matrix, whatever a solver says, relative to that of clip(0, lower, upper).
@@ -50,99 +113,109 @@ class Exact:
     def __init__(self, path: Path, device: str) -> None:
         problem = load(path, device=device, dtype=wp.float64)
         result = wl.solve(problem.lcp(), wl.MinimumMapNewton(precision="double"), stopping=EXACT, x0=problem.x0)
-        self._sparse = problem.sparse()
-        self.A, diagonal = self._sparse.A, self._sparse.A.diagonal()
-        self._d = np.where(diagonal > 0.0, diagonal, 1.0)
-        self.fluid = problem.A.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == wl.FLUID
-        self.reference = self._norm(np.clip(np.zeros(len(diagonal)), self._sparse.lower, self._sparse.upper))
+        sparse = problem.sparse()
+        self._exact = Exact(sparse.A, sparse.b, sparse.lower, sparse.upper)
+        self._fluid = problem.A.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == wl.FLUID
+        self._unit = self._exact.residual(self._exact.start) or 1.0
+        self._x = result.x.numpy().ravel()[self._fluid]
         self.residual_of_solution = self.residual(result.x.numpy())
-        self.x = result.x.numpy().ravel()[self.fluid]
 
     def residual(self, x: np.ndarray) -> float:
         """Return the relative residual of a field like b; the absolute one where the reference is 0."""
-        return self._norm(x.ravel()[self.fluid]) / (self.reference or 1.0)
+        return self._exact.residual(x.ravel()[self._fluid].astype(np.float64)) / self._unit
 
     def error(self, x: np.ndarray) -> float:
         """Return ||x - x*|| / ||x*|| in the energy norm: of the kinetic energy that a wrong pressure leaves or takes."""
-        difference = x.ravel()[self.fluid] - self.x
-        return float(np.sqrt(max(difference @ (self.A @ difference), 0.0) / (self.x @ (self.A @ self.x))))
-
-    def _norm(self, x: np.ndarray) -> float:
-        p = self._sparse
-        return float(np.linalg.norm(self._d * (x - np.clip(x - (p.A @ x + p.b) / self._d, p.lower, p.upper))))
+        difference, A = x.ravel()[self._fluid] - self._x, self._exact.matrix
+        return float(np.sqrt(max(difference @ (A @ difference), 0.0) / (self._x @ (A @ self._x))))
 
 
-def recorded_problems(scene: Scene, folder: Path, device: str, frames: int) -> list[Path]:
-    """Record the problems of a scene's first frames, and return some of the files.
+class Pressures(Probe):
+    """Problems recorded in a run of liquid, solved from the run's own first guess.
 
     Raises:
         ValueError: the scene's simulator shows none.
     """
-    simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
-    if not isinstance(simulation, Recorded):
-        raise ValueError(f"{scene.scene.simulator}: shows no problems")
-    simulation.record = ProblemFolder(folder).write
-    for frame in range(1, frames + 1):
-        while scene.time.frame_time(frame) - simulation.time > 1e-9:
-            simulation.step(plan_dt(simulation.stable_dt(), scene.time.frame_time(frame) - simulation.time, scene.time))
-    found = files(folder)
-    return [found[i] for i in np.unique(np.linspace(1, len(found) - 1, PROBLEMS).astype(int))]  # the first is free fall
 
+    kind, warm, tolerances = "solve", 1, (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
+    thorough = ("projected-multigrid", "minimum-map-newton")  # in all precisions
 
-def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
-    """Solve recorded problems by all methods to all tolerances, from the run's own first guess; return a record of each setting."""
-    with tempfile.TemporaryDirectory() as folder:
-        options.say(f"{scene.scene.name}: problems of a run")
-        paths = recorded_problems(scene, Path(folder) / "problems", options.device, frames)
-        problems = [load(path, device=options.device) for path in paths]
-        exact = [Exact(path, options.device) for path in paths]
-    records = [_exact_record(scene, exact)]
-    for method in grid_methods():
-        for precision in PRECISIONS if method in THOROUGH else ("mixed",):
-            options.say(f"{scene.scene.name}: {method}, {precision}")
-            for tolerance in TOLERANCES:
-                solves = _solves(problems, exact, wl.METHODS[method](precision=precision), tolerance, options)
-                records.append(_record(scene, method, precision, tolerance, solves))
-    return records
+    def __init__(self, scene: Scene, device: str, frames: int) -> None:
+        super().__init__(scene, device)
+        simulation = _simulation(scene, device)
+        if not isinstance(simulation, Recorded):
+            raise ValueError(f"{scene.scene.simulator}: shows no problems")
+        with tempfile.TemporaryDirectory() as folder:
+            simulation.record = ProblemFolder(Path(folder) / "problems").write
+            found = [files(Path(folder) / "problems") for _ in _run(scene, simulation, frames)][-1]
+            paths = [found[i] for i in np.unique(np.linspace(1, len(found) - 1, PROBLEMS).astype(int))]  # the first is free fall
+            self.problems = [(load(path, device=device), Reference(path, device)) for path in paths]
+        self.residual = max(reference.residual_of_solution for _, reference in self.problems)
+        tried = [(m, p) for m in grid_methods() for p in (("mixed", "single", "double") if m in self.thorough else ("mixed",))]
+        self.methods = {f"{method} {precision}": (method, precision) for method, precision in tried}
 
+    def solves(self, method: str, precision: str, tolerance: float) -> Iterator[Callable[[], Found]]:
+        """Yield what solves each problem."""
+        solver, stopping = wl.METHODS[method](precision=precision), wl.StoppingCriteria(rtol=tolerance, max_iterations=MOST_LIQUID)
+        for problem, reference in self.problems:
+            yield self._solve(problem, reference, solver, stopping)
 
-def _solves(problems: list[RecordedProblem], exact: list[Exact], solver: object, tolerance: float, options: Options) -> Solves:
-    """Solve all problems, as often as asked for and once more to load kernels."""
-    found, read = Solves(), clock(options.device)
-    criteria = wl.StoppingCriteria(rtol=tolerance, max_iterations=MAX_ITERATIONS)
-    for problem, known in zip(problems, exact, strict=True):
+    def _solve(self, problem: RecordedProblem, reference: Reference, solver: Any, stopping: wl.StoppingCriteria) -> Callable[[], Found]:
         lcp, before = problem.lcp(), array_bytes()
-        work = solver.init(lcp)  # type: ignore[attr-defined]
-        found.bytes = max(found.bytes, array_bytes() - before)
-        for turn in range(options.repeat + 1):
-            begun = read()
-            result = wl.solve(lcp, solver, stopping=criteria, x0=problem.x0, workspace=work)  # type: ignore[arg-type]
-            wp.synchronize_device(options.device)
-            taken = read() - begun
-            if turn:
-                found.seconds += [0.0] * (turn > len(found.seconds))
-                found.seconds[turn - 1] += taken
-        x = result.x.numpy()
-        found.iterations += result.linear_iterations or result.iterations
-        found.residual = max(found.residual, known.residual(x))
-        found.error = max(found.error, known.error(x))
-        found.statuses.add(result.status.name)
-    return found
+        work = solver.init(lcp)
+        held = array_bytes() - before
+
+        def solve() -> Found:
+            begun = self.read()
+            result = wl.solve(lcp, solver, stopping=stopping, x0=problem.x0, workspace=work)
+            wp.synchronize_device(self.device)
+            taken, x = self.read() - begun, result.x.numpy()
+            iterations = result.linear_iterations or result.iterations
+            return Found(taken, iterations, reference.residual(x), reference.error(x), result.status.name, held)
+
+        return solve
 
 
-def _record(scene: Scene, method: str, precision: str, tolerance: float, solves: Solves) -> Record:
-    figures = {
-        "seconds": Figure(min(solves.seconds), "s", min(solves.seconds), max(solves.seconds), len(solves.seconds)),
-        "iterations": Figure(solves.iterations),
-        "bytes": Figure(solves.bytes, "B"),
-        "residual": Figure(solves.residual),
-        "error": Figure(solves.error),
-    }
-    facts = {"scene": scene.scene.name, "kind": "solve", "method": method, "precision": precision, "tolerance": tolerance}
-    facts["status"] = ", ".join(sorted(solves.statuses))
-    return Record(f"{scene.scene.name} solve {method} {precision} {tolerance:g}", figures, facts)
+class Steps(Probe):
+    """Steps of a run of sand, from states that it came through; the error is that of the velocity over g dt."""
+
+    kind, warm, tolerances = "step", 0, (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5)
+    tried: tuple[str, ...] = ("accelerated-projection", "interleaved-sweeps")
+
+    def __init__(self, scene: Scene, device: str, frames: int) -> None:
+        super().__init__(scene, device)
+        self.methods = {method: (method, "single") for method in self.tried}
+        self.gravity = float(np.linalg.norm(scene.physics.gravity)) or 1.0
+        wanted = {round(frames * (n + 1) / (STATES + 1)) for n in range(STATES)}
+        simulation, usual = _simulation(scene, device), 1.0 / scene.time.frames_per_second
+        self.problems, self.residual = [], 0.0  # a state, the length of its next step [s], the velocities after it
+        for frame in _run(scene, simulation, max(wanted)):
+            if frame in wanted:
+                state, dt = simulation.state(), plan_dt(simulation.stable_dt(), usual, scene.time)
+                velocity, row, _ = self._step(changed(scene, EXACT_STEP), state, dt)
+                self.problems.append((state, dt, velocity))
+                self.residual = max(self.residual, row["coupled_residual"])
+
+    def solves(self, method: str, precision: str, tolerance: float) -> Iterator[Callable[[], Found]]:
+        """Yield what takes the step from each state."""
+        keys = {"solver.method": method, "solver.tolerance": tolerance, "solver.max_iterations": MOST_SAND}
+        for problem in self.problems:
+            yield partial(self._solve, changed(self.scene, keys), *problem)
+
+    def _solve(self, scene: Scene, state: Any, dt: float, exact: np.ndarray) -> Found:
+        velocity, row, taken = self._step(scene, state, dt)
+        error = float(np.sqrt(np.mean(np.sum((velocity - exact) ** 2, axis=1)))) / (self.gravity * dt)
+        return Found(taken, row["solve_iterations"], row["coupled_residual"], error)
+
+    def _step(self, scene: Scene, state: Any, dt: float) -> tuple[np.ndarray, dict[str, Any], float]:
+        """Take a step from a state, and return the particles' velocities [m/s], the log's row and the seconds."""
+        simulation = _simulation(scene, self.device)
+        simulation.restore(state)
+        begun = self.read()
+        row = simulation.step(dt)
+        wp.synchronize_device(self.device)
+        taken = self.read() - begun
+        return simulation.state()["velocity"], dict(row), taken
 
 
-def _exact_record(scene: Scene, exact: list[Exact]) -> Record:
-    figures = {"residual": Figure(max(known.residual_of_solution for known in exact)), "problems": Figure(len(exact))}
-    return Record(f"{scene.scene.name} solve reference", figures, {"scene": scene.scene.name, "kind": "reference"})
+PROBES: dict[str, Callable[[Scene, str, int], Probe]] = {"fluids": Pressures, "granular": Steps}

@@ -51,7 +51,7 @@ def test_there_are_enough_cases_of_every_kind():
 @pytest.mark.parametrize("precision", case.PRECISIONS)
 def test_a_wrong_solver_is_caught(name, precision):
     """Expected to solve the problem, as a right one is: the same case passes with wl.solve."""
-    for make, method in ((lambda: shapes.pool((24, 25)), "projected-multigrid"), (lambda: shapes.grounded((1, 40)), "minimum-map-newton")):
+    for _, make, method in broken.RIGHT:
         assert judge(SolveCase("right", "right", make, method), precision, "cpu").wrong == []
         verdict = judge(SolveCase("wrong", name, make, method, solve=broken.SOLVERS[name]), precision, "cpu")
         assert verdict.wrong

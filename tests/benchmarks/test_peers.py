@@ -75,7 +75,8 @@ def test_question_is_the_problem(question):
 def test_peers_of_the_linear_solve_find_its_solution():
     question = Question(splash(12), "linear")
     x = np.linalg.solve(question.matrix.toarray(), -question.b)
-    for solve in (libraries.pyamg_aggregation, libraries.pyamg_classical, libraries.scipy_cg, partial(libraries.warp_cg, device="cpu")):
+    classical = partial(libraries.pyamg, build="ruge_stuben_solver")
+    for solve in (libraries.pyamg, classical, libraries.scipy_cg, partial(libraries.warp_cg, device="cpu")):
         answer = solve(question, 1e-9)
         assert np.allclose(answer.x, x, atol=1e-7 * np.abs(x).max())
         assert answer.iterations > 0

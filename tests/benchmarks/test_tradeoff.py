@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from warp_lcp.benchmarks import tradeoff
 from warp_lcp.benchmarks.harness import report
 from warp_lcp.benchmarks.harness.timing import Options
-from warp_lcp.benchmarks.tradeoff import solves, steps
+from warp_lcp.benchmarks.tradeoff import solves
 from warp_lcp.benchmarks.tradeoff.runs import Runs, front_of
 from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
 from warp_lcp.cli import commands as cli
@@ -81,9 +81,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = [Setting(f"cfl {cfl:g}", (f"time.cfl={cfl:g}", f"time.dt_max={0.005 * cfl:g}")) for cfl in (4.0, 1.0)]
     monkeypatch.setattr(tradeoff, "settings_of", lambda simulator: kept)
     monkeypatch.setattr(solves, "grid_methods", lambda: ("projected-multigrid", "psor"))
-    monkeypatch.setattr(solves, "TOLERANCES", (1e-1, 1e-3, 1e-5))
-    monkeypatch.setattr(steps, "TOLERANCES", (1e-1, 1e-5))
-    monkeypatch.setattr(steps, "METHODS", ("accelerated-projection",))
+    monkeypatch.setattr(solves.Pressures, "tolerances", (1e-1, 1e-3, 1e-5))
+    monkeypatch.setattr(solves.Steps, "tolerances", (1e-1, 1e-5))
+    monkeypatch.setattr(solves.Steps, "tried", ("accelerated-projection",))
 
 
 @pytest.mark.parametrize("scene", ["dam-break-2d", "column-collapse-2d"])

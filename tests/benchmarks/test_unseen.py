@@ -11,9 +11,9 @@ from oracle import boxed, lemke
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import broken, unseen
 from warp_lcp.benchmarks.extremes.case import Attempt, Verdict, judge
-from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.problem import GridProblem, Pools, equality, solvable
 from warp_lcp.benchmarks.extremes.unseen import judging
-from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Pools, changed, equality, solvable
+from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, changed
 from warp_lcp.benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.suite import EXTREMES, SOLVERS

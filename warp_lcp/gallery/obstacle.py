@@ -82,8 +82,10 @@ def torsion(n: int, load: float = 5.0, *, device: Any = None, dtype: Any = wp.fl
     return Problem(f"torsion {n}x{n}", A, b, -distance, distance, None, UNIQUE | {"boxed"})
 
 
-def dam(nx: int, ny: int, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
-    """Return the seepage of water through a dam, 16 wide and 24 high, from a full reservoir to water of depth 4.
+def dam(
+    nx: int, ny: int, *, width: float = 16.0, high: float = 24.0, low: float = 4.0, device: Any = None, dtype: Any = wp.float32
+) -> Problem:
+    """Return the seepage of water through a dam from a full reservoir to water of depth `low`.
 
     By Baiocchi's transform, w(x, y) is the integral of the pressure's head from y up: w >= 0, -Laplace w + 1 >= 0, and w has its values
     on the border. Where w > 0 the dam is wet. `b` holds hx hy and the border's values, which are AIR.
@@ -91,6 +93,9 @@ def dam(nx: int, ny: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
     Args:
         nx: nodes along x, the border included.
         ny: nodes along y, the border included.
+        width: of the dam, in any unit of length.
+        high: its height, and the reservoir's depth.
+        low: depth of the water behind it.
         device: Warp device of the operator.
         dtype: its storage.
 
@@ -99,7 +104,6 @@ def dam(nx: int, ny: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
     """
     if min(nx, ny) < 3:
         raise ValueError(f"nx, ny = {nx}, {ny}: must be >= 3, the nodes with those on the border")
-    width, high, low = 16.0, 24.0, 4.0
     x, y = np.linspace(0, width, nx), np.linspace(0, high, ny)
     w = np.zeros((ny, nx))
     w[0] = (high**2 * (width - x) + low**2 * x) / (2 * width)

@@ -6,17 +6,18 @@ Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept un
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
-from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, solvable
 from warp_lcp.benchmarks.extremes.unseen import grids, matrices
-from warp_lcp.benchmarks.extremes.unseen.draw import Draw, Unseen, changed, solvable
+from warp_lcp.benchmarks.extremes.unseen.draw import Draw, Unseen, changed
 
 RESERVED = range(10_000, 20_000)  # seeds for acceptance
 FRESH = range(20_000, 1 << 31)  # seeds that a run draws from
 
+Make = Callable[[Draw], Problem]
 
-def _named(kinds: Iterable[Callable[[Draw], Any]]) -> dict[str, Callable[[Draw], Any]]:
+
+def _named(kinds: Iterable[Make]) -> dict[str, Make]:
     return {make.__name__.replace("_", "-"): make for make in kinds}
 
 
@@ -39,11 +40,8 @@ def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
     """
     if kind not in KINDS:
         raise ValueError(f"kind = {kind}: must be one of {', '.join(KINDS)}")
-    made, then = KINDS[kind](Draw(kind, seed, small=small)), None
-    if isinstance(made, tuple):
-        made, then = made
-    if isinstance(made, GridProblem):
-        made, then = solvable(made), None if then is None else solvable(then)
-        if then is None and seed % WARM_EVERY == 0 and not small:
-            then = changed(made, seed)
-    return Unseen(kind, seed, made, then, ALLOWANCE.get(kind, 1.0))
+    made = KINDS[kind](Draw(kind, seed, small=small))
+    if not isinstance(made, GridProblem):
+        return Unseen(made)
+    made = solvable(made)
+    return Unseen(made, changed(made, seed) if seed % WARM_EVERY == 0 and not small else None, ALLOWANCE.get(kind, 1.0))

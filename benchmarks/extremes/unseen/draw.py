@@ -10,27 +10,21 @@ from typing import Any
 
 import numpy as np
 import scipy.ndimage
-import scipy.sparse.csgraph
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.extremes.exact import Exact
-from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
+from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, solvable
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SIDES = {2: (30, 300), 3: (12, 48)}  # cells, by dimensions
 SMALL_SIDES = {2: (3, 14), 3: (2, 6)}  # where every method takes part
 LARGER, LONGER = 0.03, {2: 2.0, 3: 1.4}  # share of grids with more cells along a side, and how many times as many at most
-BALANCED = 1e-10  # of sum |b|: sums of b that are 0 but for rounding
-GENTLY = 0.01  # of the mean |b|: what a pool's b is raised by where its sum has the sign that no bound takes up
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """A problem by kind and seed."""
+    """What a kind and a seed come to."""
 
-    kind: str  # of `KINDS`
-    seed: int  # with the kind, all that it depends on
-    problem: GridProblem | MatrixProblem  # what is to be solved
+    problem: Problem  # what is to be solved
     then: GridProblem | None = None  # one that differs a little, to be solved from the solution of `problem`; None for none
     allowance: float = 1.0  # factor of the iterations that it may take
 
@@ -106,75 +100,10 @@ class Draw:
         b.flat[self.rng.integers(b.size, size=1 + b.size // 200)] = -self.decades(1.0, 1e3)
         return b
 
-    def faces(self, shape: Sequence[int], value: Any) -> dict[str, np.ndarray]:
-        """Return arrays of coefficients; `value` takes an array's shape and its axis, 0 for x."""
-        made = {}
-        for axis, name in enumerate(("face_x", "face_y", "face_z")[: len(shape)]):
-            counts = tuple(n + (q == len(shape) - 1 - axis) for q, n in enumerate(shape))
-            made[name] = value(counts, axis)
-        return made
-
 
 def framed(inside: np.ndarray) -> np.ndarray:
     """Return cells FLUID where `inside`, AIR elsewhere and all around: x = 0 on the border of a domain."""
     return np.pad(np.where(inside, FLUID, AIR), 1)
-
-
-@dataclass(frozen=True)
-class Pools:
-    """Connected unknowns, and which of them no AIR, shift or bound holds."""
-
-    label: np.ndarray  # pool of each unknown
-    loose: np.ndarray  # whether a pool's constants are in the null space, by pool
-    net: np.ndarray  # sum of b, by pool; 0 where that is rounding
-    size: np.ndarray  # sum of |b|, by pool
-    cells: np.ndarray  # unknowns, by pool
-    below: np.ndarray  # whether one of a pool's lower bounds is finite
-    above: np.ndarray  # whether one of its upper bounds is
-
-    @staticmethod
-    def of(exact: Exact) -> Pools:
-        """Return the pools of a symmetric problem whose off-diagonal entries are <= 0."""
-        count, label = scipy.sparse.csgraph.connected_components(exact.matrix != 0, directed=False)
-        excess = np.asarray(exact.matrix.sum(axis=1)).ravel()
-        tied = excess > 1e-12 * exact.matrix.diagonal()
-        net, size = (np.bincount(label, v, count) for v in (exact.b, np.abs(exact.b)))
-        return Pools(
-            label=label,
-            loose=~(np.bincount(label, tied, count) > 0),
-            net=np.where(np.abs(net) <= BALANCED * size, 0.0, net),
-            size=size,
-            cells=np.bincount(label, minlength=count),
-            below=np.bincount(label, np.isfinite(exact.lower), count) > 0,
-            above=np.bincount(label, np.isfinite(exact.upper), count) > 0,
-        )
-
-    @property
-    def lost(self) -> np.ndarray:
-        """Pools without a solution: constants lower the energy for ever."""
-        return self.loose & (((self.net > 0) & ~self.below) | ((self.net < 0) & ~self.above))
-
-
-def solvable(problem: GridProblem) -> GridProblem:
-    """Return the problem with b moved, on the pools that have no solution, by the least that gives them one and a little more."""
-    exact = problem.exact()
-    pools = Pools.of(exact)
-    # a sum of 0 is on the verge of having none: where one bound can take up a sign, b gets some of that sign
-    verge = pools.loose & (pools.net == 0) & (pools.below ^ pools.above)
-    moved = pools.lost | verge
-    taken_up = np.where(pools.below & ~pools.above, 1.0, np.where(pools.above & ~pools.below, -1.0, 0.0))
-    shift = np.where(moved, (taken_up * GENTLY * (pools.size + (pools.size == 0)) - pools.net) / pools.cells, 0.0)
-    b = np.where(problem.cells == FLUID, problem.b, 0.0)
-    b[problem.cells == FLUID] += shift[pools.label]
-    return replace(problem, b=b)
-
-
-def equality(problem: GridProblem) -> GridProblem | None:
-    """Return the problem without bounds, None if it has no solution; where b = 0 solves it at once, that of a constant b."""
-    b = problem.b if np.any(problem.b[problem.cells == FLUID]) else -np.ones(problem.cells.shape)
-    free = replace(problem, b=b, lower=-np.inf, upper=np.inf)
-    pools = Pools.of(free.exact())
-    return None if pools.lost.any() else free
 
 
 def changed(problem: GridProblem, seed: int, share: float = 0.01) -> GridProblem:

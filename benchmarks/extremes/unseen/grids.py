@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import scipy.ndimage
 
-from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp import gallery
+from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of, with_solution
 from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Draw, framed
 
 
@@ -22,6 +22,11 @@ def some_bounds(draw: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
     if kind == "layer":
         return {"lower": np.where(np.indices(shape)[draw.rng.integers(len(shape))] == 0, 0.0, -np.inf)}
     return {"upper": draw.decades(0.1, 100)}
+
+
+def loaded(draw: Draw, cells: np.ndarray, **more: Any) -> GridProblem:
+    """Return any right-hand side and some bounds on these cells."""
+    return GridProblem(cells=cells, b=draw.load(cells.shape), **more, **some_bounds(draw, cells.shape))
 
 
 def strip(draw: Draw) -> GridProblem:
@@ -39,10 +44,9 @@ def strip(draw: Draw) -> GridProblem:
 
 def vent(draw: Draw) -> GridProblem:
     """Return a box of liquid with a few single cells of AIR."""
-    shape = draw.shape(draw.of(2, 2, 3))
-    cells = np.full(shape, FLUID)
+    cells = np.full(draw.shape(draw.of(2, 2, 3)), FLUID)
     cells.flat[draw.rng.integers(cells.size, size=draw.of(1, 1, 2, 4))] = AIR
-    return GridProblem(cells=cells, b=draw.load(shape), **some_bounds(draw, shape))
+    return loaded(draw, cells)
 
 
 def voxels(draw: Draw) -> GridProblem:
@@ -51,9 +55,8 @@ def voxels(draw: Draw) -> GridProblem:
     width = draw.decades(1, 8)
     air, solid = draw.smooth(shape, width), draw.smooth(shape, width)
     cells = np.where(air > draw.between(0.2, 0.7), AIR, np.where(solid > draw.between(0.2, 0.7), SOLID, FLUID))
-    cells.flat[0] = AIR
-    cells.flat[-1] = FLUID
-    return GridProblem(cells=cells, b=draw.load(shape), **some_bounds(draw, shape))
+    cells.flat[0], cells.flat[-1] = AIR, FLUID
+    return loaded(draw, cells)
 
 
 def liquid(draw: Draw) -> GridProblem:
@@ -143,14 +146,9 @@ def dam(draw: Draw) -> GridProblem:
     nx = max(5, draw.side())
     ny = max(5, int(nx * draw.between(0.6, 2)))
     width, high = draw.between(8, 32), draw.between(16, 32)
-    tail = high * draw.between(0, 0.6)
-    x, y = np.linspace(0, width, nx), np.linspace(0, high, ny)
-    hx, hy = x[1], y[1]
-    b = np.full((ny - 2, nx - 2), hx * hy)
-    b[0] -= ((high**2 * (width - x) + tail**2 * x) / (2 * width))[1:-1] * hx / hy
-    b[:, 0] -= ((high - y) ** 2 / 2)[1:-1] * hy / hx
-    b[:, -1] -= np.where(y < tail, (tail - y) ** 2 / 2, 0)[1:-1] * hy / hx
-    return GridProblem(cells=framed(np.ones(b.shape)), b=np.pad(b, 1), faces={"face_x": hy / hx, "face_y": hx / hy})
+    flat = high * (nx - 1) / width / (ny - 1)
+    made = gallery.dam(nx, ny, width=width, high=high, low=high * draw.between(0, 0.6), device="cpu")
+    return GridProblem(cells=framed(np.ones((ny - 2, nx - 2))), b=made.b, faces={"face_x": flat, "face_y": 1 / flat})
 
 
 def bearing(draw: Draw) -> GridProblem:
@@ -175,8 +173,7 @@ def rows(draw: Draw) -> GridProblem:
     kind = draw.rng.choice(5, cells.shape, p=draw.rng.dirichlet(np.ones(5)))
     scale = draw.decades(0.1, 100)
     low, high = -scale * draw.rng.random(cells.shape), scale * draw.rng.random(cells.shape)
-    lower = np.choose(kind, [-np.inf * np.ones(cells.shape), low, -np.inf * np.ones(cells.shape), low, low])
-    upper = np.choose(kind, [np.inf * np.ones(cells.shape), np.inf * np.ones(cells.shape), high, high, low])
+    lower, upper = np.choose(kind, [-np.inf, low, -np.inf, low, low]), np.choose(kind, [np.inf, np.inf, high, high, low])
     return GridProblem(cells=cells, b=draw.load(cells.shape), lower=lower, upper=upper)
 
 
@@ -189,11 +186,7 @@ def degenerate(draw: Draw) -> GridProblem:
     x = np.where(inside, np.maximum(field - draw.between(-0.2, 0.4), 0), 0.0)
     x.flat[np.flatnonzero(inside)[0]] = 1.0
     push = np.maximum(draw.smooth(cells.shape, 4), 0) if draw.chance(0.7) else 0.0 * field
-    y = np.where(inside & (x == 0), push, 0.0)
-    made = GridProblem(cells=cells, b=np.zeros(cells.shape))
-    b = np.zeros(cells.shape)
-    b[inside] = y[inside] - made.exact().matrix @ x[inside]
-    return replace(made, b=b)
+    return with_solution(cells, x, np.where(x == 0, push, 0.0))
 
 
 def lognormal(draw: Draw) -> GridProblem:
@@ -201,12 +194,12 @@ def lognormal(draw: Draw) -> GridProblem:
     shape = draw.shape(draw.of(2, 2, 3))
     cells, sigma, length = framed(np.ones(shape)), draw.between(1, 3), draw.of(0.0, 0.0, draw.decades(1, 10))
 
-    def field(counts: tuple[int, ...], axis: int) -> np.ndarray:
+    def field(counts: tuple[int, ...]) -> np.ndarray:
         noise = draw.smooth(counts, length) if length else draw.noise(counts)
         return np.asarray(np.exp(sigma * noise / noise.std()))
 
     b = draw.noise(cells.shape) - 0.1 if draw.chance(0.7) else draw.load(cells.shape)
-    return GridProblem(cells=cells, b=b, faces=draw.faces(cells.shape, field), upper=draw.of(np.inf, np.inf, draw.decades(0.1, 100)))
+    return GridProblem(cells=cells, b=b, faces=faces_of(cells.shape, field), upper=draw.of(np.inf, np.inf, draw.decades(0.1, 100)))
 
 
 def cut_cells(draw: Draw) -> GridProblem:
@@ -232,21 +225,19 @@ def cut_cells(draw: Draw) -> GridProblem:
     face_y[1:-1] = np.where(beside_air, face_y[1:-1] / theta[:-1], face_y[1:-1])
     if not (cells == FLUID).any():
         cells[0, 0] = FLUID
-    b = draw.load(shape)
-    return GridProblem(cells=cells, b=b, faces={"face_x": face_x, "face_y": face_y}, **some_bounds(draw, shape))
+    return loaded(draw, cells, faces={"face_x": face_x, "face_y": face_y})
 
 
 def shifted(draw: Draw) -> GridProblem:
     """Return a step of diffusion in time: a shift of 10^-5 to 100, on all cells or some, with or without AIR."""
     shape = draw.shape(draw.of(2, 3))
     cells = np.full(shape, FLUID)
-    if draw.chance(0.3):
-        cells[0] = AIR
+    cells[: draw.chance(0.3)] = AIR
     shift: Any = draw.decades(1e-5, 100)
     if draw.chance(0.5):
         shift = shift * (draw.rng.random(shape) < draw.between(0.01, 1))
         shift.flat[-1] = 1.0
-    return GridProblem(cells=cells, b=draw.load(shape), shift=shift, **some_bounds(draw, shape))
+    return loaded(draw, cells, shift=shift)
 
 
 KINDS = (

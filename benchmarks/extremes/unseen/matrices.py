@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 import scipy.spatial
 
-from warp_lcp.benchmarks.extremes.problem import MatrixProblem
+from warp_lcp.benchmarks.extremes.problem import MatrixProblem, solvable
 from warp_lcp.benchmarks.extremes.unseen import grids
-from warp_lcp.benchmarks.extremes.unseen.draw import Draw, solvable
+from warp_lcp.benchmarks.extremes.unseen.draw import Draw
 
 GRIDS = (grids.torsion, grids.dam, grids.voxels, grids.shifted)
 SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # none, and the range of those that are tiny
@@ -18,20 +19,24 @@ SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # none, and the range of those that are
 
 def grid_matrix(draw: Draw) -> MatrixProblem:
     """Return one of several grids as a sparse matrix."""
-    exact = solvable(draw.of(*GRIDS)(draw)).exact()
-    return MatrixProblem(matrix=exact.matrix, b=exact.b, lower=exact.lower, upper=exact.upper)
+    return MatrixProblem.of(solvable(draw.of(*GRIDS)(draw)).exact())
+
+
+def assembled(of_elements: np.ndarray, at: np.ndarray, n: int) -> scipy.sparse.csr_array:
+    """Return the sum of elements' matrices, shape (m, k, k), with rows and columns `at`, shape (m, k)."""
+    k = at.shape[1]
+    rows, columns = np.repeat(at, k, axis=1).ravel(), np.tile(at, k).ravel()
+    return scipy.sparse.coo_array((of_elements.ravel(), (rows, columns)), shape=(n, n)).tocsr()
 
 
 def stiffness(poisson: float) -> np.ndarray:
     """Return the stiffness of a bilinear unit square in plane strain, E = 1; nodes (0,0), (1,0), (0,1), (1,1), x before y."""
     D = np.array([[1 - poisson, poisson, 0], [poisson, 1 - poisson, 0], [0, 0, 0.5 - poisson]]) / ((1 + poisson) * (1 - 2 * poisson))
     K = np.zeros((8, 8))
-    for s in (0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)):
-        for t in (0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)):
-            dx, dy = np.array([t - 1, 1 - t, -t, t]), np.array([s - 1, -s, 1 - s, s])
-            B = np.zeros((3, 8))
-            B[0, ::2], B[1, 1::2], B[2, ::2], B[2, 1::2] = dx, dy, dy, dx
-            K += B.T @ D @ B / 4
+    for s, t in itertools.product((0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)), repeat=2):
+        dx, dy, B = np.array([t - 1, 1 - t, -t, t]), np.array([s - 1, -s, 1 - s, s]), np.zeros((3, 8))
+        B[0, ::2], B[1, 1::2], B[2, ::2], B[2, 1::2] = dx, dy, dy, dx
+        K += B.T @ D @ B / 4
     return K
 
 
@@ -42,9 +47,8 @@ def elastic(draw: Draw) -> MatrixProblem:
     corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1).reshape(-1, 4)
     dofs = (2 * corners[:, :, None] + np.arange(2)).reshape(-1, 8)
     K = stiffness(draw.between(0, 0.45))
-    rows, columns = np.repeat(dofs, 8, axis=1).ravel(), np.tile(dofs, 8).ravel()
-    stiff = np.repeat(np.exp(draw.between(0, 2) * draw.smooth((nx * ny,), 1)), 64) if draw.chance(0.3) else 1.0
-    A = scipy.sparse.coo_array((np.tile(K.ravel(), len(dofs)) * stiff, (rows, columns)), shape=(2 * node.size,) * 2).tocsr()
+    stiff = np.exp(draw.between(0, 2) * draw.smooth((nx * ny,), 1)) if draw.chance(0.3) else np.ones(len(dofs))
+    A = assembled(stiff[:, None, None] * K, dofs, 2 * node.size)
     free = np.ones(2 * node.size, dtype=bool)
     free[2 * node[-1]], free[2 * node[-1] + 1] = False, False
     lower = np.full(2 * node.size, -np.inf)
@@ -67,8 +71,7 @@ def triangles(draw: Draw) -> MatrixProblem:
     good = area > 1e-12
     K = np.einsum("tik,tjk->tij", edges, edges)[good] / (4 * area[good, None, None])
     at = mesh.simplices[good]
-    rows, columns = np.repeat(at, 3, axis=1).ravel(), np.tile(at, 3).ravel()
-    A = scipy.sparse.coo_array((K.ravel(), (rows, columns)), shape=(len(points),) * 2).tocsr()
+    A = assembled(K, at, len(points))
     lumped = np.bincount(at.ravel(), np.repeat(area[good] / 3, 3), len(points))
     inside = np.setdiff1d(np.arange(len(points)), mesh.convex_hull)
     far = ((points - draw.rng.random(2)) ** 2).sum(axis=1)
