@@ -255,7 +255,7 @@ class Hierarchy:
     def rebuild(self) -> None:
         """Coarsen from the finest diagonal down, and factor the coarsest level."""
         self.finest.changed.fill_(1)
-        self._coarsening.run()
+        self.rebuild_changed()
 
     def rebuild_changed(self) -> None:
         """Do what `rebuild` does for the rows of the finest level that are marked in its `changed`, and those that depend on them.

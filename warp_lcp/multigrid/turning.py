@@ -57,11 +57,6 @@ class TurningHierarchy(Hierarchy):
         for companion in getattr(self, "companions", ()):
             companion.refresh()
 
-    def rebuild(self) -> None:
-        """Coarsen from the finest diagonal down."""
-        self.finest.changed.fill_(1)
-        self.rebuild_changed()
-
     def rebuild_changed(self) -> None:
         """Coarsen what the finest level's marked rows change; the last hierarchy clears the marks."""
         wp.copy(self._marks, self.finest.changed)
