@@ -185,4 +185,4 @@ def test_two_hierarchies_of_one_matrix_are_the_same(device):
     first, second = (hierarchy(matrix, np.ones(420, dtype=bool), None, device) for _ in range(2))
     for one, other in zip(first.levels, second.levels, strict=True):
         assert np.array_equal(one.A.values.numpy(), other.A.values.numpy())
-    assert 1.0 < first.complexity < 1.6
+    assert 1.0 < sum(level.A.values.size for level in first.levels) / first.levels[0].A.values.size < 1.6

@@ -252,7 +252,7 @@ def test_the_step_of_a_projected_cycle_is_its_correction_alone():
     """Such a correction keeps to the bounds; with a share of the last direction it would not."""
     scalars = wp.array(np.linspace(2.0, 5.0, SLOTS), dtype=wp.float64, device="cpu")
     before = scalars.numpy().copy()
-    wp.launch(plan_whole_step_kernel, 1, [scalars], device="cpu")
+    wp.launch(plan_whole_step_kernel, 1, [scalars, False], device="cpu")
     after = scalars.numpy()
     assert (after[int(BETA)], after[int(CARRY)]) == (0.0, 0.0)
     assert after[int(STEP)] == before[int(SIZE)]  # the correction's unit, which changes for the next one

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.multigrid import cycle_passes as passes
-from warp_lcp.multigrid.hierarchy import Hierarchy, Level
+from warp_lcp.multigrid.hierarchy import Hierarchy, Level, launch_all
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import Padding
@@ -84,7 +84,7 @@ class DistributedHierarchy(Hierarchy):
         into_ring = L.sweeping(L.t, L.x, first, projected=False, from_zero=True, kind=passes.SWEEP_INTO_RING, rows=everywhere)
         out_of_ring = L.sweeping(L.x, L.t, second, projected=False, kind=passes.SWEEP_OUT_OF_RING, rows=inside)
         passes.SWEEP_TWICE.launch(into_ring, out_of_ring, launch=launch)
-        self._restrict(level, launch)
+        launch_all((*L.filling("x"), L.restricting(self.levels[level + 1])), launch)
 
     @cached_property
     def unswept_cycle(self) -> Program | None:
@@ -102,7 +102,7 @@ class DistributedHierarchy(Hierarchy):
             super()._go_up(level, launch, projected=projected)
             return
         self._climb(level, launch)
-        L.sweep(L.x, L.t, self.settings.weights[0], projected=False, launch=launch)
+        launch_all((*L.filling("t"), L.sweeping(L.x, L.t, self.settings.weights[0], projected=False)), launch)
 
     def _climb(self, level: int, launch: Launch) -> None:
         """Correct a level from the next one, and sweep it once, from x to t."""

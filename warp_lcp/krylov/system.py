@@ -14,22 +14,6 @@ from warp_lcp.rows.vectors import Sums, rows_of
 NORM = RowPass("krylov.norm", HEADERS / "norm.h", "S", reads={"r": "S", "w": "S"}, optional=("w",), sums=("rr",))
 
 
-class WeightedNorm:
-    """||weight^(1/2) r||.
-
-    Args:
-        like: a field like those to be measured.
-        weight: field like it, >= 0; None: all 1.
-    """
-
-    def __init__(self, like: wp.array[Any], weight: wp.array[Any] | None = None) -> None:
-        self._weight, self._sums = weight, Sums(rows_of(like))
-
-    def of(self, r: wp.array[Any]) -> float:
-        """Return the norm of r."""
-        return float(np.sqrt(self._sums.of(NORM, r=r, w=self._weight)[0]))
-
-
 class KrylovSystem:
     """A system that a Krylov method solves; `r` is its right-hand side."""
 
@@ -37,11 +21,11 @@ class KrylovSystem:
 
     def _iterate_by(self, method: Any, weight: wp.array[Any] | None) -> None:
         """Take what iterates: it has `solve`, and the solution in `x`. Norms are weighted like its own."""
-        self._krylov, self.e, self._norm = method, method.x, WeightedNorm(self.r, weight)
+        self._krylov, self.e, self._norms, self._weighted_by = method, method.x, Sums(rows_of(self.r)), weight
 
-    def norm(self) -> float:
-        """Return the norm of r."""
-        return self._norm.of(self.r)
+    def norm(self, field: wp.array[Any] | None = None) -> float:
+        """Return the norm ||weight^(1/2) r||, or that of another field like r."""
+        return float(np.sqrt(self._norms.of(NORM, r=self.r if field is None else field, w=self._weighted_by)[0]))
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate from e = 0 until the norm is at most the tolerance; return iterations and the norm reached."""

@@ -142,11 +142,6 @@ class AlgebraicHierarchy:
         self._matrix, self._inverse = (wp.zeros(shape, dtype=wp.float64, device=self.device) for _ in range(2))
         self.r, self.z = self.levels[0].b, self.levels[0].x
 
-    @property
-    def complexity(self) -> float:
-        """Entries of all levels' matrices over those of the finest one."""
-        return sum(level.A.values.size for level in self.levels) / self.levels[0].A.values.size
-
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take a free set (uint8 field) and a shift D >= 0 (float64 field; None: 0), and coarsen."""
         finest, A = self.levels[0], self.source

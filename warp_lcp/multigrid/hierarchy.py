@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property, partial
 from typing import Any
 
@@ -18,11 +18,18 @@ from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.operators.stencil import Stencil, coarsen_spans_kernel
 from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import Padding, zeros
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.program import Launch, Program, Task
 from warp_lcp.rows.sequence import CUDA_THREADS
 from warp_lcp.rows.vectors import convert
 
 Pair = tuple[wp.array[Any], wp.array[Any]]
+Stage = Bound | Task
+
+
+def launch_all(stages: Iterable[Stage], launch: Launch) -> None:
+    """Launch stages one after another."""
+    for stage in stages:
+        stage.launch(launch)
 
 
 class Level:
@@ -36,7 +43,7 @@ class Level:
         self.lower, self.upper = (bounds or (field(), field() if upper else nothing)) if bounded else (self.x, self.x)
         self.form = stencil.weights is not None, stencil.d.dtype, real
         self.factors = 1, 1, 1  # cells of the finer level along x, y and z that one of this level stands for
-        self._bound: dict[Any, Bound] = {}  # passes by what tells them apart: a W-cycle repeats few of them many times
+        self._bound: dict[Any, Any] = {}  # passes by what tells them apart: a W-cycle repeats few of them many times
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
         rows = stencil.padding.counts[:2]
         self.changed = wp.ones(rows, dtype=wp.uint8, device=stencil.device)  # rows, since the last rebuild
@@ -88,11 +95,40 @@ class Level:
         given: dict[str, Any] = {"stencil": self.stencil, "scale": scale, "projected": projected, **fields}
         return self._once((coarse, projected, id(rows)), lambda: passes.CORRECT.bind(there, **given))  # which keeps the rows
 
-    def filling(self, name: str, axis: int) -> Bound:
-        """Return the pass that fills the ghost cells of a field, x or t, along a periodic axis."""
-        return self._once((name, axis), lambda: self.stencil.filling(getattr(self, name), axis))
+    def filling(self, name: str) -> list[Stage]:
+        """Return what fills the ghost cells of a field, x or t."""
+        return self._once(name, lambda: self.stencil.fillings(getattr(self, name)))
 
-    def _once(self, key: Any, make: Callable[[], Bound]) -> Bound:
+    def pair(self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False) -> Iterator[Stage]:
+        """Yield two sweeps, x to t and back; x is taken for 0 if from_zero."""
+        yield from () if from_zero else self.filling("x")
+        yield self.sweeping(self.t, self.x, weights[0], projected=projected, from_zero=from_zero)
+        yield from self.filling("t")
+        yield self.sweeping(self.x, self.t, weights[1], projected=projected)
+
+    def ring_pair(self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False) -> tuple[Bound, Bound]:
+        """Return the same for one wave: what is between the sweeps lies in a ring of planes."""
+        into = self.sweeping(self.t, self.x, weights[0], projected=projected, from_zero=from_zero, kind=passes.SWEEP_INTO_RING)
+        return into, self.sweeping(self.x, self.t, weights[1], projected=projected, kind=passes.SWEEP_OUT_OF_RING)
+
+    def descending(self, coarse: Level, settings: CycleSettings, *, projected: bool, from_zero: bool) -> Iterator[Stage]:
+        """Yield a leg of a cycle down: a pair of Chebyshev-Jacobi sweeps, and the residual on the next level."""
+        yield from self.pair(settings.weights, projected=projected, from_zero=from_zero)
+        yield from self.filling("x")
+        yield self.restricting(coarse)
+
+    def ascending(self, coarse: Level, settings: CycleSettings, *, projected: bool) -> Iterator[Stage]:
+        """Yield a leg up: the correction and the reverse pair, which keeps the cycle symmetric."""
+        yield self.correcting(coarse, settings.over_correction, projected=projected)
+        yield from self.pair(settings.weights[::-1], projected=projected)
+
+    def coarsened(self, coarse: Level, settings: CycleSettings) -> Iterator[Stage]:
+        """Yield the making of the next level."""
+        yield self.coarsening(coarse, settings.over_correction, settings.excess)
+        for w in coarse.stencil.weights or ():
+            yield from coarse.stencil.fillings(w)
+
+    def _once(self, key: Any, make: Callable[[], Any]) -> Any:
         """Return the pass with this key, made at its first use."""
         made = self._bound.get(key)
         if made is None:
@@ -103,30 +139,17 @@ class Level:
         return coarse.stencil.rows.beside(self.stencil.rows, coarse.factors)
 
     def sweeping(
-        self,
-        y: wp.array[Any],
-        x: wp.array[Any],
-        omega: float,
-        *,
-        projected: bool,
-        from_zero: bool = False,
-        kind: RowPass = passes.SWEEP,
-        rows: Rows | None = None,
-    ) -> Bound:
-        """Return the pass that `sweep` launches, or one of its kind that goes into or out of a ring; of all rows unless told."""
+        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False,
+        kind: RowPass = passes.SWEEP, rows: Rows | None = None,
+    ) -> Bound:  # fmt: skip
+        """Return the pass y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero.
+
+        `kind` may be one that goes into or out of a ring; `rows` are all unless told.
+        """
         fields = {"x": x, "y": y, "b": self.b, "lower": self.lower, "upper": self.upper}
         numbers: dict[str, Any] = {"omega": omega, "projected": projected, "from_zero": from_zero}
         key = kind, id(rows), y is self.x, *numbers.values()
         return self._once(key, lambda: kind.bind(rows or self.stencil.rows, stencil=self.stencil, **numbers, **fields))
-
-    def sweep(
-        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, launch: Launch = wp.launch
-    ) -> None:
-        """y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero."""
-        s = self.stencil
-        if not from_zero:
-            s.wrap(x, launch=launch)
-        self.sweeping(y, x, omega, projected=projected, from_zero=from_zero).launch(launch)
 
 
 class Hierarchy:
@@ -151,18 +174,9 @@ class Hierarchy:
     """
 
     def __init__(
-        self,
-        stencil: Stencil,
-        real: Any,
-        *,
-        bounded: bool,
-        settings: CycleSettings | None = None,
-        bounds: Pair | None = None,
-        shifted: bool = False,
-        shrunk: float = 1.0,
-        strength: list[float] | None = None,
-        finest: Level | None = None,
-    ) -> None:
+        self, stencil: Stencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, bounds: Pair | None = None,
+        shifted: bool = False, shrunk: float = 1.0, strength: list[float] | None = None, finest: Level | None = None,
+    ) -> None:  # fmt: skip
         self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
         self.device = stencil.device
         self._strength = strength or stencil.mean_weights
@@ -241,7 +255,7 @@ class Hierarchy:
     def rebuild(self) -> None:
         """Coarsen from the finest diagonal down, and factor the coarsest level."""
         self.finest.changed.fill_(1)
-        self._coarsening.run()
+        self.rebuild_changed()
 
     def rebuild_changed(self) -> None:
         """Do what `rebuild` does for the rows of the finest level that are marked in its `changed`, and those that depend on them.
@@ -253,14 +267,11 @@ class Hierarchy:
     @cached_property
     def _coarsening(self) -> Program:
         program = Program(self.device)
-        weights = self.settings.over_correction, self.settings.excess
         alone = len(self.levels) if self.device.is_cpu else self._first_small + 1
         for fine, coarse in zip(self.levels, self.levels[1:alone], strict=False):
             if fine.stencil.ghosts is not None:
                 program.record(partial(share_changes, fine))
-            fine.coarsening(coarse, *weights).launch(program.launch)
-            for w in coarse.stencil.weights or ():
-                coarse.stencil.wrap(w, launch=program.launch)
+            launch_all(fine.coarsened(coarse, self.settings), program.launch)
         if self._small is not None and alone < len(self.levels):
             self._small.coarsening.launch(program.launch)
         if len(self.levels) > 1:
@@ -299,7 +310,7 @@ class Hierarchy:
     def projected_sweep(self) -> Program:
         """One projected Jacobi sweep of the finest level: what no bounded problem can make worse."""
         program, L = Program(self.device), self.finest
-        L.sweep(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True, launch=program.launch)
+        L.sweeping(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True).launch(program.launch)
         return program
 
     @cached_property
@@ -354,19 +365,18 @@ class Hierarchy:
         launch = program.launch
         self._go_down(level, launch, projected=projected, from_zero=from_zero)
         if projected:
-            self._bounding(level).launch(launch)
+            self.levels[level].bounding(self.levels[level + 1], self.settings.over_correction).launch(launch)
         self._visit(level + 1, self._visits(level + 1), program, projected=projected)
         if whole:
             self._go_up(level, launch, projected=projected)
 
     def _go_down(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Sweep a level, and restrict its residual to the next one."""
-        L = self.levels[level]
+        L, C, s = self.levels[level], self.levels[level + 1], self.settings
         if self._fuses(L):
-            self._descending_leg(level, launch, projected=projected, from_zero=from_zero)
+            passes.DESCEND.launch(*L.ring_pair(s.weights, projected=projected, from_zero=from_zero), L.restricting(C), launch=launch)
         else:
-            self._pair(L, launch, from_zero=from_zero, projected=projected)
-            self._restrict(level, launch)
+            launch_all(L.descending(C, s, projected=projected, from_zero=from_zero), launch)
 
     def _go_up(self, level: int, launch: Launch, *, projected: bool) -> None:
         """Correct a level from the next one, and sweep it."""
@@ -374,8 +384,7 @@ class Hierarchy:
         if self._fuses(L):
             passes.ASCEND.launch(*self._ascent(level, projected=projected), launch=launch)
         else:
-            self._correcting(level, projected=projected).launch(launch)
-            self._pair(L, launch, reverse=True, projected=projected)
+            launch_all(L.ascending(self.levels[level + 1], self.settings, projected=projected), launch)
 
     def _visits(self, level: int) -> int:
         """Return how often a cycle of the next finer level visits a level: once where that solves."""
@@ -385,47 +394,18 @@ class Hierarchy:
         """Whether a leg of the cycle is one launch: on the CPU, where one thread does it all, unless ghost cells must be filled between."""
         return self.device.is_cpu and not L.stencil.has_ghosts
 
-    def _descending_leg(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
-        """Sweeps, residual and restriction in one launch of one CPU thread."""
-        L, (first, second) = self.levels[level], self.settings.weights
-        into_ring = L.sweeping(L.t, L.x, first, projected=projected, from_zero=from_zero, kind=passes.SWEEP_INTO_RING)
-        out_of_ring = L.sweeping(L.x, L.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING)
-        passes.DESCEND.launch(into_ring, out_of_ring, L.restricting(self.levels[level + 1]), launch=launch)
-
     def _ascent(self, level: int, *, projected: bool) -> tuple[Bound, ...]:
         """Return the passes of a leg up: correction and sweeps."""
-        L, (first, second) = self.levels[level], reversed(self.settings.weights)
-        into_ring = L.sweeping(L.t, L.x, first, projected=projected, kind=passes.SWEEP_INTO_RING)
-        out_of_ring = L.sweeping(L.x, L.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING)
-        return self._correcting(level, projected=projected), into_ring, out_of_ring
+        L, s = self.levels[level], self.settings
+        correcting = L.correcting(self.levels[level + 1], s.over_correction, projected=projected)
+        return correcting, *L.ring_pair(s.weights[::-1], projected=projected)
 
     def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""
-        L = self.levels[-1]
-        if not projected:
-            self._solving.launch(launch)
-        elif self._fuses(L):
+        if projected:
             self._last.cycle(1, launch, projected=True, from_zero=from_zero)
         else:
-            for sweep in range(self.settings.projected_sweeps):
-                self._pair(L, launch, from_zero=from_zero and sweep == 0, projected=True)
-                self._pair(L, launch, reverse=True, projected=True)
-
-    def _pair(self, L: Level, launch: Launch, *, projected: bool, from_zero: bool = False, reverse: bool = False) -> None:
-        """Two Chebyshev-Jacobi sweeps; the reverse pair after the correction keeps the cycle symmetric."""
-        first, second = reversed(self.settings.weights) if reverse else self.settings.weights
-        L.sweep(L.t, L.x, first, projected=projected, from_zero=from_zero, launch=launch)
-        L.sweep(L.x, L.t, second, projected=projected, launch=launch)
-
-    def _restrict(self, level: int, launch: Launch) -> None:
-        self.levels[level].stencil.wrap(self.levels[level].x, launch=launch)
-        self.levels[level].restricting(self.levels[level + 1]).launch(launch)
-
-    def _bounding(self, level: int) -> Bound:
-        return self.levels[level].bounding(self.levels[level + 1], self.settings.over_correction)
-
-    def _correcting(self, level: int, *, projected: bool) -> Bound:
-        return self.levels[level].correcting(self.levels[level + 1], self.settings.over_correction, projected=projected)
+            self._solving.launch(launch)
 
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
         """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""

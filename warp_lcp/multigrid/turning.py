@@ -1,76 +1,19 @@
 """Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled."""
 
-import functools
 import math
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, no_type_check
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.operators.sparse import GATHER
 from warp_lcp.operators.stencil import Stencil
-from warp_lcp.rows import Bound
+from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.program import Program
-
-
-@no_type_check
-@wp.func
-def first_cell(sample: int, samples: int, blocks: int, edge: int):
-    """First cell, from 1, of a sample's block; samples are spread evenly over the blocks."""
-    return sample * blocks / samples * edge + 1
-
-
-@no_type_check
-@functools.cache
-def sample_kernel(real: Any) -> Any:
-    """Return the kernel for weights of this type, a thread a sampled block."""
-    field = wp.array3d(dtype=real)
-
-    @wp.func
-    def largest(w: field, k0: int, j0: int, i0: int, edges: wp.vec3i):
-        """The largest of a block's weights."""
-        most = float(0.0)
-        for k in range(k0, k0 + edges[0]):
-            for j in range(j0, j0 + edges[1]):
-                for i in range(i0, i0 + edges[2]):
-                    most = wp.max(most, float(w[k, j, i]))
-        return most
-
-    @wp.func
-    def mean_logarithm(w: field, k0: int, j0: int, i0: int, edges: wp.vec3i, bottom: float):
-        """Mean logarithm of a block's weights that are not 0, those below `bottom` taken for it; NaN if most are 0: few tell nothing."""
-        total, count = float(0.0), float(0.0)
-        for k in range(k0, k0 + edges[0]):
-            for j in range(j0, j0 + edges[1]):
-                for i in range(i0, i0 + edges[2]):
-                    v = float(w[k, j, i])
-                    if v > 0.0:
-                        total += wp.log(wp.max(v, bottom))
-                        count += 1.0
-        if 2.0 * count < float(edges[0] * edges[1] * edges[2]):
-            total = wp.nan
-        return total / count
-
-    @wp.kernel(enable_backward=False, module=f"warp_lcp.turning.{real.__name__}")
-    def sample(
-        wx: field, wy: field, wz: field, samples: wp.vec3i, blocks: wp.vec3i, edges: wp.vec3i, least: float, out: wp.array(dtype=wp.vec3)
-    ):
-        """Write a block's mean logarithms along x, y, z; weights below `least` of its largest count as that."""
-        c, b, a = wp.tid()
-        k0 = first_cell(c, samples[0], blocks[0], edges[0])
-        j0 = first_cell(b, samples[1], blocks[1], edges[1])
-        i0 = first_cell(a, samples[2], blocks[2], edges[2])
-        most = wp.max(wp.max(largest(wx, k0, j0, i0, edges), largest(wy, k0, j0, i0, edges)), largest(wz, k0, j0, i0, edges))
-        x = mean_logarithm(wx, k0, j0, i0, edges, least * most)
-        y = mean_logarithm(wy, k0, j0, i0, edges, least * most)
-        z = mean_logarithm(wz, k0, j0, i0, edges, least * most)
-        out[(c * samples[1] + b) * samples[2] + a] = wp.vec3(x, y, z)
-
-    return sample
-
 
 Strength = list[float]  # mean weights along x, y and z, in units of the largest
 
@@ -113,11 +56,6 @@ class TurningHierarchy(Hierarchy):
         super().refresh()
         for companion in getattr(self, "companions", ()):
             companion.refresh()
-
-    def rebuild(self) -> None:
-        """Coarsen from the finest diagonal down."""
-        self.finest.changed.fill_(1)
-        self.rebuild_changed()
 
     def rebuild_changed(self) -> None:
         """Coarsen what the finest level's marked rows change; the last hierarchy clears the marks."""
@@ -205,15 +143,29 @@ def _long(stencil: Stencil) -> list[int]:
 
 def _sampled(stencil: Stencil) -> np.ndarray:
     """Return the mean logarithms of the weights along the long axes, a row a block that has open faces along all of them."""
-    counts, long, device = stencil.padding.counts, _long(stencil), stencil.device
+    cells, long, device = stencil.padding.counts, _long(stencil), stencil.device
     dimension = max(len(long), 2)
-    edges = [min(n, EDGES[dimension]) for n in counts]
-    blocks = [n // edge for n, edge in zip(counts, edges, strict=True)]
+    edges = [min(n, EDGES[dimension]) for n in cells]
+    blocks = [n // edge for n, edge in zip(cells, edges, strict=True)]
     samples = [min(n, SAMPLES[dimension]) for n in blocks]
+    shape, sides = stencil.padding.shape, (math.prod(samples), math.prod(edges))
+    along = [
+        (np.arange(m) * n // m * edge + 1)[:, None] + np.arange(edge)  # samples are spread evenly over the blocks
+        for m, n, edge in zip(samples, blocks, edges, strict=True)
+    ]
+    places = np.ravel_multi_index(np.ix_(*(at.ravel() for at in along)), shape)
+    places = places.reshape([n for pair in zip(samples, edges, strict=True) for n in pair]).transpose(0, 2, 4, 1, 3, 5)
+    order = wp.array(places.ravel(), dtype=wp.int32, device=device)
     assert stencil.weights is not None
-    grids = [w.reshape(stencil.padding.shape) for w in stencil.weights]
-    out = wp.empty(math.prod(samples), dtype=wp.vec3, device=device)
-    inputs = [*grids, wp.vec3i(*samples), wp.vec3i(*blocks), wp.vec3i(*edges), LEAST, out]
-    wp.launch(sample_kernel(grids[0].dtype), samples, inputs, device=device)
-    logs = out.numpy()[:, long].astype(np.float64)
-    return logs[np.isfinite(logs).all(axis=1)] if len(long) > 1 else logs[:0]
+    faces = np.stack([_gathered(w, order).reshape(sides) for w in stencil.weights], axis=1)  # by block, axis, face
+    least = LEAST * faces.max(axis=(1, 2), keepdims=True)
+    totals = np.log(np.where(faces > 0, np.maximum(faces, least), 1.0)).sum(axis=2)
+    counts = np.count_nonzero(faces, axis=2)
+    counted = (2 * counts >= sides[1])[:, long].all(axis=1)  # few open faces tell nothing
+    return (totals / np.maximum(counts, 1))[counted][:, long] if len(long) > 1 else totals[:0, long]
+
+
+def _gathered(weights: wp.array[Any], order: wp.array[Any]) -> np.ndarray:
+    taken = wp.empty(order.size, dtype=weights.dtype, device=order.device)
+    GATHER.bind(Rows.flat(order.size, order.device), source=weights, order=order, taken=taken).launch()
+    return taken.numpy().astype(np.float64)

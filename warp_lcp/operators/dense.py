@@ -81,6 +81,10 @@ class DenseOperator(Pickled):
         """Number of rows, which are all unknowns."""
         return self.shape[0]
 
+    def update(self, values: Any) -> None:
+        """Take other entries, shape (n, n), finite; `symmetric` and `row_sizes` stay as they are."""
+        self.matrix.assign(values)
+
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return A x, x of shape (n,) and type wp.float32 or wp.float64."""
         return self._product(x, out, transposed=False)
@@ -125,10 +129,6 @@ class DenseOperator(Pickled):
 
 
 @as_operator.register(np.ndarray)
-def _dense(A: np.ndarray, device: Any = None) -> DenseOperator:
-    return DenseOperator(A, device=device)
-
-
 @as_operator.register(wp.array)
-def _dense_on_device(A: Any, device: Any = None) -> DenseOperator:
-    return DenseOperator(A, device=A.device if device is None else device)
+def _dense(A: Any, device: Any = None, dtype: Any = wp.float64) -> DenseOperator:
+    return DenseOperator(A, device=A.device if device is None and isinstance(A, wp.array) else device, dtype=dtype)

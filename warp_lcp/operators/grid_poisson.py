@@ -90,17 +90,9 @@ class GridPoisson(Pickled):
     _across: Across | None = None
 
     def __init__(
-        self,
-        cells: Any,
-        *,
-        face_x: Face = 1.0,
-        face_y: Face = 1.0,
-        face_z: Face = 1.0,
-        shift: Any = None,
-        periodic: tuple[bool, ...] = (False, False, False),
-        device: Any = None,
-        dtype: Any = wp.float32,
-    ) -> None:
+        self, cells: Any, *, face_x: Face = 1.0, face_y: Face = 1.0, face_z: Face = 1.0, shift: Any = None,
+        periodic: tuple[bool, ...] = (False, False, False), device: Any = None, dtype: Any = wp.float32,
+    ) -> None:  # fmt: skip
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         host = _checked_cells(cells)
@@ -293,20 +285,13 @@ class GridPoisson(Pickled):
         return any(f.size > 0 for f in self.faces)
 
     def _empty_stencil(self) -> Stencil:
-        layout = self.layout
-        means = [self._mean_coefficient(f, c) for f, c in zip(self.faces, self.uniform, strict=True)]
-        strength = (means[0], means[1], means[2])
-        weights = None
-        if self._has_arrays:
-            weights = (layout.zeros(self.dtype), layout.zeros(self.dtype), layout.zeros(self.dtype))
-        unit = max(self.uniform) or 1.0
-        if self._counts_faces:
-            used = [c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1]
-            unit = max(used, default=1.0) or 1.0
-            d, ends = layout.zeros(wp.uint8), (self.periodic, self._spans, strength, self._ghosts)
-            return Stencil(layout.padding, d, None, self.uniform, unit, *ends)
-        d, ends = layout.zeros(self.dtype), (self.periodic, self._spans, strength, self._ghosts)
-        return Stencil(layout.padding, d, weights, self.uniform, 1.0, *ends)
+        layout, counts = self.layout, self._counts_faces
+        strength: Any = tuple(map(self._mean_coefficient, self.faces, self.uniform))
+        weights: Any = tuple(layout.zeros(self.dtype) for _ in AXES) if self._has_arrays else None
+        used = [c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1]
+        unit = (max(used, default=1.0) or 1.0) if counts else 1.0
+        d = layout.zeros(wp.uint8 if counts else self.dtype)
+        return Stencil(layout.padding, d, weights, self.uniform, unit, self.periodic, self._spans, strength, self._ghosts)
 
     def _mean_coefficient(self, face: wp.array[Any], uniform: float) -> float:
         """Return the mean of the coefficients that are not 0."""

@@ -183,6 +183,10 @@ class LowRankOperator(Pickled):
         layout = layout_of(A)
         if columns.size != layout.size:
             raise ValueError(f"columns are for fields of {columns.size} elements: A stores {layout.size}")
+        return cls._of(layout, columns, weights)
+
+    @classmethod
+    def _of(cls, layout: Layout, columns: BlockColumns, weights: Any) -> LowRankOperator:
         made = cls.__new__(cls)
         made._make(layout, columns, weights)
         return made
@@ -190,10 +194,8 @@ class LowRankOperator(Pickled):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the rows of U that are not 0, by the field's elements that they belong to."""
         rows, blocks, values = self.columns.entries()
-        stored = self.layout.zeros(wp.int32)
-        stored.assign(np.arange(self.layout.size))
         user = np.full(self.layout.size, -1)
-        user[self.layout.unload(stored).numpy().ravel()] = np.arange(int(np.prod(self.shape)))
+        user[self.layout.places()] = np.arange(int(np.prod(self.shape)))
         entries = (user[rows], blocks.copy(), values.copy())
         sizes = (self.shape, self.columns.rank // self.columns.width, self.columns.width)
         return made_again(_of_entries, sizes, entries, self.weights.numpy(), device=self.device, dtype=self.dtype)
@@ -225,7 +227,7 @@ class LowRankOperator(Pickled):
         layout = layout_of(A)
         if layout.stored_shape == self.layout.stored_shape:
             return self
-        old, place = self.columns, layout.target(np.arange(layout.size).reshape(layout.stored_shape), np.empty(self.shape)).ravel()
+        old, place = self.columns, layout.places()
         rows, blocks, values = old.entries()
         moved = BlockColumns(layout.size, old.rank // old.width, old.width, old.dtype, old.device)
         moved.assign(place[rows], blocks, values)
@@ -314,9 +316,7 @@ def _of_entries(sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, d
     layout = Layout(shape, wp.get_device(device))
     columns = BlockColumns(layout.size, blocks, width, dtype, layout.device)
     columns.assign(*entries)
-    made = LowRankOperator.__new__(LowRankOperator)
-    made._make(layout, columns, weights)
-    return made
+    return LowRankOperator._of(layout, columns, weights)
 
 
 def _is_symmetric(W: np.ndarray) -> bool:

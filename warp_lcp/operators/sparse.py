@@ -193,17 +193,9 @@ class SparseOperator(Pickled):
         return SparseOperator(matrix, device=self.device, dtype=self.dtype)
 
     def relax(
-        self,
-        x: Any,
-        b: Any,
-        lower: Any,
-        upper: Any,
-        omega: float,
-        *,
-        forward: bool = True,
-        colored: bool | None = None,
+        self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True, colored: bool | None = None,
         launch: Launch = wp.launch,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Sweep x once, each unknown projected onto its bounds; rows with a zero diagonal are passed over.
 
         Args:
@@ -329,5 +321,5 @@ def _is_symmetric(host: scipy.sparse.csr_array, largest: np.ndarray) -> bool:
 
 @as_operator.register(scipy.sparse.sparray)
 @as_operator.register(scipy.sparse.spmatrix)
-def _sparse(A: Any, device: Any = None) -> SparseOperator:
-    return SparseOperator(A, device=device)
+def _sparse(A: Any, device: Any = None, dtype: Any = wp.float64) -> SparseOperator:
+    return SparseOperator(A, device=device, dtype=dtype)

@@ -18,7 +18,7 @@ import warp as wp
 from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.layout import check_memory, put, stencil_struct
-from warp_lcp.rows.program import Launch, perform
+from warp_lcp.rows.program import Launch, Task
 
 HEADERS = Path(__file__).parent / "headers"
 PRODUCT = RowPass(
@@ -174,16 +174,15 @@ class Stencil:
 
     def wrap(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Fill x's ghost cells along periodic axes, and those that stand for cells of others."""
-        for axis, periodic in enumerate(self.periodic):
-            if periodic:
-                self.filling(x, axis).launch(launch)
-        if self.ghosts is not None:
-            perform(partial(self.ghosts.fill, x), launch)
+        for filling in self.fillings(x):
+            filling.launch(launch)
 
-    def filling(self, x: wp.array[Any], axis: int) -> Bound:
-        """Return the pass that fills x's ghost cells along a periodic axis, 0, 1, 2 for x, y, z."""
-        step = (1, self.padding.row, self.padding.plane)[axis]
-        return WRAP.bind(self._edges[axis], x=x, cells=self.padding.counts[2 - axis], step=step)
+    def fillings(self, x: wp.array[Any]) -> list[Bound | Task]:
+        """Return what `wrap` launches."""
+        strides, counts = (1, self.padding.row, self.padding.plane), self.padding.counts[::-1]
+        axes = [axis for axis, periodic in enumerate(self.periodic) if periodic]
+        made: list[Bound | Task] = [WRAP.bind(self._edges[a], x=x, cells=counts[a], step=strides[a]) for a in axes]
+        return made if self.ghosts is None else [*made, Task(partial(self.ghosts.fill, x))]
 
     @cached_property
     def _edges(self) -> list[Rows]:

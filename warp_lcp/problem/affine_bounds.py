@@ -136,9 +136,8 @@ class AffineFields:
         for side, name in zip(sides, SIDES, strict=True):
             if not layout.fits(side.index):
                 raise ValueError(f"{name}: index has shape {side.index.shape}: expected {layout.shape}")
-        stored = _stored_indices(layout)
         self.sides = (sides[0], sides[1])
-        indices = [np.where(s.index >= 0, stored(s.index)[s.index], -1) for s in sides]
+        indices = [np.where(s.index >= 0, layout.places(s.index)[s.index], -1) for s in sides]
         self.constant = [layout.load(s.constant, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)]
         self.coefficient = [layout.load(s.coefficient, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)]
         # ghost cells become 0 by loading, so that -1 is stored as 0 and the others one too large
@@ -201,9 +200,3 @@ def _constant(layout: Layout, side: Any, name: str) -> AffineBounds:
     if shape not in (layout.shape, layout.stored_shape):
         raise ValueError(f"{name} has shape {shape}: expected {layout.shape}")
     return AffineBounds(host, np.full(shape, -1), 0.0)
-
-
-def _stored_indices(layout: Layout) -> Any:
-    """Return a function from the shape of a field's indices to the stored index of each of its elements."""
-    stored = np.arange(layout.size).reshape(layout.stored_shape)
-    return lambda index: layout.target(stored, index).ravel()

@@ -22,7 +22,7 @@ CHECK = RowPass(
 
 
 @singledispatch
-def as_operator(A: Any, device: Any = None) -> Operator:
+def as_operator(A: Any, device: Any = None, dtype: Any = wp.float64) -> Operator:
     """Return A as an operator; operators register here which arrays they take (numpy arrays, scipy.sparse matrices).
 
     What converts to an array, by `__array__` or `to_numpy` (a data frame), is taken as one.
@@ -30,6 +30,7 @@ def as_operator(A: Any, device: Any = None) -> Operator:
     Args:
         A: an operator, or what one is made of.
         device: where an operator is made; the default device if None.
+        dtype: storage of its entries.
 
     Raises:
         ValueError: A is neither, or lacks members of `wl.Operator`; the message names them.
@@ -38,7 +39,7 @@ def as_operator(A: Any, device: Any = None) -> Operator:
     if not missing:
         return A
     if hasattr(A, "__array__") or hasattr(A, "to_numpy"):
-        return as_operator(real_array(A, "A"), device)
+        return as_operator(real_array(A, "A"), device, dtype)
     if hasattr(A, "apply"):
         raise ValueError(f"A is a {type(A).__name__} without {', '.join(missing)}: an operator needs them, see wl.Operator")
     raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")

@@ -173,6 +173,12 @@ class IterateMemory:
         """Round x to its precision."""
         self._round(self.x)
 
+    def _finish_move(self, x: wp.array[Any]) -> None:
+        """Choose the constants that a move of x left open on floating components, and round."""
+        if self.floating is not None:
+            self.floating.settle(x, self.problem.lower, self.problem.upper)
+        self._round(x)
+
     def _round(self, x: wp.array[Any]) -> None:
         if self._rounded is not None:
             convert(x, self._rounded)
@@ -195,14 +201,9 @@ class Solver(Protocol):
 
 
 def solve(
-    problem: LCP | ConvexSetProblem,
-    solver: Solver,
-    *,
-    stopping: StoppingCriteria | None = None,
-    x0: Array | None = None,
-    workspace: Workspace | None = None,
-    callback: Callable[[Record], None] | None = None,
-) -> SolveResult:
+    problem: LCP | ConvexSetProblem, solver: Solver, *, stopping: StoppingCriteria | None = None, x0: Array | None = None,
+    workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None,
+) -> SolveResult:  # fmt: skip
     """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
     if not isinstance(problem, (LCP, ConvexSetProblem)):
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
@@ -314,20 +315,14 @@ class _Loop:
 
     def _status(self, iteration: int, failure: SolveStatus | None, *, interim: bool = False) -> SolveStatus | None:
         """Return how the solve ends now, None if it goes on."""
-        norm, stopping = self.residual.norm, self.stopping
-        if not math.isfinite(norm):
-            return SolveStatus.NON_FINITE
-        if norm <= self.tolerance:
-            return SolveStatus.CONVERGED
-        if failure is not None:
+        norm, first = self.residual.norm, max(self.history[0].residual, self.reference)
+        if failure is not None and self.tolerance < norm < math.inf:
             return self._floor_or(failure)
-        if not interim and norm > stopping.divergence * max(self.history[0].residual, self.reference):
-            return SolveStatus.DIVERGED
-        if iteration >= stopping.max_iterations:
-            return SolveStatus.MAX_ITERATIONS
-        if not interim and iteration - max(self.best_iteration, self.progress) >= stopping.patience:
-            return self._floor_or(SolveStatus.STAGNATED)
-        return None if self.deadline.left() > 0 else SolveStatus.TIME_LIMIT
+        idle = iteration - max(self.best_iteration, self.progress)
+        status = self.stopping.status(norm, self.tolerance, first, iteration, idle, interim=interim)
+        if status is SolveStatus.STAGNATED:
+            return self._floor_or(status)
+        return SolveStatus.TIME_LIMIT if status is None and self.deadline.left() <= 0 else status
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
         """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it.

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from annotated_types import Gt
 
+from warp_lcp.problem.result import SolveStatus
 from warp_lcp.settings import Count, CountOrZero, NonNegative, OrInfinite, Settings, ShareOrZero
 
 
@@ -44,3 +45,24 @@ class StoppingCriteria(Settings):
     def tolerance(self, reference: float) -> float:
         """Return the absolute tolerance for a reference residual norm."""
         return max(self.atol, self.rtol * reference)
+
+    def status(self, norm: float, tolerance: float, first: float, steps: int, idle: int, *, interim: bool = False) -> SolveStatus | None:
+        """Return how an iteration ends, None if it goes on.
+
+        Args:
+            norm: of the residual.
+            tolerance: for it.
+            first: the residual's norm that divergence is relative to.
+            steps: done.
+            idle: steps since the last progress.
+            interim: neither patience nor divergence applies now.
+        """
+        if not math.isfinite(norm):
+            return SolveStatus.NON_FINITE
+        if norm <= tolerance:
+            return SolveStatus.CONVERGED
+        if not interim and norm > self.divergence * first:
+            return SolveStatus.DIVERGED
+        if steps >= self.max_iterations:
+            return SolveStatus.MAX_ITERATIONS
+        return SolveStatus.STAGNATED if not interim and idle >= self.patience else None

@@ -126,6 +126,10 @@ class Layout:
         """Return the part of a stored field that an array which fits it fills, reshaped to that part's shape."""
         return self._inner(stored) if host.shape == self.shape else stored
 
+    def places(self, like: np.ndarray | None = None) -> np.ndarray:
+        """Return where the elements of an array that fits, of the operator's shape unless one is given, are in a stored field."""
+        return self.target(np.arange(self.size).reshape(self.stored_shape), np.empty(self.shape) if like is None else like).ravel()
+
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape; a copy unless both are the same."""
         return stored.reshape(self.shape)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from typing import Any, Protocol
@@ -29,11 +30,15 @@ class Launch(Protocol):
         """Launch the kernel now, or record its launch."""
 
 
+@dataclass(frozen=True)
 class Task:
     """What the host does between launches: exchange with other processes, say."""
 
-    def __init__(self, function: Callable[[], object]) -> None:
-        self.launch = function
+    function: Callable[[], object]
+
+    def launch(self, launch: Launch = wp.launch) -> None:
+        """Do it now, or record it between the launches."""
+        perform(self.function, launch)
 
 
 def perform(function: Callable[[], object], launch: Launch) -> None:

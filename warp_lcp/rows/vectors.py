@@ -73,15 +73,9 @@ class Reduction:
     """
 
     def __init__(
-        self,
-        n: int,
-        device: wp.Device,
-        scalars: wp.array[wp.float64],
-        *,
-        columns: int = 1,
-        threads: int | None = None,
+        self, n: int, device: wp.Device, scalars: wp.array[wp.float64], *, columns: int = 1, threads: int | None = None,
         across: Across | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.scalars, self.columns, self._across = scalars, columns, across
         self.threads = threads or Rows.flat(n, device).places
         self.block = min(CUDA_BLOCK, self.threads) if device.is_cuda else 1

@@ -144,10 +144,6 @@ class BlockWorkspace(SweepWorkspace):
         self._operands = [rows.operand, problem.b, *bound_operands(problem), wp.float64(settings.omega), given]
         self._kernel = block_sweep_kernel(rows.values.dtype, max(sizes))
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
-        """Rows are shared with the operator."""
-        self.contraction.start(self.x)
-
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Solve each block once: by one thread, or color by color."""
         colors = range(len(self._starts) - 1)
@@ -185,10 +181,6 @@ class LineWorkspace(SweepWorkspace):
         zeros, numbers = problem.layout.zeros, {"AXIS": axis.value, "cells": counts[axis.value], "most": CHANGES, "omega": settings.omega}
         memory = {name: zeros(f64) for name in ("c", "q", "z")} | {"s": zeros(wp.uint8)}
         self._given: dict[str, Any] = memory | numbers | {"s1": padding.plane, "s2": padding.row}
-
-    def start(self, *, warm: bool, tolerance: float) -> None:
-        """The stencil is the operator's own."""
-        self.contraction.start(self.x)
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Solve the lines of one color, then those of the other."""

@@ -115,14 +115,9 @@ class StaggeredRound:
 
 
 def solve_coupled(
-    blocks: Sequence[CoupledBlock],
-    solvers: Sequence[Solver],
-    *,
-    stopping: StoppingCriteria | None = None,
-    eta: float = 1e-2,
-    max_block_iterations: int = 100,
-    staggered: StaggeredRound | None = None,
-) -> CoupledResult:
+    blocks: Sequence[CoupledBlock], solvers: Sequence[Solver], *, stopping: StoppingCriteria | None = None, eta: float = 1e-2,
+    max_block_iterations: int = 100, staggered: StaggeredRound | None = None,
+) -> CoupledResult:  # fmt: skip
     """Solve coupled problems in turn until all are solved at once ([Book] 2.2.4, staggering).
 
     Converges where the coupling is weak or comes from one symmetric positive definite matrix; there is no proof for friction.
@@ -145,29 +140,14 @@ def solve_coupled(
     norms = rounds.residuals()
     history = [float(np.linalg.norm(norms))]
     tolerance, linear, best = stopping.tolerance(history[0]), 0, 0
-    status = _status(history, tolerance, best, stopping, deadline)
-    while status is None:
+    status = stopping.status(history[0], tolerance, history[0], 0, 0)
+    while status is None and deadline.left() > 0:
         with suppress(TimeIsUp), deadline:
             linear += rounds.run(tolerance)
         norms = rounds.residuals()
         history.append(float(np.linalg.norm(norms)))
-        best = len(history) - 1 if history[-1] < min(history[:-1]) else best
-        status = _status(history, tolerance, best, stopping, deadline)
-    relative = history[-1] / history[0] if history[0] > 0 else 0.0
+        done = len(history) - 1
+        best = done if history[-1] < min(history[:-1]) else best
+        status = stopping.status(history[-1], tolerance, history[0], done, done - best)
+    status, relative = status or SolveStatus.TIME_LIMIT, history[-1] / history[0] if history[0] > 0 else 0.0
     return CoupledResult(status, len(history) - 1, linear, history[-1], relative, norms, history, time.perf_counter() - begun)
-
-
-def _status(history: list[float], tolerance: float, best: int, stopping: StoppingCriteria, deadline: Deadline) -> SolveStatus | None:
-    """Return how the loop ends now, None if it goes on."""
-    norm, rounds = history[-1], len(history) - 1
-    if not math.isfinite(norm):
-        return SolveStatus.NON_FINITE
-    if norm <= tolerance:
-        return SolveStatus.CONVERGED
-    if norm > stopping.divergence * history[0]:
-        return SolveStatus.DIVERGED
-    if rounds >= stopping.max_iterations:
-        return SolveStatus.MAX_ITERATIONS
-    if rounds - best >= stopping.patience:
-        return SolveStatus.STAGNATED
-    return None if deadline.left() > 0 else SolveStatus.TIME_LIMIT

@@ -31,15 +31,9 @@ def default_method(problem: LCP) -> Solver:
 
 
 def solve(
-    problem: LCP | ConvexSetProblem,
-    solver: Solver | None = None,
-    *,
-    stopping: StoppingCriteria | None = None,
-    x0: Array | None = None,
-    workspace: Workspace | None = None,
-    callback: Callable[[Record], None] | None = None,
-    **misplaced: Never,
-) -> SolveResult:
+    problem: LCP | ConvexSetProblem, solver: Solver | None = None, *, stopping: StoppingCriteria | None = None, x0: Array | None = None,
+    workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None, **misplaced: Never,
+) -> SolveResult:  # fmt: skip
     """Solve a problem by a method.
 
     Args:

@@ -248,9 +248,15 @@ class DenseWorkspace(IterateMemory):
         stored[self.data.rows] = np.clip(values, self.data.lower, self.data.upper)
         self.x.assign(stored)
 
-    def result(self, name: str, pivots: int, active: int | None) -> Step:
+    @property
+    def held(self) -> int:
+        """Number of unknowns at a bound."""
+        x = self.read_iterate()
+        return int(np.count_nonzero((x <= self.data.lower) | (x >= self.data.upper)))
+
+    def result(self, name: str, pivots: int) -> Step:
         """Return what a step did: interim while the method goes on."""
-        return Step(name, pivots, active, self.ended, interim=self.ended is None)
+        return Step(name, pivots, self.held, self.ended, interim=self.ended is None)
 
 
 def pivots_of(setting: int | None, n: int) -> int:

@@ -53,9 +53,7 @@ class DirectEnumeration:
             work.ended = SolveStatus.STAGNATED
         else:
             work.ended = SolveStatus.INFEASIBLE
-        values = work.read_iterate()
-        held = (values <= work.data.lower) | (values >= work.data.upper)
-        return work.result("sets", int(np.count_nonzero(measures <= 1)), int(np.count_nonzero(held)))
+        return work.result("sets", int(np.count_nonzero(measures <= 1)))
 
     def solutions(self, problem: LCP) -> np.ndarray:
         """Return all solutions that some active set determines, shape (k, n), k = 0 where there is none.

@@ -150,14 +150,9 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def batch(
-        A: wp.array3d(dtype=dtype),
-        b: wp.array2d(dtype=dtype),
-        lower: wp.array2d(dtype=dtype),
-        upper: wp.array2d(dtype=dtype),
-        accepted: dtype,
-        x: wp.array2d(dtype=dtype),
-        chosen: wp.array(dtype=wp.int32),
-    ):
+        A: wp.array3d(dtype=dtype), b: wp.array2d(dtype=dtype), lower: wp.array2d(dtype=dtype), upper: wp.array2d(dtype=dtype),
+        accepted: dtype, x: wp.array2d(dtype=dtype), chosen: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
         """Solve a problem a thread; bounds of one row serve all problems."""
         t = wp.tid()
         M, q, low, high = mat(), vec(), vec(), vec()
@@ -177,13 +172,9 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def each(
-        A: wp.array2d(dtype=dtype),
-        b: wp.array(dtype=dtype),
-        lower: wp.array(dtype=dtype),
-        upper: wp.array(dtype=dtype),
-        x: wp.array2d(dtype=dtype),
-        measures: wp.array(dtype=dtype),
-    ):
+        A: wp.array2d(dtype=dtype), b: wp.array(dtype=dtype), lower: wp.array(dtype=dtype), upper: wp.array(dtype=dtype),
+        x: wp.array2d(dtype=dtype), measures: wp.array(dtype=dtype),
+    ):  # fmt: skip
         """Try a set a thread; measure 2 where the set has no x."""
         code = wp.tid()
         M, q, low, high = mat(), vec(), vec(), vec()

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 import warp as wp
 
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, has, version_of
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scaled
@@ -54,13 +52,11 @@ class EquilibratedWorkspace(IterateMemory):
         super().__init__(problem, precision)
         layout, bounds = problem.layout, problem.bounds
         self._rows, self._units = layout.zeros(wp.float64), layout.zeros(wp.float64)
-        matrix = self._scaled()
-        made: Any = SparseOperator if scipy.sparse.issparse(matrix) else DenseOperator
         sides = [layout.zeros(wp.float64) if bounds.varying[k] or bounds.values[k] not in (0.0, -np.inf, np.inf) else None for k in (0, 1)]
         self._sides = sides
-        operator = made(matrix, device=problem.device, dtype=problem.A.dtype)
+        self._operator: Any = as_operator(self._scaled(), problem.device, problem.A.dtype)
         limits = [bounds.values[k] if side is None else side for k, side in enumerate(sides)]
-        self._inner = LCP(operator, layout.zeros(wp.float64), *limits)
+        self._inner = LCP(self._operator, layout.zeros(wp.float64), *limits)
         self.inner = make(self._inner)
         self._version = version_of(problem.A)
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
@@ -75,11 +71,8 @@ class EquilibratedWorkspace(IterateMemory):
         inner, version = self._inner, version_of(self.problem.A)
         if version is None or version != self._version:
             self._version = version
-            operator: Any = inner.A
-            if isinstance(operator, SparseOperator):
-                operator.update(self._scaled())
-            else:
-                operator.matrix.assign(self._scaled())
+            self._operator.update(self._scaled())
+            if isinstance(self._operator, DenseOperator):
                 self.inner.residual.rescale()
         UNITS.bind(rows_of(inner.b), x=self.problem.b, units=self._rows, inverse=False, scaled=inner.b).launch()
         for k, side in enumerate(self._sides):

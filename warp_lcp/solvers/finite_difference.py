@@ -19,13 +19,9 @@ from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
 HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
 DIFFERENCE = RowPass(
-    "finite_difference.difference",
-    HEADERS / "difference.h",
-    f64,
-    reads={"free": wp.uint8, "f": f64},
-    writes={"q": f64},
+    "finite_difference.difference", HEADERS / "difference.h", f64, reads={"free": wp.uint8, "f": f64}, writes={"q": f64},
     numbers={"over": f64},
-)
+)  # fmt: skip
 SCALE = RowPass("finite_difference.scale", HEADERS / "divide_by_size.h", f64, reads={"r": f64, "d": f64}, writes={"z": f64})
 STEP = 1e-7  # relative to ||x|| / ||p||: half the digits of float64
 
@@ -59,7 +55,7 @@ class FiniteDifferenceSystem(KrylovSystem):
         """Take the point x, where the residual was evaluated, and make -f / size on the free unknowns the right-hand side."""
         self._x, self._free, self._size = x, free, size
         self._map.values(x, self._f)
-        self._length = 1 + self._norm.of(x)
+        self._length = 1 + self.norm(x)
         self.r.zero_()
         DIFFERENCE.bind(rows_of(self.r), free=free, f=self._f, over=1 / size, q=self.r).launch()
 
@@ -68,7 +64,7 @@ class FiniteDifferenceSystem(KrylovSystem):
         SCALE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        norm = self._norm.of(p)
+        norm = self.norm(p)
         if norm == 0:
             q.zero_()
             return

@@ -243,9 +243,7 @@ class FischerWorkspace(IterateMemory):
             move, self._gone = scale - self._gone, scale
             return self._condense(x, move) if math.isfinite(move) else math.inf
         self._go(x, scale)
-        if self.floating is not None:
-            self.floating.settle(x, self.problem.lower, self.problem.upper)
-        self._round(x)
+        self._finish_move(x)
         return self._condense(x) if math.isfinite(self._evaluate(x)) else math.inf
 
     def _go(self, x: wp.array[Any], scale: float) -> None:

@@ -74,6 +74,11 @@ class FischerMap:
         q = self.share * q + rest * ((y > 0) * lowered + (y < 0) * raised)
         return p, q, kinks
 
+    def linearized(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return f and what `derivative` does."""
+        y = self.data.affine(x)
+        return self.value(x, y), *self.derivative(x, y)
+
     def jacobian(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return diag(p d) + diag(q) A."""
         return np.diag(p * self.d) + q[:, None] * self.data.A
@@ -156,9 +161,7 @@ class FischerDenseWorkspace(DenseWorkspace):
     def _plain(self) -> SolveStatus | None:
         """Take a step of the book's method: algorithm 12."""
         x, map_ = self._iterate, self.map
-        y = map_.data.affine(x)
-        f = map_.value(x, y)
-        p, q, kinks = map_.derivative(x, y)
+        f, p, q, kinks = map_.linearized(x)
         move = ~kinks if map_.kink is Kink.ZERO else np.ones(len(x), dtype=bool)
         J = map_.jacobian(p, q)
         dx = np.zeros(len(x))
@@ -171,9 +174,7 @@ class FischerDenseWorkspace(DenseWorkspace):
     def _regularized(self) -> SolveStatus | None:
         """Take a step of the safeguarded method, along the gradient if that of Newton's is no descent."""
         x, map_ = self._iterate, self.map
-        y = map_.data.affine(x)
-        f = map_.value(x, y)
-        p, q, kinks = map_.derivative(x, y)
+        f, p, q, kinks = map_.linearized(x)
         if map_.kink is Kink.ZERO:
             p, q = np.where(kinks, 1.0, p), np.where(kinks, 0.0, q)
         J = map_.jacobian(p, q)

@@ -352,9 +352,7 @@ class InteriorPointWorkspace(IterateMemory):
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
         """Take the step, and remember mu."""
         self.mu = float(self._launch(MOVE, **self._moving(x, second, tau, length))[0]) / max(self.count, 1)
-        if self.floating is not None:
-            self.floating.settle(x, self.problem.lower, self.problem.upper)
-        self._round(x)
+        self._finish_move(x)
 
     def _inside(self, x: wp.array[Any], width: float) -> None:
         """Set w and v to at least width / d, and x accordingly."""

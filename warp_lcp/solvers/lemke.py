@@ -208,7 +208,7 @@ class Lemke(Settings):
     def step(self, problem: LCP, work: LemkeWorkspace, x: wp.array[Any]) -> Step:
         """Make a block of pivots."""
         done = work.pivot(pivots_of(self.pivots_per_step, len(work.data.b)))
-        return work.result("pivots", done, work.held)
+        return work.result("pivots", done)
 
 
 class Basis:
@@ -391,12 +391,6 @@ class LemkeWorkspace(DenseWorkspace):
         m = len(self.form.q)
         self._sizes = (float(abs(self.form.M).max() if m else 0.0) or 1.0, float(np.abs(self.form.q).max(initial=0.0)) or 1.0)
         self._cover(np.ones(m))
-
-    @property
-    def held(self) -> int:
-        """Number of unknowns at a bound."""
-        x = self.read_iterate()
-        return int(np.count_nonzero((x <= self.data.lower) | (x >= self.data.upper)))
 
     def pivot(self, count: int) -> int:
         """Make at most `count` pivots; returns how many were made."""

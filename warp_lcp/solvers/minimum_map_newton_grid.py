@@ -74,6 +74,7 @@ class GridNewtonWorkspace(MultigridWorkspace):
     def __init__(self, problem: LCP, A: HasStencil, settings: MinimumMapNewton, *, serves: bool = False) -> None:
         super().__init__(problem, A, settings, shifted=serves)  # type: ignore[arg-type]
         self._newton, self._norms, self._target, self._serves = settings, list[float](), 0.0, serves
+        self._stored = serves  # elsewhere
 
     def _residual(self, problem: LCP, rounded: bool) -> MinimumMapResidual:
         return MinimumMapResidual(problem, self.A, self.hierarchy, rounded=rounded)
@@ -124,16 +125,6 @@ class GridNewtonWorkspace(MultigridWorkspace):
     def _creeps(self) -> bool:
         """Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard has the word."""
         return super()._creeps() and self._rounded is None
-
-    def _leave(self) -> None:
-        """Store the best iterate before x leaves it behind."""
-        if not self._serves:
-            super()._leave()
-
-    def _store(self) -> None:
-        """Keep the best iterate in memory of its own."""
-        if not self._serves:
-            super()._store()
 
     def _shorten(self, limit: float, iterations: int, active: int) -> Step:
         """Take the longest of the halves of the last move that the safeguard allows; if there is none, projected cycles."""

@@ -340,9 +340,7 @@ class MPRGPWorkspace(IterateMemory):
     def _settle(self, target: wp.array[Any]) -> None:
         """Take what a step wrote as x."""
         self.x = target
-        if self.floating is not None:
-            self.floating.settle(self.x, self.problem.lower, self.problem.upper)
-        self._round(self.x)
+        self._finish_move(self.x)
         self.residual.current = False
 
     def keep(self) -> None:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
 from warp_lcp.operators.sparse import SparseOperator, greedy_colors
-from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasFaces, HasRows, described, has, version_of
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.rows import RowPass
@@ -45,7 +44,7 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
     if isinstance(blocks, str) or not hasattr(blocks, "__iter__"):
         raise ValueError(f"blocks = {blocks!r}: expected a number of unknowns, or for each block a list of indices")
     layout = problem.layout
-    place = layout.target(np.arange(layout.size).reshape(layout.stored_shape), np.empty(layout.shape)).ravel()
+    place = layout.places()
     found = []
     for k, block in enumerate(blocks):
         index = np.asarray(block, dtype=np.int64).ravel()
@@ -86,24 +85,20 @@ class MatrixBlock:
     def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
         self._whole, self._x, self._rows = whole, x, rows
         inner, self._outer = self._entries()
-        made: Any = DenseOperator if isinstance(inner, np.ndarray) else SparseOperator
         device, size = whole.device, len(rows)
-        A = made(inner, device=device, dtype=whole.A.dtype)
+        A = as_operator(inner, device, whole.A.dtype)
         b, low, high = (wp.zeros(size, dtype=wp.float64, device=device) for _ in range(3))
         self.problem = LCP(A, b, low, high)
         self._version = version_of(whole.A)
 
     def refresh(self) -> None:
         """Take A's entries again where they have changed."""
-        A, version = self.problem.A, version_of(self._whole.A)
+        A, version = cast(Any, self.problem.A), version_of(self._whole.A)
         if isinstance(A, SparseOperator) and version == self._version:
             return
         self._version = version
         inner, self._outer = self._entries()
-        if isinstance(A, DenseOperator):
-            A.matrix.assign(inner)
-        elif isinstance(A, SparseOperator):
-            A.update(inner)
+        A.update(inner)
 
     def couple(self) -> None:
         """Write b_B + A_BC x_C and the bounds at x."""

@@ -12,10 +12,9 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.multigrid.aggregates import coarse_points, suits_multigrid
-from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
@@ -236,9 +235,8 @@ class ProximalPoint:
         self._b, self._eps = problem.b.numpy(), CENTER
         if scipy.sparse.issparse(self._matrix) and len(self._D) <= SMALL:
             self._matrix = self._matrix.toarray()
-        made: Any = SparseOperator if scipy.sparse.issparse(self._matrix) else DenseOperator
-        operator = made(self._regularized(), device=problem.device, dtype=wp.float64)
-        regularized = LCP(operator, self._b, problem.lower.numpy(), problem.upper.numpy())
+        self._operator: Any = as_operator(self._regularized(), problem.device)
+        regularized = LCP(self._operator, self._b, problem.lower.numpy(), problem.upper.numpy())
         self._inner = Inner(PrimalDualActiveSet(precision="double"), regularized)
         self._inner.work.last_resort = False
         self._smallest, self._idle, self._steps, self._near, self._least = residual.norm, 0, 0, 0.0, LEAST
@@ -265,11 +263,7 @@ class ProximalPoint:
         inner = self._inner.problem
         center = np.clip(x.numpy(), inner.lower.numpy(), inner.upper.numpy())
         x.assign(center)
-        operator: Any = inner.A
-        if isinstance(operator, SparseOperator):
-            operator.update(self._regularized())
-        else:
-            operator.matrix.assign(self._regularized())
+        self._operator.update(self._regularized())
         inner.b.assign(self._b - self._eps * self._D * center)
         self._center = center
         size = self._residual.evaluate(x)

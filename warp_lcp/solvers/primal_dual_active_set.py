@@ -12,6 +12,7 @@ import warp as wp
 from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import PrecisionName, Step
@@ -93,8 +94,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         self._seen: dict[bytes, float] = {}  # residuals at the sets met
         self._last, self._moved, self._stuck, self._pivots = b"", True, 0, 0
         self.cycled, self.places, self.first = False, None, 0.0
-        nothing, none = wp.empty(0, dtype=wp.float64, device=self.problem.device), wp.empty(0, dtype=wp.uint8, device=self.problem.device)
-        self._unbounded = [nothing, wp.float64(-np.inf), nothing, wp.float64(np.inf), none]
+        self._unbounded = Bounds(self.problem.layout, *INFINITE).operands
 
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Classify, solve on the free set, take the whole step; a least-index one after a cycle."""
@@ -122,9 +122,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
             wp.copy(self.trial, x)
         bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
         projected_move(self._sums.rows, bounds, x, self.system.e, size, x)
-        if self.floating is not None:
-            self.floating.settle(x, p.lower, p.upper)
-        self._round(x)
+        self._finish_move(x)
         norm = self.residual.evaluate(x)
         if watched and not norm <= BLOWN * self.first:  # the free block is all but singular
             wp.copy(x, self.trial)

@@ -13,7 +13,7 @@ from warp_lcp.operators.low_rank import ENTRIES, LowRankOperator
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, GZ, SIZE, STEP, ZAP, ZAZ, rescale
+from warp_lcp.solvers.projected_multigrid_kernels import ZAP, ZAZ
 
 I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
@@ -56,20 +56,6 @@ def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
             zp += uz[i] * w * up[j]
     scalars[ZAZ] += zz
     scalars[ZAP] += zp
-
-
-@no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
-def plan_bounded_step_kernel(scalars: F64):
-    """Take a projected cycle's correction z, or as much of it as lowers the energy most; half of z keeps to the bounds as z does."""
-    share = wp.float64(1.0)
-    curvature = scalars[ZAZ]
-    if curvature > scalars[GZ]:
-        share = wp.max(scalars[GZ] / curvature, wp.float64(0.0))
-    scalars[BETA] = wp.float64(0.0)
-    scalars[STEP] = share * scalars[SIZE]
-    scalars[CARRY] = wp.float64(0.0)
-    rescale(scalars)
 
 
 HEADERS = Path(__file__).parent / "headers"
@@ -199,17 +185,10 @@ class LowRankCorrection:
         order[: len(strong)] = strong
         self._of_slot.assign(order)
         self._slot_columns = strong
-        self._dots = (
-            Reduction(n, low.device, self._sums, columns=len(strong), threads=self._hierarchy.finest.stencil.rows.places)
-            if strong
-            else None
-        )
-        if self._dots is not None:
-            given, rows, finest = (
-                {"Z": self._Z, "slots": len(strong), "size": n},
-                self._hierarchy.finest.stencil.rows,
-                self._hierarchy.finest,
-            )
+        self._dots, finest = None, self._hierarchy.finest
+        if strong:
+            rows, given = finest.stencil.rows, {"Z": self._Z, "slots": len(strong), "size": n}
+            self._dots = Reduction(n, low.device, self._sums, columns=len(strong), threads=rows.places)
             self._multiply = DOTS.bind(rows, r=finest.b, out=self._dots.partials, **given)
             self._subtract = SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, **given)
         for q in kept:

@@ -10,7 +10,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 import warp as wp
 
-from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
+from warp_lcp.krylov.conjugate_gradient import ConjugateGradient, Preconditioner
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.aggregates import suits_multigrid
@@ -21,14 +21,13 @@ from warp_lcp.rows.program import Launch
 
 # symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
 FAR_FROM_M = partial(AlgebraicSettings, strength=0.08, interval=(0.05, 1.0))
+DROP, FILL = 1e-4, 10.0  # share of a column below which entries of the factors go, and the most of them in units of A's
 DIRECT = 2000  # unknowns up to which factors are complete: that costs less than the iterations it saves
 
 
-class SparsePreconditioner(Protocol):
+class SparsePreconditioner(Preconditioner, Protocol):
     """An approximate inverse of M = P A P + P D P, and M itself."""
 
-    r: wp.array[Any]
-    z: wp.array[Any]
     weight: wp.array[Any]
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
@@ -36,9 +35,6 @@ class SparsePreconditioner(Protocol):
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """q = M p, on the device."""
-
-    def apply(self) -> None:
-        """Write z, about M^-1 r."""
 
 
 class SparseSystem(KrylovSystem):
@@ -89,12 +85,10 @@ class IncompleteFactors:
     Args:
         A: the matrix, on the CPU.
         real: type of the corrections.
-        drop: entries of the factors below this share of their column are dropped.
-        fill: the most entries of the factors, in units of A's.
     """
 
-    def __init__(self, A: SparseOperator, real: Any, *, drop: float = 1e-4, fill: float = 10.0) -> None:
-        self._A, self._drop, self._fill = A, drop, fill
+    def __init__(self, A: SparseOperator, real: Any) -> None:
+        self._A = A
         self.r, self.z, self.weight = (wp.zeros(A.unknowns, dtype=real, device="cpu") for _ in range(3))
         self._solve: Any = None
         self._free = np.zeros(0, dtype=np.intp)
@@ -130,7 +124,7 @@ class IncompleteFactors:
                 nudged = block if nudge == 0 else (block + nudge * size * scipy.sparse.eye_array(block.shape[0])).tocsc()
                 if block.shape[0] <= DIRECT:
                     return scipy.sparse.linalg.splu(nudged).solve
-                return scipy.sparse.linalg.spilu(nudged, drop_tol=self._drop, fill_factor=self._fill).solve
+                return scipy.sparse.linalg.spilu(nudged, drop_tol=DROP, fill_factor=FILL).solve
             except RuntimeError:  # a factor is exactly singular
                 continue
         return np.asarray

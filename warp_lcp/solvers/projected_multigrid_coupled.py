@@ -110,7 +110,7 @@ class CoupledWorkspace(MultigridWorkspace):
 
     def _plan_monotone_step(self) -> None:
         self._sum_products()
-        wp.launch(coupling.plan_bounded_step_kernel, 1, [self.residual.scalars], device=self.problem.device)
+        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, True], device=self.problem.device)
 
     def _newton_step(self) -> Step:
         """Take a step of Newton's method on the minimum map, whose memory is made when the first solve needs it."""

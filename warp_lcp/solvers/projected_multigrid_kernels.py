@@ -115,9 +115,16 @@ def rescale(scalars: f64):
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
-def plan_whole_step_kernel(scalars: f64):
-    """Take the correction as it is: what a projected cycle returns keeps to the bounds. The direction is forgotten."""
+def plan_whole_step_kernel(scalars: f64, searched: bool):
+    """Take a projected cycle's correction z as it is, or as much of it as lowers the energy most; both keep to the bounds.
+
+    The direction is forgotten.
+    """
+    share = wp.float64(1.0)
+    if searched:
+        if scalars[ZAZ] > scalars[GZ]:
+            share = wp.max(scalars[GZ] / scalars[ZAZ], wp.float64(0.0))
     scalars[BETA] = wp.float64(0.0)
-    scalars[STEP] = scalars[SIZE]
+    scalars[STEP] = share * scalars[SIZE]
     scalars[CARRY] = wp.float64(0.0)
     rescale(scalars)

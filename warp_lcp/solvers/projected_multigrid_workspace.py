@@ -179,25 +179,24 @@ class MultigridWorkspace(IterateMemory):
         """Store the best iterate before x leaves it behind: it was x, or one step ago."""
         exact = self.floating is None and self._rounded is None  # else x is more than a step from it
         if not self._stored and self._past == (1 if exact else 0):
-            if self._best is None:
-                self._best = wp.empty_like(self.x)
-            if exact:
-                self._undo(self._best)
-            else:
-                wp.copy(self._best, self.x)
-            self._stored = True
+            self._keep_stored(by_undoing=exact)
         self._past += 1
 
     def _store(self) -> None:
         """Keep the best iterate in memory of its own: x is about to change by more than can be taken back."""
-        if not self._stored and self._past == 0:
-            if self._best is None:
-                self._best = wp.empty_like(self.x)
+        exact = self.floating is None and self._rounded is None
+        if not self._stored and self._past <= (1 if exact else 0):
+            self._keep_stored(by_undoing=self._past == 1)
+
+    def _keep_stored(self, *, by_undoing: bool) -> None:
+        """Store x, or where its last step began."""
+        if self._best is None:
+            self._best = wp.empty_like(self.x)
+        if by_undoing:
+            self._undo(self._best)
+        else:
             wp.copy(self._best, self.x)
-            self._stored = True
-        elif not self._stored and self._past == 1:
-            self._leave()
-            self._past = 1  # that counted a step
+        self._stored = True
 
     def _undo(self, out: wp.array[Any]) -> None:
         """Write where the last step began."""
@@ -286,7 +285,7 @@ class MultigridWorkspace(IterateMemory):
         """Take the projected cycle's correction as it is."""
         finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x)
-        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars], device=self.problem.device)
+        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, False], device=self.problem.device)
 
     def truncated_step(self) -> Step:
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
@@ -382,14 +381,11 @@ class MultigridWorkspace(IterateMemory):
 
     def _advance(self, *, settle: bool = False) -> None:
         """Take the planned step and evaluate the residual there."""
-        p = self.problem
         if self.floating is None and self._rounded is None:
             self.residual.advance(self.x, self._p)
             return
         self.residual.update(self.x, self._p)
-        if self.floating is not None and settle:
-            self.floating.settle(self.x, p.lower, p.upper)
-        self._round(self.x)
+        (self._finish_move if settle else self._round)(self.x)
         self.residual.assess(self.x)
 
     def _rebuild(self) -> None:

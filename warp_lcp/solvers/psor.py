@@ -96,7 +96,7 @@ class SweepWorkspace(IterateMemory):
         contraction: the test of its sweeps.
     """
 
-    sweep: Sweep
+    sweep = Sweep()
 
     def __init__(self, problem: LCP, precision: str) -> None:
         super().__init__(problem, precision)

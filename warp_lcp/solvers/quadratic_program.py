@@ -58,10 +58,7 @@ class QuadraticProgram(Settings):
 
     def step(self, problem: LCP, work: QuadraticProgramWorkspace, x: wp.array[Any]) -> Step:
         """Solve the quadratic program as a whole."""
-        iterations = work.minimize(self.tolerance, self.max_iterations)
-        values = work.read_iterate()
-        held = (values <= work.data.lower) | (values >= work.data.upper)
-        return work.result("quadratic program", iterations, int(np.count_nonzero(held)))
+        return work.result("quadratic program", work.minimize(self.tolerance, self.max_iterations))
 
 
 class QuadraticProgramWorkspace(DenseWorkspace):

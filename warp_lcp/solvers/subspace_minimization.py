@@ -158,9 +158,7 @@ class SubspaceWorkspace(SweepWorkspace):
             p.bounds.follow(x)
             old = dict(zip(("old_lower", "old_upper"), self._old_bounds, strict=True))
             FOLLOW.bind(self._sums.rows, bounds=p.bounds.operands, x=x, **old).launch()
-        if self.floating is not None:
-            self.floating.settle(x, p.lower, p.upper)
-        self.round_iterate()
+        self._finish_move(x)
 
     def _energy(self, x: wp.array[Any]) -> float:
         """Return x'A x / 2 + b'x = x'(y + b) / 2, y being that of x; infinite where there is none: A not symmetric, bounds affine."""

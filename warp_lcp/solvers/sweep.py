@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -31,25 +31,22 @@ class SweepOrder(StrEnum):
 OrderName = Literal[tuple(map(str, SweepOrder))]
 
 
-class Sweep(Protocol):
+class Sweep:
     """Sweeps a problem's iterate, in an order of its own."""
 
     def start(self) -> None:
-        """Take A's diagonal again; a solve begins."""
+        """A solve begins: take again of A what is not shared with it."""
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Sweep x (stored, float64) once."""
 
 
-class OperatorSweep:
+class OperatorSweep(Sweep):
     """The operator's own sweep: red-black on grids, by rows or by colors on sparse matrices. Affine bounds are evaluated once a sweep."""
 
     def __init__(self, problem: LCP, A: Relaxes, omega: float, *, colored: bool | None = None) -> None:
         self.problem, self._A, self.omega = problem, A, omega
         self._options: dict[str, bool] = {} if colored is None else {"colored": colored}
-
-    def start(self) -> None:
-        """The operator knows its diagonal."""
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Sweep by the operator; bounds are those at x."""
@@ -64,7 +61,7 @@ def bound_operands(problem: LCP) -> list[Any]:
     return affine.operands if affine else [affine_side(problem.lower), affine_side(problem.upper)]
 
 
-class RowSweep:
+class RowSweep(Sweep):
     """Rows one after the other by one thread, in any order; bounds affine in x and zero or negative diagonals are minded row by row.
 
     Args:
@@ -86,9 +83,6 @@ class RowSweep:
         self._kernels = row_kernels(rows.values.dtype)
         self._y = problem.layout.zeros(wp.float64) if order is SweepOrder.GREEDY else None
 
-    def start(self) -> None:
-        """Rows are shared with the operator."""
-
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Sweep by one thread, the order chosen now where it depends on x."""
         p = self.problem
@@ -104,7 +98,7 @@ class RowSweep:
         wp.launch(self._kernels.sweep, 1, inputs, device=p.device)
 
 
-class DiagonalSweep:
+class DiagonalSweep(Sweep):
     """The operator's own sweep while the diagonal is positive, row by row where an entry of it is not."""
 
     def __init__(self, own: Sweep, by_rows: Sweep | None, diagonal: Diagonal) -> None:
