@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Lines
-from warp_lcp.benchmarks.validation.finding import Check, Drawing, Findings, Trial, check_at, curves_of, plot
+from warp_lcp.benchmarks.validation import signals
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import GRAVITY, SUB_CELL, Numerics, Row, box, create_liquid, fill, particles_in_cells, steps
-from warp_lcp.benchmarks.validation.signals import (
-    best_pace,
-    best_shift,
-    enclosed_cells,
-    filled_fraction,
-    front,
-    relative_rms,
-    stays,
-    surface_height,
-)
+from warp_lcp.benchmarks.validation.signals import best_shift, enclosed_cells, filled_fraction, front, relative_rms, stays, surface_height
 from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (12, 24)  # cells of a
@@ -38,7 +28,7 @@ SIZE, COLUMN = [1.6, 0.8], 0.4  # [m]: of a domain with two columns, and the sid
 DURATION, AVERAGED = 30.0, 2.0  # [s], and the end over which their volume is averaged
 DAM_DURATION, DAM_AVERAGED = 3.0, 0.3  # [s]: the column of the dam break fills a pool four cells deep
 UNCORRECTED: Row = {"density_correction": {"every": 0}}
-DATA = "Martin & Moyce"
+DATA, FRONT, HIGH = "Martin & Moyce", "Front of a collapsing column", "Height at the wall"  # in charts
 
 # [MartinMoyce1952], front and height of the column of square section, n^2 = 2
 T = np.array([0.41, 0.84, 1.19, 1.43, 1.63, 1.83, 1.98, 2.20, 2.32, 2.51, 2.65, 2.83, 2.98, 3.11, 3.33])
@@ -88,7 +78,7 @@ def shown_gravity(c: Collapse) -> float:
     sqrt(g) too, and data and simulation leave it a range as wide as that from .8 g to 1.25 g.
     """
     compared = (T >= FIRST) & (T <= LAST)
-    return best_pace(c.T, c.Z, T[compared], Z[compared], MAX_SHIFT) ** 2
+    return signals.best_pace(c.T, c.Z, T[compared], Z[compared], MAX_SHIFT) ** 2
 
 
 def create(cells: int, numerics: Numerics, **tables: Any) -> LiquidSimulation:
@@ -111,20 +101,12 @@ def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Col
     return Collapse(*stays(math.sqrt(N2) * unit * time, place / cells), unit * time, height / (N2 * cells))
 
 
-def _against(kind: str, data: tuple[np.ndarray, np.ndarray], title: str, x: str, y: str) -> Drawing:
-    def draw(trials: Sequence[Trial]) -> Lines:
-        curves = {DATA: (data[0].tolist(), data[1].tolist())} | curves_of(trials, kind)
-        return Lines(f"dam-break-{kind}", title, x, y, curves, marked=frozenset({DATA}), log="")
-
-    return draw
-
-
 DAM_BREAK = Check(
     about="A dam break against the experiments of Martin & Moyce 1952: a column of base a and height n^2 a, n^2 = 2.",
     trials=[(front_and_height, RESOLUTIONS)],
     charts=[
-        _against("front", (T, Z), "Front of a collapsing column", "T = n t sqrt(g / a)", "Z = x / a"),
-        _against("height", (TAU, H), "Height at the wall", "tau = t sqrt(g / a)", "H = y / (n^2 a)"),
+        plot("dam-break-front", FRONT, "T = n t sqrt(g / a)", "Z = x / a", "front", exact={DATA: (T, Z)}, marked=[DATA]),
+        plot("dam-break-height", HIGH, "tau = t sqrt(g / a)", "H = y / (n^2 a)", "height", exact={DATA: (TAU, H)}, marked=[DATA]),
     ],
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from inspect import signature
@@ -18,6 +18,7 @@ from warp_lcp.benchmarks.validation.scenes import DEVICE
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
 Curve = tuple[Sequence[float], Sequence[float]]
+ArrayCurve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]
 Drawing = Callable[[Sequence["Trial"]], Lines]
 COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 
@@ -113,7 +114,7 @@ class Check:
 
     about: str  # what must hold
     trials: Sequence[tuple[Callable[..., Trial], Sequence[Any]]]  # with their cases: arguments, in a tuple where there are several
-    across: Callable[[Sequence[Trial]], Trial] | None = None  # compares trials
+    across: tuple[str, Callable[[Findings, Sequence[Trial]], None]] | None = None  # what compares trials, after what it does in words
     charts: Sequence[Drawing] = ()
     known: str = ""  # why it is known not to hold everywhere; the report says so where it does not
 
@@ -122,7 +123,9 @@ class Check:
         before = DEVICE.set(device)
         try:
             trials = [run(*(case if isinstance(case, tuple) else (case,))) for run, cases in self.trials for case in cases]
-            trials += [self.across(trials)] if self.across else []
+            if self.across:
+                words, compare = self.across
+                trials.append(attempt(trials[0].check, words, lambda found: compare(found, trials)))
         finally:
             DEVICE.reset(before)
         return trials, [draw(trials) for draw in self.charts]
@@ -184,14 +187,30 @@ class Findings:
         self.findings.append(control(Finding(what, float(value), low, high, unit)))
 
 
-def curves_of(trials: Sequence[Trial], *labels: str) -> dict[str, Curve]:
-    """Return the curves of trials by resolution and label; those whose label begins with one of `labels`, if there are any."""
-    return {f"{t.resolution}: {k}": c for t in trials for k, c in t.curves.items() if not labels or k.startswith(labels)}
+def curves_of(trials: Sequence[Trial], *labels: str, check: str = "", but: str = "") -> dict[str, Curve]:
+    """Return the curves of trials by resolution and label.
+
+    Args:
+        trials: whose curves.
+        labels: what a label begins with; any without.
+        check: whose trials only.
+        but: the label that is left out.
+    """
+    chosen = [t for t in trials if check in ("", t.check)]
+    return {f"{t.resolution}: {k}": c for t in chosen for k, c in t.curves.items() if k != but and k.startswith(labels or "")}
 
 
-def plot(name: str, title: str, x: str, y: str, *labels: str, log: str = "") -> Drawing:
-    """Return what draws the curves of trials, those whose label begins with one of `labels`, if there are any."""
-    return lambda trials: Lines(name, title, x, y, curves_of(trials, *labels), log=log)
+def plot(
+    name: str, title: str, x: str, y: str, *labels: str, log: str = "", exact: Mapping[str, ArrayCurve] | None = None,
+    marked: Collection[str] = (), **chosen: str,
+) -> Drawing:  # fmt: skip
+    """Return what draws exact curves and those of trials that `curves_of` chooses; those in `marked` are points."""
+    given = {label: (np.asarray(a).tolist(), np.asarray(b).tolist()) for label, (a, b) in (exact or {}).items()}
+
+    def draw(trials: Sequence[Trial]) -> Lines:
+        return Lines(name, title, x, y, given | curves_of(trials, *labels, **chosen), log=log, marked=frozenset(marked))
+
+    return draw
 
 
 def table(check: str, remark: str, trials: Sequence[Trial]) -> Table:

@@ -9,20 +9,9 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.validation import scenes
 from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
-from warp_lcp.benchmarks.validation.scenes import (
-    GRAVITY,
-    SHORTEST,
-    SUB_CELL,
-    VOXEL,
-    Numerics,
-    Row,
-    box,
-    create_liquid,
-    create_sand,
-    positions,
-    steps,
-)
+from warp_lcp.benchmarks.validation.scenes import GRAVITY, SHORTEST, SUB_CELL, VOXEL, Row, box, create_liquid, create_sand, positions, steps
 from warp_lcp.benchmarks.validation.transfers import angular_momentum
 from warp_lcp.fluids import LiquidSimulation
 
@@ -85,7 +74,7 @@ def off(moved: np.ndarray, velocity: np.ndarray, duration: float) -> float:
     return float(np.linalg.norm(moved - way) / np.linalg.norm(way))
 
 
-def _liquid(cells: int, numerics: Numerics, liquid: Row = BLOCK, **tables: Any) -> Any:
+def _liquid(cells: int, numerics: scenes.Numerics, liquid: Row = BLOCK, **tables: Any) -> Any:
     return create_liquid(numerics, SIZE, cells, [liquid], **tables)
 
 

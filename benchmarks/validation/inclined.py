@@ -15,13 +15,11 @@ u = 2/3 I / d sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Lines
-from warp_lcp.benchmarks.validation.finding import Check, Findings, Trial, check_at, curves_of
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import CORRECTED, GRAVITY, Row, box, create_sand, steps, tilted
 from warp_lcp.granular.materials import MATERIALS
 from warp_lcp.granular.simulator import SandSimulation
@@ -172,23 +170,18 @@ def _watch(simulation: SandSimulation, cells: int, duration: float) -> tuple[np.
     return dt * np.arange(1, len(mean) + 1), np.array(mean)
 
 
-def _accelerations(trials: Sequence[Trial]) -> Lines:
-    curves = curves_of([t for t in trials if t.check == "inclined layer"])
-    exact = [(math.degrees(a), accelerates(math.degrees(a)) / GRAVITY) for a in np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20)]
-    curves["sin - cos / 2"] = ([x for x, _ in exact], [y for _, y in exact])
-    return Lines("inclined-layer", "Acceleration of a layer that runs", "slope [degrees]", "a / g", curves, log="")
-
-
-def _profiles(trials: Sequence[Trial]) -> Lines:
-    curves, y = curves_of([t for t in trials if t.check == BAGNOLD]), np.linspace(0.0, DEPTH, 40)
-    curves |= {f"Bagnold, {a:g} degrees": ((y / DEPTH).tolist(), bagnold_profile(y, a).tolist()) for a in STEADY}
-    return Lines("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", curves, log="")
-
-
+STEEPER = np.degrees(np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20))
+HEIGHTS = np.linspace(0.0, DEPTH, 40)
+EXACT = {"sin - cos / 2": (STEEPER, [accelerates(angle) / GRAVITY for angle in STEEPER])}
+STEADY_LAYERS = {f"Bagnold, {a:g} degrees": (HEIGHTS / DEPTH, bagnold_profile(HEIGHTS, a)) for a in STEADY}
+RUNNING = "inclined-layer", "Acceleration of a layer that runs", "slope [degrees]", "a / g"
 LAYERS = Check(
     about=__doc__ or "",
     trials=[(run, RESOLUTIONS) for run in (layer, slab, bagnold)],
-    charts=[_accelerations, _profiles],
+    charts=[
+        plot(*RUNNING, check="inclined layer", exact=EXACT),
+        plot("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", check=BAGNOLD, exact=STEADY_LAYERS),
+    ],
     known="half a degree below the angle from which it runs a settled layer of 32 cells still moves, at .7 % of g t",
 )
 

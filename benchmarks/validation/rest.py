@@ -11,24 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warp_lcp.benchmarks.harness.record import Lines
-from warp_lcp.benchmarks.validation.finding import Check, Curve, Drawing, Findings, Trial, attempt, check_at, curves_of
-from warp_lcp.benchmarks.validation.scenes import (
-    DENSITY,
-    GRAVITY,
-    PER_AXIS,
-    SMOOTHED,
-    SUB_CELL,
-    VOXEL,
-    Numerics,
-    Row,
-    box,
-    create_liquid,
-    particles_in_cells,
-    positions,
-    pressures,
-    steps,
-    tilted,
-)
+from warp_lcp.benchmarks.validation import scenes
+from warp_lcp.benchmarks.validation.finding import Check, Curve, Findings, Trial, check_at, plot
+from warp_lcp.benchmarks.validation.scenes import DENSITY, GRAVITY, SUB_CELL, VOXEL, Numerics, box, pressures, steps, tilted
 from warp_lcp.benchmarks.validation.signals import enclosed_cells, mode, period
 
 RESOLUTIONS = (20, 40)  # cells a side
@@ -43,7 +28,7 @@ V = [
     for side in (-1, 1)
 ]
 FULL = [box([0.0, 0.0], [SIDE, SIDE])]
-CASES: dict[str, Row] = {
+CASES: dict[str, scenes.Row] = {
     "pool": {"liquid": POOL},
     "pool in a V": {"liquid": POOL, "solid": V},
     "full box": {"liquid": FULL},
@@ -58,6 +43,7 @@ PERIOD = 2.0 * math.pi / math.sqrt(GRAVITY * WAVENUMBER * math.tanh(WAVENUMBER *
 PERIODS = 5
 SEEDS = (2015, 1, 2)  # of the particles: with whole cells the period is a matter of chance too, once the wave is lower than a cell
 POINTS = 257  # of the surface at the start
+SPEED = "t [s]", "largest speed / sqrt(g dx)"
 STAIRS = "whole cells: error of the period"  # a control
 
 
@@ -112,10 +98,10 @@ def sub_cell(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) ->
 
 
 @check_at("tilted rest", "{resolution} cells, {numerics.name}")
-def tilted_surface(found: Findings, resolution: int, numerics: Numerics = SMOOTHED) -> None:
+def tilted_surface(found: Findings, resolution: int, numerics: Numerics = scenes.SMOOTHED) -> None:
     """Rest of a free surface that gravity tilts; the control is a surface of whole cells, whose stairs run."""
     normal = [-math.sin(math.radians(TILT)), math.cos(math.radians(TILT))]
-    tables: Row = {"liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}], "physics": tilted(TILT)}
+    tables: scenes.Row = {"liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}], "physics": tilted(TILT)}
     rest, stairs = (settle(resolution, each, TILTED_DURATION, **tables) for each in (numerics, VOXEL))
     late = rest.time > 0.5 * TILTED_DURATION
     found.add("largest speed", rest.largest(0.0, TILTED_DURATION), high=0.1)
@@ -129,9 +115,9 @@ def tilted_surface(found: Findings, resolution: int, numerics: Numerics = SMOOTH
 
 def settle(resolution: int, numerics: Numerics, duration: float, level: float = LEVEL, **tables: Any) -> Rest:
     """Let a liquid rest for a time [s]; `level` is how high it stands if it stands level [m]."""
-    simulation = create_liquid(numerics, [SIDE, SIDE], resolution, **tables)
+    simulation = scenes.create_liquid(numerics, [SIDE, SIDE], resolution, **tables)
     dx = simulation.grid.spacing
-    before, unit = enclosed_cells(*particles_in_cells(simulation)), math.sqrt(GRAVITY * dx)
+    before, unit = enclosed_cells(*scenes.particles_in_cells(simulation)), math.sqrt(GRAVITY * dx)
     time, speed, fields = [], [], []
     for row in steps(simulation, duration):
         time.append(row["time"])
@@ -139,7 +125,7 @@ def settle(resolution: int, numerics: Numerics, duration: float, level: float = 
         if row["time"] > duration - AVERAGED:
             fields.append(pressures(simulation))
     bias, profile = _bias(np.mean(fields, axis=0), dx, level)
-    return Rest(np.array(time), np.array(speed), bias, profile, enclosed_cells(*particles_in_cells(simulation)) / before)
+    return Rest(np.array(time), np.array(speed), bias, profile, enclosed_cells(*scenes.particles_in_cells(simulation)) / before)
 
 
 def _bias(pressure: np.ndarray, dx: float, level: float = LEVEL) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
@@ -158,15 +144,6 @@ def _draw_profile(found: Findings, rest: Rest) -> None:
     found.curve("profile", y / LEVEL, pressure / (DENSITY * GRAVITY * LEVEL))
 
 
-def _speeds(check: str, title: str) -> Drawing:
-    def draw(trials: Sequence[Trial]) -> Lines:
-        curves = curves_of([t for t in trials if t.check == check])
-        speeds = {label: c for label, c in curves.items() if not label.endswith("profile")}
-        return Lines(check.replace(" ", "-"), title, "t [s]", "largest speed / sqrt(g dx)", speeds, log="y")
-
-    return draw
-
-
 def _profiles(trials: Sequence[Trial]) -> Lines:
     curves: dict[str, Curve] = {"rho g (h - y)": ([0.0, 1.0], [1.0, 0.0])}
     curves |= {t.resolution: t.curves["profile"] for t in trials if "profile" in t.curves}
@@ -176,7 +153,11 @@ def _profiles(trials: Sequence[Trial]) -> Lines:
 RESTING = Check(
     about="Liquids at rest: they stay there, and their pressure is that of their depth.",
     trials=[(run, RESOLUTIONS) for run in (whole_cells, sub_cell, tilted_surface)],
-    charts=[_speeds("rest", "Largest speed at rest"), _speeds("tilted rest", "Largest speed of a tilted surface at rest"), _profiles],
+    charts=[
+        plot("rest", "Largest speed at rest", *SPEED, log="y", check="rest", but="profile"),
+        plot("tilted-rest", "Largest speed of a tilted surface at rest", *SPEED, log="y", check="tilted rest"),
+        _profiles,
+    ],
     known="single particles that leave a tilted free surface run down above it, beyond 10 % of sqrt(g dx)",
 )
 
@@ -203,11 +184,11 @@ def slosh(cells: int, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndar
         folder, size = Path(name), [LENGTH, HEIGHT]
         write_wave(folder / "wave.obj")
         wave = {"shape": "mesh", "file": "wave.obj"}
-        simulation = create_liquid(numerics, size, round(cells * LENGTH / DEPTH), [wave], particles={"seed": seed}, folder=folder)
-    area = (simulation.grid.spacing / PER_AXIS) ** 2
+        simulation = scenes.create_liquid(numerics, size, round(cells * LENGTH / DEPTH), [wave], particles={"seed": seed}, folder=folder)
+    area = (simulation.grid.spacing / scenes.PER_AXIS) ** 2
 
     def amplitude() -> float:
-        return mode(positions(simulation)[:, 0], WAVENUMBER, area, LENGTH)
+        return mode(scenes.positions(simulation)[:, 0], WAVENUMBER, area, LENGTH)
 
     curve = [(0.0, amplitude()), *((row["time"], amplitude()) for row in steps(simulation, PERIODS * PERIOD))]
     time, elevation = np.array(curve).T
@@ -232,15 +213,11 @@ def write_wave(path: Path) -> None:
     path.write_text("\n".join([*vertices, *faces]) + "\n", encoding="utf-8")
 
 
-def _finer(trials: Sequence[Trial]) -> Trial:
+def finer(found: Findings, trials: Sequence[Trial]) -> None:
     """Compare the errors of the period at both resolutions."""
-
-    def refined(found: Findings) -> None:
-        (coarse, _), (fine, stairs) = ([t.value(what) for what in ("error of the period", f"control: {STAIRS}")] for t in trials)
-        found.add("error of the period", fine, high=max(coarse, 0.5), unit="%")
-        found.must_break(STAIRS, stairs, high=max(coarse, 0.5), unit="%")
-
-    return attempt("sloshing", f"{WAVE_RESOLUTIONS[1]} against {WAVE_RESOLUTIONS[0]} cells", refined)
+    (coarse, _), (fine, stairs) = ([t.value(what) for what in ("error of the period", f"control: {STAIRS}")] for t in trials)
+    found.add("error of the period", fine, high=max(coarse, 0.5), unit="%")
+    found.must_break(STAIRS, stairs, high=max(coarse, 0.5), unit="%")
 
 
 def _modes(trials: Sequence[Trial]) -> Lines:
@@ -254,6 +231,6 @@ def _modes(trials: Sequence[Trial]) -> Lines:
 SLOSHING = Check(
     about="Sloshing of a small amplitude: omega^2 = g k tanh(k h), linear theory of waves on water of depth h.",
     trials=[(sloshing, WAVE_RESOLUTIONS)],
-    across=_finer,
+    across=(f"{WAVE_RESOLUTIONS[1]} against {WAVE_RESOLUTIONS[0]} cells", finer),
     charts=[_modes],
 )

@@ -13,21 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.validation import scenes
 from warp_lcp.benchmarks.validation.finding import Check, Findings, Trial, attempt, plot
-from warp_lcp.benchmarks.validation.scenes import (
-    CORRECTED,
-    GRAVITY,
-    PER_AXIS,
-    VOXEL,
-    Row,
-    Simulation,
-    box,
-    create_liquid,
-    create_sand,
-    positions,
-    share_solved,
-    steps,
-)
+from warp_lcp.benchmarks.validation.scenes import CORRECTED, GRAVITY, Row, box, create_liquid, create_sand, positions, share_solved, steps
 
 OPENINGS = {1: (8, 12, 16), 2: (16,)}  # cells, by refinement
 WIDTH, DEPTH, BELOW = 0.24, 0.44, 0.12  # [m]: of the bin, the sand in it at the start, and the room below
@@ -94,12 +82,12 @@ def sand(cells: int, refinement: int, floor: float | str = "stick", **tables: An
 def liquid(cells: int) -> tuple[Discharge, Discharge]:
     """Let a liquid run through a slot of so many cells; return what sand is measured on, and what leaves down to LOW."""
     size, solids, fill, drain = _bin(cells * SPACING, DEPTH)
-    simulation = create_liquid(VOXEL, size, round(max(size) / SPACING), [fill], solid=solids, drain=[drain], **CORRECTED)
-    curve = _empty(simulation, SPACING**2 / PER_AXIS**2, LOW, [])
+    simulation = create_liquid(scenes.VOXEL, size, round(max(size) / SPACING), [fill], solid=solids, drain=[drain], **CORRECTED)
+    curve = _empty(simulation, SPACING**2 / scenes.PER_AXIS**2, LOW, [])
     return Discharge(*_rates(*curve, FIRST, LEAST, PARTS)), Discharge(*_rates(*curve, FIRST, LOW, 2 * PARTS))
 
 
-def _empty(simulation: Simulation, area: float, low: float, rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
+def _empty(simulation: scenes.Simulation, area: float, low: float, rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
     """Step until a bin is as low [widths], note the log's rows; return the times [s] and how much is in the bin [m^2]."""
     time, left = [0.0], [simulation.particles.count]
     while left[-1] * area > low * WIDTH**2:

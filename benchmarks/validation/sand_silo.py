@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.harness.record import Lines
-from warp_lcp.benchmarks.validation.finding import Check, Findings, Trial, check_at, curves_of
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import GRAVITY, Row, box, create_sand
 from warp_lcp.granular.simulator import SandSimulation
 
@@ -196,16 +196,6 @@ def measure(simulation: SandSimulation, rows: list[Row]) -> Silo:
     return Silo(depth, load[::-1], shear[::-1], float(np.ptp(heights) / (2.0 * heights[0])), rows)
 
 
-def _pack_as_before(simulation: SandSimulation, dt: float) -> None:
-    """Let what is too dense expand through the stresses: drive = (1 - phi) dx / dt of either sign below the surface."""
-    _drive(simulation, dt, lambda phi, drive: np.where(phi >= 0.9, 1.0 - phi, drive))
-
-
-def _close_all_gaps(simulation: SandSimulation, dt: float) -> None:
-    """Count a cell as full at the nominal density, and no sooner."""
-    _drive(simulation, dt, lambda phi, drive: np.where(phi >= 0.9, np.maximum(1.0 - phi, 0.0), drive))
-
-
 def _drive(simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
     """Have the packing's drive follow a rule of fractions and what it was [cells a step]."""
     packing, rate = simulation.packing, simulation.grid.spacing / dt
@@ -218,18 +208,19 @@ def _drive(simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np
     packing.update = update  # type: ignore[method-assign]
 
 
+# let what is too dense expand through the stresses: drive = (1 - phi) dx / dt of either sign below the surface
+_pack_as_before = partial(_drive, rule=lambda phi, drive: np.where(phi >= 0.9, 1.0 - phi, drive))
+# count a cell as full at the nominal density, and no sooner
+_close_all_gaps = partial(_drive, rule=lambda phi, drive: np.where(phi >= 0.9, np.maximum(1.0 - phi, 0.0), drive))
+
+
 def _keep_impulses(simulation: SandSimulation, dt: float) -> None:
     """Start a solve from the last impulses, however long they acted."""
     simulation.stress.kick_dt = 0.5 * (simulation.last_dt + dt)
 
 
-def _loads(trials: Sequence[Trial]) -> Lines:
-    curves, depths = curves_of(trials), np.linspace(0.0, DEEP[2], 40).tolist()
-    for ratio in RATIOS:
-        curves[f"Janssen, mu = 0.5, K = {ratio:.2g}"] = (depths, [janssen(z, 0.5, ratio) for z in depths])
-    return Lines("sand-silo", "Vertical stress in a silo", "z / W", "sigma / (rho g W)", curves, log="")
-
-
+DEPTHS = np.linspace(0.0, DEEP[2], 40)
+LAWS = {f"Janssen, mu = 0.5, K = {ratio:.2g}": (DEPTHS, [janssen(z, 0.5, ratio) for z in DEPTHS]) for ratio in RATIOS}
 CHECK = Check(
     about=__doc__ or "",
     trials=[
@@ -237,5 +228,5 @@ CHECK = Check(
         (slot, RESOLUTIONS[2]),
         (controls, RESOLUTIONS[2][:1]),
     ],
-    charts=[_loads],
+    charts=[plot("sand-silo", "Vertical stress in a silo", "z / W", "sigma / (rho g W)", exact=LAWS)],
 )

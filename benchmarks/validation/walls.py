@@ -8,31 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from warp_lcp.benchmarks.validation import scenes
 from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
-from warp_lcp.benchmarks.validation.scenes import (
-    DENSITY,
-    GRAVITY,
-    SUB_CELL,
-    VOXEL,
-    Numerics,
-    Row,
-    box,
-    create_liquid,
-    positions,
-    pressures,
-    steps,
-    velocities,
-)
+from warp_lcp.benchmarks.validation.scenes import GRAVITY, SUB_CELL, VOXEL, Numerics, box, create_liquid, positions, steps, velocities
 from warp_lcp.fluids import LiquidSimulation
 
 DURATION = 0.25  # [s]
 SIZE, LOW = [0.4, 0.8], 0.55  # [m]: of the domain with a ceiling, and where the block begins
 SLANTED = math.radians(5.0)
-CEILINGS: dict[str, list[Row]] = {
+CEILINGS: dict[str, list[scenes.Row]] = {
     "flat": [],
     "slanted": [{"shape": "plane", "point": [0.2, 0.76], "normal": [math.sin(SLANTED), -math.cos(SLANTED)]}],  # cuts cells
 }
-WEIGHT = DENSITY * GRAVITY * (SIZE[1] - LOW)  # [Pa] that the block's height would have below it at rest
+WEIGHT = scenes.DENSITY * GRAVITY * (SIZE[1] - LOW)  # [Pa] that the block's height would have below it at rest
 
 WAY_IN_DEPTHS, LENGTH_IN_DEPTHS = 10.0, 4.0  # the way, and the sliding layer's length
 ANGLE = 30.0  # degrees
@@ -87,7 +75,7 @@ def drop(resolution: int, numerics: Numerics, ceiling: str = "flat", *, wall: st
     if not release:
         _hold(simulation)
     for _ in steps(simulation, DURATION):
-        pressure = pressures(simulation)
+        pressure = scenes.pressures(simulation)
         lowest, highest = min(lowest, pressure.min()), max(highest, pressure.max())
     dx, way = simulation.grid.spacing, 0.5 * GRAVITY * DURATION**2
     return Fall((start - np.sort(positions(simulation)[:, 1])) / dx, way / dx, float(lowest), float(highest))
