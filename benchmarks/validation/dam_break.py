@@ -98,7 +98,8 @@ def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Col
 
     unit = math.sqrt(GRAVITY / A)
     time, place, height = np.array([now(0.0), *(now(row["time"]) for row in steps(simulation, END / (math.sqrt(N2) * unit)))]).T
-    return Collapse(*stays(math.sqrt(N2) * unit * time, place / cells), unit * time, height / (N2 * cells))
+    tau = unit * time
+    return Collapse(*stays(math.sqrt(N2) * tau, place / cells), tau, height / (N2 * cells))
 
 
 DAM_BREAK = Check(

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
-from warp_lcp.benchmarks.validation.scenes import GRAVITY, Row, box, create_sand
+from warp_lcp.benchmarks.validation.scenes import GRAVITY, box, create_sand
 from warp_lcp.granular.simulator import SandSimulation
 
 RESOLUTIONS = {2: (16, 24), 3: (16,)}  # cells of the width, by dimension
@@ -45,7 +45,6 @@ class Silo(NamedTuple):
     load: np.ndarray  # the vertical stress there [rho g W], shape (rows,)
     shear: np.ndarray  # what walls bear, upward, over the load, shape (rows,)
     fell: float  # how far the center of mass has gone at most, over the height
-    rows: list[Row]  # of the log
 
     def at(self, depth: float) -> float:
         """Return the vertical stress [rho g W] at a depth [widths]."""
@@ -166,19 +165,14 @@ def rest(simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0,
         tiny: length of a short step after `PERIOD` others [s]; 0: there are none.
         each: called before each step with its length [s].
     """
-    rows: list[Row] = []
+    heights: list[Any] = []
     while simulation.time < duration:
         dt = min(simulation.stable_dt(), simulation.scene.time.dt_max)
         if tiny and simulation.step_count % PERIOD == PERIOD // 2:
             dt = tiny
         if each is not None:
             each(simulation, dt)
-        rows.append({**simulation.step(dt), "dt": dt})
-    return measure(simulation, rows)
-
-
-def measure(simulation: SandSimulation, rows: list[Row]) -> Silo:
-    """Return what the last step's stresses are."""
+        heights.append(simulation.step(dt)["center_of_mass_y"])
     grid, packing = simulation.grid, simulation.packing
     inner = tuple(slice(low, high) for low, high in zip(grid.domain.low, grid.domain.high, strict=True))
     x = simulation.stress.now.numpy()[(slice(None), *inner)].astype(np.float64)
@@ -192,8 +186,7 @@ def measure(simulation: SandSimulation, rows: list[Row]) -> Silo:
     phi = packing.fraction.numpy()[inner].mean(axis=across)
     depth = (np.cumsum(phi[::-1]) - 0.5 * phi[::-1]) / cells
     shear = np.mean(sides, axis=0) / unit / np.maximum(load, 1e-12)
-    heights = [row["center_of_mass_y"] for row in rows]
-    return Silo(depth, load[::-1], shear[::-1], float(np.ptp(heights) / (2.0 * heights[0])), rows)
+    return Silo(depth, load[::-1], shear[::-1], float(np.ptp(heights) / (2.0 * heights[0])))
 
 
 def _drive(simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
