@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Chart, Results, Table
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.validation import (
-    ceiling,
     dam_break,
     flight,
     floating,
@@ -24,50 +22,34 @@ from warp_lcp.benchmarks.validation import (
     sand_collapse,
     sand_heap,
     sand_hourglass,
-    sand_invariants,
-    sand_oblique,
-    sand_rest,
     sand_silo,
-    slope,
-    sloshing,
-    spin,
     time_steps,
     transfers,
-    volume,
+    walls,
 )
 from warp_lcp.benchmarks.validation.finding import Trial, table
 
 TITLE = "Liquids, sand and rigid bodies against known answers"
 CHECKS = {
-    "transfers": transfers,
-    "flight": flight,
-    "spin": spin,
-    "time steps": time_steps,
-    "ceiling": ceiling,
-    "slope": slope,
-    "dam break": dam_break,
-    "sloshing": sloshing,
-    "rest": rest,
-    "volume": volume,
-    "floating": floating,
-    "inclined layer": inclined,
-    "sand collapse": sand_collapse,
-    "sand hourglass": sand_hourglass,
-    "sand invariants": sand_invariants,
-    "sand oblique": sand_oblique,
-    "sand rest": sand_rest,
-    "sand silo": sand_silo,
-    "sand heap": sand_heap,
-}
-
-KNOWN = {  # why a check is known not to hold everywhere; the report says so where it does not
-    "inclined layer": "half a degree below the angle from which it runs a settled layer of 32 cells still moves, at .7 % of g t",
-    "rest": "single particles that leave a tilted free surface run down above it, beyond 10 % of sqrt(g dx)",
-    "sand collapse": "a = 0.5 with 20 cells, ten of height, runs 0.40 widths, with 40 cells 0.52; 10 to 30 % of tall ones' steps miss 1e-3",
-    "sand hourglass": "deep sand that yields everywhere is solved to 2 to 5e-3 rho g dx, not 1e-3; at 30 degrees delta is 1.6 cells",
-    "sand invariants": "of the steps at 40 cells 94.9 % reach 1e-3, one packs a cell to 1.11, one gains 1e-4 J/m",
-    "sand rest": "columns of the box of Narain et al. run 2.25 widths, 7 % less than the experiments allow",
-    "sand heap": "sand at rest holds up to asin k: heaps lie at 33 to 36 degrees where layers stop at 30, at 41 to 43 where at 40",
+    "transfers": transfers.CHECK,
+    "flight": flight.THROWING,
+    "spin": flight.SPINNING,
+    "time steps": time_steps.CHECK,
+    "ceiling": walls.CEILING,
+    "slope": walls.SLOPE,
+    "dam break": dam_break.DAM_BREAK,
+    "sloshing": rest.SLOSHING,
+    "rest": rest.RESTING,
+    "volume": dam_break.VOLUME,
+    "floating": floating.CHECK,
+    "inclined layer": inclined.LAYERS,
+    "sand collapse": sand_collapse.COLLAPSES,
+    "sand hourglass": sand_hourglass.CHECK,
+    "sand invariants": sand_collapse.INVARIANTS,
+    "sand oblique": inclined.OBLIQUE,
+    "sand rest": sand_collapse.RESTING,
+    "sand silo": sand_silo.CHECK,
+    "sand heap": sand_heap.CHECK,
 }
 
 
@@ -75,15 +57,15 @@ def measure(options: Options, out: Path) -> Results:
     """Run all checks."""
     trials: dict[str, list[Trial]] = {}
     charts: list[Chart] = []
-    for name, module in CHECKS.items():
+    for name, check in CHECKS.items():
         options.say(f"{name} ...")
-        trials[name], drawn = module.check(options.device)
+        trials[name], drawn = check.run(options.device)
         passed = sum(t.passed for t in trials[name])
         options.say(f"{name}: {passed} of {len(trials[name])} as they must be, {sum(t.seconds for t in trials[name]):.0f} s")
         charts += [chart for chart in drawn if chart.curves]
     found = [t for own in trials.values() for t in own]
     where = machine(options.device, elements=1 << 22, repeat=options.repeat)
-    tables = [summary(trials), misses(trials), *(table(name, inspect.getdoc(CHECKS[name]) or "", own) for name, own in trials.items())]
+    tables = [summary(trials), misses(trials), *(table(name, CHECKS[name].about.strip(), own) for name, own in trials.items())]
     return Results([where, *(t.record() for t in found)], tables, charts, [line for t in found for line in t.failures()])
 
 
@@ -107,5 +89,5 @@ def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
 
 def misses(trials: Mapping[str, Sequence[Trial]]) -> Table:
     """Return what is not as it must be, and why that is known."""
-    rows = [[line, KNOWN.get(name, "")] for name, own in trials.items() for t in own for line in t.failures()]
+    rows = [[line, CHECKS[name].known] for name, own in trials.items() for t in own for line in t.failures()]
     return Table("Not as it must be", ["figure", "known"], rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,7 +65,7 @@ class Ledger:
 
     def energy(self) -> float:
         """Return kinetic and potential energy of particles and bodies as they are [J; J/m]; the gain of free fall is not known yet."""
-        return self._material() + self._bodies()
+        return self._material() + self._energy_of_bodies()
 
     def height(self) -> float:
         """Return the energy that the material and the bodies have by their height over the domain's lowest corner [J; J/m], >= 0."""
@@ -75,8 +75,7 @@ class Ledger:
         lowest = float(np.minimum(-gravity * size, 0.0).sum())
         mass, moment = self._moments()
         own = -float(gravity @ moment) - mass * lowest
-        bodies = s.bodies.bodies if s.bodies is not None else []
-        return own + sum(-b.properties.mass * (float(gravity @ b.position) + lowest) for b in bodies)
+        return own + sum(-b.properties.mass * (float(gravity @ b.position) + lowest) for b in self._bodies())
 
     def total(self) -> float:
         """Return the energy of motion and that of height over the domain's lowest corner [J; J/m]."""
@@ -98,12 +97,12 @@ class Ledger:
         """Step by dt [s] and return the account."""
         s = self.simulation
         before, momentum, self._dt = self.now, self._momentum(), dt
-        moving = self._body_velocities()
+        bodies = self._bodies()
+        moving = [body.velocity.copy() for body in bodies]
         self._given = self._displaced = 0.0
         self._carried = momentum
         s.step(dt)
         gained = self._free_fall(s.particle_mass * s.particles.count, self._carried - momentum)
-        bodies = s.bodies.bodies if s.bodies is not None else []
         for body, old in zip(bodies, moving, strict=True):
             gained += self._free_fall(body.properties.mass, body.properties.mass * (body.velocity - old))
         self.now = self.energy() + gained
@@ -121,7 +120,10 @@ class Ledger:
         motion = 0.5 * s.particle_mass * float(np.square(velocity).sum())
         return motion + 0.5 * self._dt * float(s.gravity @ self._momentum()) + self._potential()
 
-    def _bodies(self) -> float:
+    def _bodies(self) -> Sequence[Any]:
+        return [] if self.simulation.bodies is None else self.simulation.bodies.bodies
+
+    def _energy_of_bodies(self) -> float:
         s = self.simulation
         if s.bodies is None:
             return 0.0
@@ -145,10 +147,6 @@ class Ledger:
     def _momentum(self) -> np.ndarray:
         s = self.simulation
         return np.asarray(s.particle_mass * s.particles.velocity.numpy().astype(np.float64).sum(axis=0))
-
-    def _body_velocities(self) -> list[np.ndarray]:
-        bodies = self.simulation.bodies
-        return [] if bodies is None else [body.velocity.copy() for body in bodies.bodies]
 
     def _note_momentum(self) -> None:
         self._carried = self._momentum()

@@ -1,20 +1,25 @@
-"""What a check finds: figures beside the bounds that they must keep, or must break where the set-up is wrong on purpose."""
+"""Checks, and what they find: figures beside the bounds that they must keep, or must break where the set-up is wrong on purpose."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from inspect import signature
 from typing import Any
 
-from warp_lcp.benchmarks.harness.record import Record, Table
+import numpy as np
+
+from warp_lcp.benchmarks.harness.record import Lines, Record, Table
 from warp_lcp.benchmarks.harness.timing import Figure
+from warp_lcp.benchmarks.validation.scenes import DEVICE
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
 Curve = tuple[Sequence[float], Sequence[float]]
+ArrayCurve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]
+Drawing = Callable[[Sequence["Trial"]], Lines]
 COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 
 
@@ -76,6 +81,10 @@ class Trial:
         """Whether every figure keeps its bound and every control breaks its own."""
         return not self.error and bool(self.findings) and all(f.passed for f in self.findings)
 
+    def value(self, what: str) -> float:
+        """Return a figure's value, NaN without it."""
+        return next((f.value for f in self.findings if f.what == what), math.nan)
+
     def record(self) -> Record:
         """Return what the file keeps."""
         figures = {f.what: Figure(f.value, f.unit) for f in self.findings if not math.isnan(f.value)}
@@ -97,6 +106,29 @@ class Trial:
             if not f.passed:
                 lines.append(f"{self.name}: {f.what} = {f.value:.4g} {f.unit}".rstrip() + f" ({f.row()[2]})")
         return lines
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """What must hold, and by what it is tried and shown."""
+
+    about: str  # what must hold
+    trials: Sequence[tuple[Callable[..., Trial], Sequence[Any]]]  # with their cases: arguments, in a tuple where there are several
+    across: tuple[str, Callable[[Findings, Sequence[Trial]], None]] | None = None  # what compares trials, after what it does in words
+    charts: Sequence[Drawing] = ()
+    known: str = ""  # why it is known not to hold everywhere; the report says so where it does not
+
+    def run(self, device: str) -> tuple[list[Trial], list[Lines]]:
+        """Run all trials on a device, and draw them."""
+        before = DEVICE.set(device)
+        try:
+            trials = [run(*(case if isinstance(case, tuple) else (case,))) for run, cases in self.trials for case in cases]
+            if self.across:
+                words, compare = self.across
+                trials.append(attempt(trials[0].check, words, lambda found: compare(found, trials)))
+        finally:
+            DEVICE.reset(before)
+        return trials, [draw(trials) for draw in self.charts]
 
 
 def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Callable[..., Trial]]:
@@ -146,14 +178,39 @@ class Findings:
         """Note a figure that must keep its bound."""
         self.findings.append(Finding(what, float(value), low, high, unit))
 
+    def curve(self, label: str, x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> None:
+        """Note a line to draw."""
+        self.curves[label] = (np.asarray(x).tolist(), np.asarray(y).tolist())
+
     def must_break(self, what: str, value: float, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> None:
         """Note a figure of a negative control, which must break the bound."""
         self.findings.append(control(Finding(what, float(value), low, high, unit)))
 
 
-def curves_of(trials: Sequence[Trial], *labels: str) -> dict[str, Curve]:
-    """Return the curves of trials by resolution and label; those whose label begins with one of `labels`, if there are any."""
-    return {f"{t.resolution}: {k}": c for t in trials for k, c in t.curves.items() if not labels or k.startswith(labels)}
+def curves_of(trials: Sequence[Trial], *labels: str, check: str = "", but: str = "") -> dict[str, Curve]:
+    """Return the curves of trials by resolution and label.
+
+    Args:
+        trials: whose curves.
+        labels: what a label begins with; any without.
+        check: whose trials only.
+        but: the label that is left out.
+    """
+    chosen = [t for t in trials if check in ("", t.check)]
+    return {f"{t.resolution}: {k}": c for t in chosen for k, c in t.curves.items() if k != but and k.startswith(labels or "")}
+
+
+def plot(
+    name: str, title: str, x: str, y: str, *labels: str, log: str = "", exact: Mapping[str, ArrayCurve] | None = None,
+    marked: Collection[str] = (), **chosen: str,
+) -> Drawing:  # fmt: skip
+    """Return what draws exact curves and those of trials that `curves_of` chooses; those in `marked` are points."""
+    given = {label: (np.asarray(a).tolist(), np.asarray(b).tolist()) for label, (a, b) in (exact or {}).items()}
+
+    def draw(trials: Sequence[Trial]) -> Lines:
+        return Lines(name, title, x, y, given | curves_of(trials, *labels, **chosen), log=log, marked=frozenset(marked))
+
+    return draw
 
 
 def table(check: str, remark: str, trials: Sequence[Trial]) -> Table:

@@ -1,100 +1,176 @@
-"""What is thrown flies along its parabola: liquid, sand and a rigid body, at any CFL number, as long as nothing touches it."""
+"""What flies: whatever is thrown goes along its parabola, and a spinning drop keeps its angular momentum."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Chart
-from warp_lcp.benchmarks.validation import sand_pit, tank
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at
-from warp_lcp.benchmarks.validation.tank import GRAVITY, SUB_CELL, VOXEL, box
+from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.validation import scenes
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
+from warp_lcp.benchmarks.validation.scenes import GRAVITY, SHORTEST, SUB_CELL, VOXEL, Row, box, create_liquid, create_sand, positions, steps
+from warp_lcp.benchmarks.validation.transfers import angular_momentum
+from warp_lcp.fluids import LiquidSimulation
 
-RESOLUTIONS = (32, 64)  # cells along the domain
-CFL = (2.0, 8.0)
+RESOLUTIONS = (32, 64)  # cells along the domain of what is thrown, cells a meter of a spinning drop
 SIZE = [2.0, 2.0]  # [m]: no wall is met
+MOST = 1e-4  # of the way, off the parabola
+
+CFL = (2.0, 8.0)
 LOW, HIGH = [0.4, 0.8], [0.8, 1.2]  # [m]: corners of what is thrown
 VELOCITY = [1.5, 2.0]  # [m/s]
 DURATION = 0.4  # [s]
 POOL = box([0.0, 0.0], [2.0, 0.25])  # a rigid body needs some material in its scene
-BODY: dict[str, Any] = {"density": 500.0, "angular_velocity": 4.0}
-MOST = 1e-4  # of the way
+BLOCK = box(LOW, HIGH, velocity=VELOCITY)
+CRATE: Row = BLOCK | {"density": 500.0, "angular_velocity": 4.0}
 
-
-def check(device: str) -> tuple[list[Trial], list[Chart]]:
-    """Run the check at its resolutions."""
-    return [trial(n, device) for n in RESOLUTIONS], []
+KEPT = {32: 0.95, 64: 0.98}  # of the angular momentum
+RADIUS, SPIN, FLIGHT = 0.25, 3.0 * np.pi, 0.4  # [m], [rad/s], [s]: .6 of a turn, at 2.4 m/s of the rim
+LAUNCH = np.array([1.0, 2.0])  # [m/s]
+TRANSFERS = ("apic", "flip", "pic")
 
 
 @check_at("flight", "{cells} cells")
-def trial(found: Findings, cells: int, device: str) -> None:
+def thrown(found: Findings, cells: int) -> None:
     """Throw everything; in the controls gravity acts for a whole step before things move by it."""
     for what in THROWN:
         for cfl in CFL:
-            found.add(f"{what}, CFL {cfl:g}: off its parabola", off_its_parabola(what, cells, cfl, device), high=MOST, unit="of the way")
-            old = off_its_parabola(what, cells, cfl, device, whole_kicks=True)
+            old = off_its_parabola(what, cells, cfl, whole_kicks=True)
+            found.add(f"{what}, CFL {cfl:g}: off its parabola", off_its_parabola(what, cells, cfl), high=MOST, unit="of the way")
             found.must_break(f"{what}, CFL {cfl:g}, old gravity: off its parabola", old, high=MOST, unit="of the way")
 
 
-def off_its_parabola(what: str, cells: int, cfl: float, device: str = "cpu", *, whole_kicks: bool = False) -> float:
+def off_its_parabola(what: str, cells: int, cfl: float, *, whole_kicks: bool = False) -> float:
     """Return how far a center of mass is from where it should be after `DURATION`, over its way.
 
     Args:
         what: a key of `THROWN`.
         cells: along the domain.
         cfl: the Courant number.
-        device: where it runs.
         whole_kicks: let gravity act for the whole step that it moves things by, as symplectic Euler does.
     """
-    simulation = THROWN[what](cells, cfl, device)
+    simulation = THROWN[what](cells, time={"duration": 100.0, "cfl": cfl, "dt_max": 1.0})
 
     def center() -> np.ndarray:
         if simulation.bodies is not None:
             return np.array(simulation.bodies.bodies[0].position[:2])
         return np.asarray(simulation.particles.position.numpy()[:, :2].mean(axis=0, dtype=np.float64))
 
-    start, longest = center(), simulation.scene.time.dt_max
-    while simulation.time < DURATION - tank.SHORTEST:
-        dt = min(simulation.stable_dt(), longest, DURATION - simulation.time)
+    start = center()
+    while simulation.time < DURATION - SHORTEST:
+        dt = min(simulation.stable_dt(), DURATION - simulation.time)
         if whole_kicks:
             simulation.last_dt = dt
         simulation.step(dt)
-    way = np.array(VELOCITY) * DURATION + 0.5 * np.array([0.0, -GRAVITY]) * DURATION**2
-    return float(np.linalg.norm(center() - start - way) / np.linalg.norm(way))
+    return off(center() - start, np.array(VELOCITY), DURATION)
 
 
-def _time(cfl: float) -> dict[str, float]:
-    return {"duration": 100.0, "cfl": cfl, "dt_max": 1.0}
+def off(moved: np.ndarray, velocity: np.ndarray, duration: float) -> float:
+    """Return how far a way is from that of what was thrown so long ago, over the latter."""
+    way = velocity * duration - [0.0, 0.5 * GRAVITY * duration**2]
+    return float(np.linalg.norm(moved - way) / np.linalg.norm(way))
 
 
-def _liquid(numerics: tank.Numerics, **tables: Any) -> Any:
-    def create(cells: int, cfl: float, device: str) -> Any:
-        block = box(LOW, HIGH, velocity=VELOCITY)
-        return tank.create(numerics, size=SIZE, resolution=cells, liquid=[block], time=_time(cfl), device=device, **tables)
-
-    return create
+def _liquid(cells: int, numerics: scenes.Numerics, liquid: Row = BLOCK, **tables: Any) -> Any:
+    return create_liquid(numerics, SIZE, cells, [liquid], **tables)
 
 
-def _sand(cells: int, cfl: float, device: str) -> Any:
-    return sand_pit.create(SIZE, cells, [box(LOW, HIGH, velocity=VELOCITY)], time=_time(cfl), device=device)
+def _sand(cells: int, sand: Row = BLOCK, **tables: Any) -> Any:
+    return create_sand(SIZE, cells, [sand], tables.pop("solid", []), **tables)
 
 
-def _body_over(material: str) -> Any:
-    def create(cells: int, cfl: float, device: str) -> Any:
-        crate = box(LOW, HIGH, velocity=VELOCITY) | BODY
-        if material == "sand":
-            return sand_pit.create(SIZE, cells, [POOL], [crate], time=_time(cfl), device=device)
-        return tank.create(SUB_CELL, size=SIZE, resolution=cells, liquid=[POOL], solid=[crate], time=_time(cfl), device=device)
-
-    return create
-
-
-THROWN = {
-    "liquid, whole cells": _liquid(VOXEL),
-    "liquid, sub-cell": _liquid(SUB_CELL),
-    "liquid, unilateral": _liquid(VOXEL, pressure={"model": "unilateral"}),
+THROWN: dict[str, Callable[..., Any]] = {
+    "liquid, whole cells": partial(_liquid, numerics=VOXEL),
+    "liquid, sub-cell": partial(_liquid, numerics=SUB_CELL),
+    "liquid, unilateral": partial(_liquid, numerics=VOXEL, pressure={"model": "unilateral"}),
     "sand": _sand,
-    "body over liquid": _body_over("liquid"),
-    "body over sand": _body_over("sand"),
+    "body over liquid": partial(_liquid, numerics=SUB_CELL, liquid=POOL, solid=[CRATE]),
+    "body over sand": partial(_sand, sand=POOL, solid=[CRATE]),
 }
+THROWING = Check(
+    about="What is thrown flies along its parabola: liquid, sand and a rigid body, at any CFL number, as long as nothing touches it.",
+    trials=[(thrown, RESOLUTIONS)],
+)
+
+
+def drop(n: int, *, transfer: str = "apic", thrown: bool = False, cfl: float = 2.0, keeps: bool = True) -> LiquidSimulation:
+    """Return a drop that spins in a room of two meters, far from its walls.
+
+    Args:
+        n: cells a meter.
+        transfer: of particles and grid.
+        thrown: give it the velocity LAUNCH and let gravity act.
+        cfl: Courant number.
+        keeps: whether bodies in flight keep their momenta; False: the control.
+    """
+    tables: Row = {"particles": {"transfer": transfer}, "physics": {"gravity": [0.0, -GRAVITY if thrown else 0.0]}, "cfl": cfl}
+    ball = {"shape": "sphere", "center": [0.8 if thrown else 1.0, 1.0], "radius": RADIUS}
+    simulation = create_liquid(SUB_CELL, SIZE, 2 * n, [ball], **tables)
+    particles, arm = simulation.particles, positions(simulation)
+    arm -= arm.mean(axis=0)
+    velocity = np.zeros((len(arm), 3), dtype=np.float32)
+    velocity[:, :2] = SPIN * np.stack([-arm[:, 1], arm[:, 0]], axis=1) + LAUNCH * thrown
+    particles.velocity.assign(velocity)
+    for gradient, row in zip(particles.affine, ([0.0, -SPIN, 0.0], [SPIN, 0.0, 0.0]), strict=False):
+        gradient.assign(np.tile(np.array(row, dtype=np.float32), (len(arm), 1)))
+    if not keeps:
+        simulation.flights = None
+    return simulation
+
+
+def turning(simulation: LiquidSimulation) -> float:
+    """Return the angular momentum about the center of mass, of unit masses [m^2/s], what gradients carry included."""
+    particles = simulation.particles
+    x, v = positions(simulation), particles.velocity.numpy().astype(np.float64)
+    whole = angular_momentum(x, v, [g.numpy() for g in particles.affine], simulation.grid.spacing)
+    mean = x.mean(axis=0)
+    return whole - float(mean[0] * v[:, 1].sum() - mean[1] * v[:, 0].sum())
+
+
+@check_at("spin", "spinning drop, {n} cells a meter")
+def spinning(found: Findings, n: int) -> None:
+    """Let drops spin without gravity; the control has no law of bodies in flight."""
+
+    def spun(label: str, simulation: LiquidSimulation) -> tuple[float, np.ndarray]:
+        start = turning(simulation)
+        rows = [(row["time"], turning(simulation) / start, row["kinetic_energy"]) for row in steps(simulation, FLIGHT)]
+        times, kept, energies = np.array(rows).T
+        found.curve(label, times, kept)
+        return float(kept[-1]), energies
+
+    for transfer in TRANSFERS:
+        name, simulation = transfer.upper(), drop(n, transfer=transfer)
+        middle = positions(simulation).mean(axis=0)
+        kept, energies = spun(f"{name}, {n} cells a meter", simulation)
+        way = float(np.linalg.norm(positions(simulation).mean(axis=0) - middle))
+        found.add(f"{name}: angular momentum after {FLIGHT} s, of that at the start", kept, low=KEPT[n], high=2.0 - KEPT[n])
+        found.add(f"{name}: way of the center of mass", way, high=1e-5, unit="m")
+        found.add(f"{name}: largest rise of the kinetic energy in a step", np.diff(energies).max() / energies[0], high=1e-3)
+    kept, _ = spun("APIC, control", drop(n, keeps=False))
+    found.must_break("APIC: angular momentum, bodies in flight left alone", kept, low=KEPT[n])
+
+
+@check_at("spin", "thrown spinning drop, {n} cells a meter")
+def parabolas(found: Findings, n: int) -> None:
+    """Throw drops that spin; the control has no law of bodies in flight."""
+
+    def missed(cfl: float, *, keeps: bool = True) -> float:
+        simulation = drop(n, thrown=True, cfl=cfl, keeps=keeps)
+        start = positions(simulation).mean(axis=0)
+        for _ in steps(simulation, FLIGHT):
+            pass
+        return off(positions(simulation).mean(axis=0) - start, LAUNCH, FLIGHT)
+
+    for cfl in CFL:
+        found.add(f"CFL {cfl:g}: center of mass off its parabola, of its way", missed(cfl), high=MOST)
+    found.must_break("CFL 2: the same, bodies in flight left alone", missed(2.0, keeps=False), high=MOST)
+
+
+SPINNING = Check(
+    about="Liquid in flight: a spinning drop keeps its angular momentum, and what flies goes along its parabola.",
+    trials=[(spinning, RESOLUTIONS), (parabolas, RESOLUTIONS[:1])],
+    charts=[lambda trials: Lines("spin", "Angular momentum of a spinning drop", "time [s]", "of that at the start", trials[0].curves)],
+)

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Chart
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at
-from warp_lcp.benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, box, create, steps
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
+from warp_lcp.benchmarks.validation.scenes import CORRECTED, DENSITY, GRAVITY, SUB_CELL, VOXEL, box, create_liquid, steps
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import Window
 
@@ -22,22 +21,14 @@ BOX = 0.3, 0.2  # [m]: width and height of what floats
 EXTREMES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3)
 
 
-def check(device: str) -> tuple[list[Trial], list[Chart]]:
-    """Run the check at its resolutions."""
-    trials = [accelerations(dimension, cells, device) for dimension in (2, 3) for cells in CELLS[dimension]]
-    trials += [displacement(dimension, *case, device) for dimension in (2, 3) for case in FLOATS[dimension]]
-    trials += [momentum(dimension, device) for dimension in (2, 3)]
-    return [*trials, *(iterations(cells, device) for cells in (24, 32))], []
-
-
 @check_at("floating", "{dimension}-D, {cells} cells a diameter")
-def accelerations(found: Findings, dimension: int, cells: int, device: str) -> None:
+def accelerations(found: Findings, dimension: int, cells: int) -> None:
     """Compare the first acceleration of a disc or sphere with that of potential flow."""
     for ratio in RATIOS[dimension]:
         expected = acceleration(dimension, ratio)
-        found.add(f"ratio {ratio:g}: a over expected", _first_acceleration(dimension, cells, ratio, device) / expected, low=0.95, high=1.05)
+        found.add(f"ratio {ratio:g}: a over expected", _first_acceleration(dimension, cells, ratio) / expected, low=0.95, high=1.05)
     light = min(RATIOS[dimension])
-    apart = _first_acceleration(dimension, cells, light, device, together=False) / acceleration(dimension, light)
+    apart = _first_acceleration(dimension, cells, light, together=False) / acceleration(dimension, light)
     found.must_break(f"solved one after the other, ratio {light:g}: a over expected", apart, low=0.95, high=1.05)
 
 
@@ -52,12 +43,12 @@ def acceleration(dimension: int, ratio: float) -> float:
     return (1.0 - ratio) * GRAVITY / (ratio + added)
 
 
-def _first_acceleration(dimension: int, cells: int, ratio: float, device: str, *, together: bool = True) -> float:
+def _first_acceleration(dimension: int, cells: int, ratio: float, *, together: bool = True) -> float:
     """Return a body's vertical acceleration from rest; not `together`: the liquid is solved as if it did not move the body."""
     ball = {"shape": "sphere", "center": [0.5] * dimension, "radius": 0.5 / WIDE, "density": DENSITY * ratio}
-    simulation = create(
-        SUB_CELL, size=[1.0] * dimension, resolution=cells * WIDE, liquid=[box([0.0] * dimension, [1.0] * dimension)], wall="free-slip",
-        solid=[ball], solver={"tolerance": 1e-6}, device=device, **_down(dimension),
+    simulation = create_liquid(
+        SUB_CELL, [1.0] * dimension, cells * WIDE, [box([0.0] * dimension, [1.0] * dimension)], wall="free-slip", solid=[ball],
+        solver={"tolerance": 1e-6}, **_down(dimension),
     )  # fmt: skip
     if not together:
         coupling = simulation.projection.coupling
@@ -67,7 +58,7 @@ def _first_acceleration(dimension: int, cells: int, ratio: float, device: str, *
 
 
 @check_at("floating", "{dimension}-D, {cells} cells, a box of {ratio:g} times the liquid's density")
-def displacement(found: Findings, dimension: int, cells: int, ratio: float, device: str) -> None:
+def displacement(found: Findings, dimension: int, cells: int, ratio: float) -> None:
     """Let a box bob, and compare the mean of what it displaces with its mass."""
     width, height = BOX
     side = 1.0 if dimension == 2 else 0.8
@@ -75,10 +66,8 @@ def displacement(found: Findings, dimension: int, cells: int, ratio: float, devi
     bottom = level - 0.85 * ratio * height
     low, high = [center - 0.5 * width, bottom, center - 0.5 * width], [center + 0.5 * width, bottom + height, center + 0.5 * width]
     raft = box(low[:dimension], high[:dimension], density=DENSITY * ratio)
-    simulation = create(
-        SUB_CELL, size=[side] * dimension, resolution=cells, liquid=[box([0.0] * dimension, [side, level, side][:dimension])],
-        solid=[raft], density_correction={}, device=device, **_down(dimension),
-    )  # fmt: skip
+    pool = box([0.0] * dimension, [side, level, side][:dimension])
+    simulation = create_liquid(SUB_CELL, [side] * dimension, cells, [pool], solid=[raft], **CORRECTED, **_down(dimension))
     depths = []
     for row in steps(simulation, SETTLES[dimension]):
         if simulation.time > 0.4 * SETTLES[dimension]:
@@ -104,22 +93,21 @@ def water_level(simulation: LiquidSimulation, width: float) -> float:
 
 
 @check_at("floating", "{dimension}-D, an impact")
-def momentum(found: Findings, dimension: int, device: str) -> None:
+def momentum(found: Findings, dimension: int) -> None:
     """Let liquid fly against a body far from walls: what the body gains is what the liquid loses, whatever the solve leaves."""
     for ratio in (0.01, 1.0, 100.0):
-        lost, exchanged = exchange(dimension, ratio, device)
+        lost, exchanged = exchange(dimension, ratio)
         found.add(f"ratio {ratio:g}: momentum lost over exchanged", lost / exchanged, high=1e-4)
-    found.must_break("solved one after the other: energy over that before", exchange(dimension, 0.01, device, together=False)[0], high=1.0)
+    found.must_break("solved one after the other: energy over that before", exchange(dimension, 0.01, together=False)[0], high=1.0)
 
 
-def exchange(dimension: int, ratio: float, device: str, *, together: bool = True) -> tuple[float, float]:
+def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[float, float]:
     """Return the momentum that a step's projection loses and that it exchanges; not `together`: kinetic energy after over before, and 0."""
     body = box([0.46, 0.4, 0.4][:dimension], [0.61, 0.57, 0.57][:dimension], density=DENSITY * ratio)
     fast = box([0.25, 0.3, 0.3][:dimension], [0.55, 0.6, 0.6][:dimension], velocity=[1.0, 0.2, -0.3][:dimension])
-    simulation = create(
-        VOXEL, size=[1.0] * dimension, resolution=20, liquid=[fast], solid=[body], device=device, physics={"gravity": [0.0] * dimension},
-        domain={"size": [1.0] * dimension, "resolution": 20, "solids": "cut-cell"}, solver={"tolerance": 1e-6},
-    )  # fmt: skip
+    size, still = [1.0] * dimension, {"gravity": [0.0] * dimension}
+    domain, solver = {"size": size, "resolution": 20, "solids": "cut-cell"}, {"tolerance": 1e-6}
+    simulation = create_liquid(VOXEL, size, 20, [fast], solid=[body], physics=still, domain=domain, solver=solver)
     coupling, bodies = simulation.projection.coupling, simulation.bodies
     assert coupling is not None and bodies is not None
     if not together:
@@ -147,22 +135,20 @@ def exchange(dimension: int, ratio: float, device: str, *, together: bool = True
 
 
 @check_at("floating", "{cells}^3 cells, bodies of all weights")
-def iterations(found: Findings, cells: int, device: str) -> None:
+def iterations(found: Findings, cells: int) -> None:
     """Count the iterations of the first step of bodies of all weights under water."""
-    counts = {ratio: _iterations(cells, ratio, device, corrected=True) for ratio in EXTREMES}
+    counts = {ratio: _iterations(cells, ratio, corrected=True) for ratio in EXTREMES}
     for ratio, count in counts.items():
         found.add(f"ratio {ratio:g}: iterations over those at 1", count / counts[1.0], high=1.5)
-    plain = _iterations(cells, min(EXTREMES), device, corrected=False)
+    plain = _iterations(cells, min(EXTREMES), corrected=False)
     found.must_break(f"uncorrected, ratio {min(EXTREMES):g}: iterations over those at 1", plain / counts[1.0], high=1.5)
 
 
-def _iterations(cells: int, ratio: float, device: str, *, corrected: bool) -> int:
+def _iterations(cells: int, ratio: float, *, corrected: bool) -> int:
     """Return the iterations of the first step from rest."""
     raft = box([0.3, 0.3, 0.35], [0.7, 0.45, 0.6], density=DENSITY * ratio, wall="free-slip")
-    simulation = create(
-        SUB_CELL, size=[1.0] * 3, resolution=cells, liquid=[box([0.0] * 3, [1.0, 0.7, 1.0])], solid=[raft],
-        solver={"tolerance": 1e-6}, device=device, **_down(3),
-    )  # fmt: skip
+    pool, solver = box([0.0] * 3, [1.0, 0.7, 1.0]), {"tolerance": 1e-6}
+    simulation = create_liquid(SUB_CELL, [1.0] * 3, cells, [pool], solid=[raft], solver=solver, **_down(3))
     if not corrected:
         simulation.projection._make_problem()
         simulation.projection._work.correction.renew = lambda begins: False
@@ -171,3 +157,14 @@ def _iterations(cells: int, ratio: float, device: str, *, corrected: bool) -> in
 
 def _down(dimension: int) -> dict[str, Any]:
     return {"physics": {"gravity": [0.0, -GRAVITY, 0.0][:dimension]}}
+
+
+CHECK = Check(
+    about="Rigid bodies in a liquid: displacement at rest, added mass, momentum, and solves that do not depend on what bodies weigh.",
+    trials=[
+        (accelerations, [(dimension, cells) for dimension in (2, 3) for cells in CELLS[dimension]]),
+        (displacement, [(dimension, *case) for dimension in (2, 3) for case in FLOATS[dimension]]),
+        (momentum, (2, 3)),
+        (iterations, (24, 32)),
+    ],
+)

@@ -1,4 +1,6 @@
-"""Sand on a slope without an end: it rests, or runs with the acceleration that friction leaves of gravity's.
+"""Sand on slopes: layers without an end, and blocks and hoppers on walls that lie askew to the grid.
+
+A layer rests, or runs with the acceleration that friction leaves of gravity's.
 
 On a rough floor the friction is the sand's own, k = tan(friction angle) of the normal load; stiff sand slides on a smooth one with the
 wall's. Above the friction angle sand that runs goes on running; sand that has settled holds up to the angle whose sine is k, because it
@@ -13,18 +15,16 @@ u = 2/3 I / d sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
+from warp_lcp.benchmarks.validation.scenes import CORRECTED, GRAVITY, Row, box, create_sand, steps, tilted
 from warp_lcp.granular.materials import MATERIALS
-from warp_lcp.granular.scene import SandScene
-from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
+from warp_lcp.granular.simulator import SandSimulation
+from warp_lcp.granular.solids import SandSolids
 
-GRAVITY = 9.81  # [m/s^2]
 DEPTH, LENGTH = 0.32, 0.16  # [m]: of the layer, and of the domain
 RESOLUTIONS = (16, 32)  # cells of depth
 DT = 2e-3  # [s], at 16 cells
@@ -42,68 +42,61 @@ STEADY, BELOW, STOPPED = (24.0, 28.0), 19.0, 0.6  # degrees; degrees at which it
 CREEPS = 0.1  # from this speed [m/s]
 SETS_IN, OFF = 0.9, 0.8  # [s] until it is steady; what of the profile it starts with
 
-
-def check(device: str) -> tuple[list[Trial], list[Chart]]:
-    """Run the check at its resolutions."""
-    trials = [trial(n, device) for trial in (layer, slab, bagnold) for n in RESOLUTIONS]
-    curves = curves_of([t for t in trials if t.check == "inclined layer"])
-    exact = [(math.degrees(a), accelerates(math.degrees(a)) / GRAVITY) for a in np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20)]
-    curves["sin - cos / 2"] = ([x for x, _ in exact], [y for _, y in exact])
-    title = "Acceleration of a layer that runs"
-    profiles = curves_of([t for t in trials if t.check == BAGNOLD])
-    y = np.linspace(0.0, DEPTH, 40)
-    profiles |= {f"Bagnold, {a:g} degrees": ((y / DEPTH).tolist(), bagnold_profile(y, a).tolist()) for a in STEADY}
-    return trials, [
-        Lines("inclined-layer", title, "slope [degrees]", "a / g", curves, log=""),
-        Lines("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", profiles, log=""),
-    ]
+PLANES = ((10.0, 0.1), (20.0, 0.2), (30.0, 0.3), (45.0, 0.5))  # degrees, friction of planes that the block slides on
+BLOCK_HEIGHT, BLOCK_LENGTH = 0.1, 0.4  # [m]
+BLOCK = {"friction_angle": 40.0, "cohesion": 5e3}
+AFTER, UNTIL = 0.03, 0.12  # [s], when the block's acceleration is measured
+HOPPER = 40  # cells of its width
+WIDTH, SLOT, STEEP, LIP, SLICK = 0.4, 0.1, 60.0, 0.025, 0.2  # of the hopper [m, degrees], and its friction
+SHIFTS = (0.0, 0.25, 0.5)  # of the grid [cells]
+FROM, TO, PARTS = 0.25, 0.6, 3  # [s], when the hopper's rate is measured
 
 
 @check_at("inclined layer", "{cells} cells of depth")
-def layer(found: Findings, cells: int, device: str = "cpu", angles: tuple[float, ...] = ANGLES) -> None:
+def layer(found: Findings, cells: int, angles: tuple[float, ...] = ANGLES) -> None:
     """Let sand rest and run on a rough slope; the control is the box of Narain et al., which gives way where sand should rest."""
-    whole, late = rests(cells, REST, device)
+    whole, late = rests(cells, REST)
     found.add(f"{REST:g} degrees, settled: |mean acceleration|", abs(late), high=0.01, unit="g")
     found.add(f"{REST:g} degrees, settled: speed in the end over g t", abs(whole), high=1e-3)
     ratios = []
     for angle in angles:
-        ratio = runs(cells, angle, device) / accelerates(angle)
+        ratio = runs(cells, angle) / accelerates(angle)
         stuck = 1.0 / cells  # of the mean, the share of the row that the floor holds
         found.add(f"{angle:g} degrees, running: acceleration over expected", ratio, low=0.94 - stuck, high=1.06 + stuck)
         ratios.append(ratio * accelerates(angle) / GRAVITY)
-    found.curves["layer"] = (list(angles), ratios)
-    _, flows = rests(cells, BOX_FLOWS, device, friction={"model": "box"})
+    found.curve("layer", angles, ratios)
+    _, flows = rests(cells, BOX_FLOWS, friction={"model": "box"})
     found.must_break(f"box, {BOX_FLOWS:g} degrees, settled: mean acceleration", flows, high=0.01, unit="g")
 
 
 @check_at("sliding slab", "{cells} cells of depth")
-def slab(found: Findings, cells: int, device: str = "cpu", angles: tuple[float, ...] = SLIDES) -> None:
+def slab(found: Findings, cells: int, angles: tuple[float, ...] = SLIDES) -> None:
     """Let stiff sand rest and slide on a smooth slope; the control is a floor without friction."""
     tables = {"material": {"friction_angle": STIFF}, "floor": SMOOTH}
-    _, late = rests(cells, SLAB_REST, device, **tables)
+    _, late = rests(cells, SLAB_REST, **tables)
     found.add(f"{SLAB_REST:g} degrees: |mean acceleration|", abs(late), high=0.01, unit="g")
     for angle in angles:
-        ratio = runs(cells, angle, device, speed=0.0, **tables) / accelerates(angle)
+        ratio = runs(cells, angle, speed=0.0, **tables) / accelerates(angle)
         found.add(f"{angle:g} degrees: acceleration over expected", ratio, low=0.94, high=1.06)
-    _, slips = rests(cells, SLAB_REST, device, material={"friction_angle": STIFF}, floor=0.0)
+    _, slips = rests(cells, SLAB_REST, material={"friction_angle": STIFF}, floor=0.0)
     found.must_break("smooth floor: mean acceleration", slips, high=0.01, unit="g")
 
 
 @check_at(BAGNOLD, "{cells} cells of depth")
-def bagnold(found: Findings, cells: int, device: str = "cpu", angles: tuple[float, ...] = STEADY) -> None:
+def bagnold(found: Findings, cells: int, angles: tuple[float, ...] = STEADY) -> None:
     """Let sand whose friction grows with the rate of shear run to its steady speed; the control is friction that does not grow."""
     beads: dict[str, Any] = {"material": {"friction_angle": STATIC}}
     growing = beads | {"friction": {"dynamic_angle": DYNAMIC, "grain_size": GRAIN, "inertial_number": INERTIAL}}
     for angle in angles:
-        y, u = steady(cells, angle, device, **growing)
+        y, u = steady(cells, angle, **growing)
         expected, most = bagnold_profile(y, angle), float(bagnold_profile(np.array([DEPTH]), angle)[0])
         found.add(f"{angle:g} degrees: mean speed over Bagnold's", u.mean() / expected.mean(), low=0.95, high=1.05)
         off = np.abs(u - expected).max() / most
         found.add(f"{angle:g} degrees: farthest from Bagnold's profile, over its surface's speed", off, high=0.05)
-        found.curves[f"{angle:g} degrees"] = ((y / DEPTH).tolist(), u.tolist())
-    _, mean = _watch(_create(cells, BELOW, device, CREEPS, **growing), cells, STOPPED)
+        found.curve(f"{angle:g} degrees", y / DEPTH, u)
+    _, mean = _watch(_create(cells, BELOW, CREEPS, **growing), cells, STOPPED)
     found.add(f"{BELOW:g} degrees: speed in the end over that at the start", abs(mean[-1]) / CREEPS, high=0.01)
-    y, u = steady(cells, angles[0], device, **beads)
+    y, u = steady(cells, angles[0], **beads)
     ratio = u.mean() / bagnold_profile(y, angles[0]).mean()
     found.must_break(f"friction that does not grow, {angles[0]:g} degrees: mean speed over Bagnold's", ratio, low=0.95, high=1.05)
 
@@ -116,9 +109,9 @@ def bagnold_profile(y: np.ndarray, angle: float) -> np.ndarray:
     return np.asarray(2.0 / 3.0 * inertial / GRAIN * fall * (DEPTH**1.5 - np.maximum(DEPTH - y, 0.0) ** 1.5))
 
 
-def steady(cells: int, angle: float, device: str = "cpu", **tables: Any) -> tuple[np.ndarray, np.ndarray]:
+def steady(cells: int, angle: float, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the heights [m] of rows of sand that has run for a while on a slope [degrees], and their mean speeds [m/s]."""
-    simulation = _create(cells, angle, device, 0.0, **tables)
+    simulation = _create(cells, angle, 0.0, **tables)
     velocity = simulation.particles.velocity.numpy()
     velocity[:, 0] = OFF * bagnold_profile(simulation.particles.position.numpy()[:, 1], angle)
     simulation.particles.velocity.assign(velocity)
@@ -134,40 +127,37 @@ def accelerates(angle: float) -> float:
     return GRAVITY * (math.sin(math.radians(angle)) - COEFFICIENT * math.cos(math.radians(angle)))
 
 
-def runs(cells: int, angle: float, device: str = "cpu", *, speed: float = START, **tables: Any) -> float:
+def runs(cells: int, angle: float, *, speed: float = START, **tables: Any) -> float:
     """Return the acceleration of sand on a slope [degrees] in the second half of its run [m/s^2]."""
-    simulation = _create(cells, angle, device, speed, **tables)
+    simulation = _create(cells, angle, speed, **tables)
     time, mean = _watch(simulation, cells, RUNS)
     half = time > 0.5 * RUNS
     return float(np.polyfit(time[half], mean[half], 1)[0])
 
 
-def rests(cells: int, angle: float, device: str = "cpu", **tables: Any) -> tuple[float, float]:
+def rests(cells: int, angle: float, **tables: Any) -> tuple[float, float]:
     """Return how fast sand that has settled on the level gains speed on a slope [degrees], in all and in the second half of RESTS [g]."""
-    simulation = _create(cells, 0.0, device, 0.0, **tables)
+    simulation = _create(cells, 0.0, 0.0, **tables)
     _watch(simulation, cells, SETTLES)
     simulation.particles.velocity.zero_()
     for gradient in simulation.particles.affine:
         gradient.zero_()
-    simulation.gravity = GRAVITY * np.array(_down(angle))
+    simulation.gravity = np.array([*tilted(angle)["gravity"], 0.0])
     time, mean = _watch(simulation, cells, RESTS)
     middle = len(time) // 2
     whole, late = mean[-1] / time[-1], (mean[-1] - mean[middle]) / (time[-1] - time[middle])
     return float(whole / GRAVITY), float(late / GRAVITY)
 
 
-def _create(cells: int, angle: float, device: str, speed: float, floor: float | str = ROUGH, **tables: Any) -> SandSimulation:
-    data = {
-        "scene": {"simulator": "granular"},
-        "time": {"duration": 100.0},
-        "domain": {"size": [LENGTH, 1.5 * DEPTH], "resolution": 3 * cells // 2, "periodic": [True, False], "friction": floor},
-        "physics": {"gravity": [GRAVITY * a for a in _down(angle)[:2]]},
+def _create(cells: int, angle: float, speed: float, floor: float | str = ROUGH, **tables: Any) -> SandSimulation:
+    size, resolution = [LENGTH, 1.5 * DEPTH], 3 * cells // 2
+    layer: Row = {
+        "domain": {"size": size, "resolution": resolution, "periodic": [True, False], "friction": floor},
+        "physics": tilted(angle),
         "material": {"friction_angle": FRICTION_ANGLE},
         "particles": {"jitter": 0.0},
-        "sand": [{"shape": "box", "min": [0.0, 0.0], "max": [LENGTH, DEPTH], "velocity": [speed, 0.0]}],
     }
-    scene = SandScene.model_validate(data | tables)
-    return GranularSimulator().create(scene, device=device, folder=Path())
+    return create_sand(size, resolution, [box([0.0, 0.0], [LENGTH, DEPTH], velocity=[speed, 0.0])], **(layer | tables))
 
 
 def _watch(simulation: SandSimulation, cells: int, duration: float) -> tuple[np.ndarray, np.ndarray]:
@@ -180,6 +170,121 @@ def _watch(simulation: SandSimulation, cells: int, duration: float) -> tuple[np.
     return dt * np.arange(1, len(mean) + 1), np.array(mean)
 
 
-def _down(angle: float) -> list[float]:
-    """Return the direction of gravity in a domain whose x runs down a slope [degrees]."""
-    return [math.sin(math.radians(angle)), -math.cos(math.radians(angle)), 0.0]
+STEEPER = np.degrees(np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20))
+HEIGHTS = np.linspace(0.0, DEPTH, 40)
+EXACT = {"sin - cos / 2": (STEEPER, [accelerates(angle) / GRAVITY for angle in STEEPER])}
+STEADY_LAYERS = {f"Bagnold, {a:g} degrees": (HEIGHTS / DEPTH, bagnold_profile(HEIGHTS, a)) for a in STEADY}
+RUNNING = "inclined-layer", "Acceleration of a layer that runs", "slope [degrees]", "a / g"
+LAYERS = Check(
+    about=__doc__ or "",
+    trials=[(run, RESOLUTIONS) for run in (layer, slab, bagnold)],
+    charts=[
+        plot(*RUNNING, check="inclined layer", exact=EXACT),
+        plot("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", check=BAGNOLD, exact=STEADY_LAYERS),
+    ],
+    known="half a degree below the angle from which it runs a settled layer of 32 cells still moves, at .7 % of g t",
+)
+
+
+@check_at("sand oblique", "{cells} cells of height")
+def planes(found: Findings, cells: int, cases: tuple[tuple[float, float], ...] = PLANES) -> None:
+    """Let a block slide down planes, and rest on rougher ones."""
+    for angle, friction in cases:
+        t = math.radians(angle)
+        drive = GRAVITY * math.sin(t)
+        measured = acceleration(angle, friction, cells)
+        off = 100.0 * (measured - drive + friction * GRAVITY * math.cos(t)) / drive
+        found.add(f"{angle:g} degrees, friction {friction:g}: acceleration off Coulomb's, of g sin", abs(off), high=2.0, unit="%")
+        held = acceleration(angle, 1.2 * math.tan(t), cells)
+        found.add(f"{angle:g} degrees, friction 1.2 tan: acceleration of g sin", 100.0 * abs(held) / drive, high=0.5, unit="%")
+    angle, friction = cases[len(cases) // 2]
+    drive = GRAVITY * math.sin(math.radians(angle))
+    exact = drive - friction * GRAVITY * math.cos(math.radians(angle))
+    stairs = acceleration(angle, friction, cells, whole=True)
+    found.must_break("whole cells: acceleration off Coulomb's, of g sin", 100.0 * abs(stairs - exact) / drive, high=2.0, unit="%")
+
+
+@check_at("sand oblique", "hopper of {cells} cells")
+def hopper(found: Findings, cells: int = HOPPER, shifts: tuple[float, ...] = SHIFTS) -> None:
+    """Let sand run from a hopper whose place in the grid differs."""
+    cut, stairs = (np.array([discharge(shift, cells, whole=whole) for shift in shifts]) for whole in (False, True))
+
+    def spread(rates: np.ndarray) -> float:
+        return 100.0 * float(np.ptp(rates.mean(axis=1)) / rates.mean())
+
+    found.add("spread of the rate over places in the grid", spread(cut), high=6.0, unit="%")
+    growth = 100.0 * float(np.abs(cut[:, -1] / cut[:, 0] - 1.0).max())
+    found.add("growth of the rate as the hopper empties", growth, high=10.0, unit="%")
+    found.add("rate / sqrt(g D^3)", float(cut.mean()), low=0.7, high=2.0)
+    found.must_break("whole cells: spread of the rate over places in the grid", spread(stairs), high=6.0, unit="%")
+
+
+def acceleration(angle: float, friction: float, cells: int, *, whole: bool = False, shift: float = 0.0) -> float:
+    """Return the acceleration of a stiff block down a plane [m/s^2].
+
+    Args:
+        angle: of the plane [degrees].
+        friction: of the plane.
+        cells: of the block's height.
+        whole: solids are whole cells for the stresses.
+        shift: of the plane [cells].
+    """
+    t, dx = math.radians(angle), BLOCK_HEIGHT / cells
+    down, up = np.array([math.cos(t), -math.sin(t)]), np.array([math.sin(t), math.cos(t)])
+    point = [BLOCK_HEIGHT + shift * dx, BLOCK_HEIGHT + 5.0 * BLOCK_HEIGHT * math.tan(t) + 0.37 * dx]
+    high = math.ceil(point[1] / BLOCK_HEIGHT) + 2
+    plane = {"shape": "plane", "point": point, "normal": up.tolist(), "friction": friction}
+    block = box([0.0, 0.0], [BLOCK_LENGTH, BLOCK_HEIGHT], rotate=-angle, translate=point)
+    size = [8.0 * BLOCK_HEIGHT, high * BLOCK_HEIGHT]
+    simulation = create_sand(size, max(8, high) * cells, [block], [plane], material=BLOCK)
+    simulation = with_stairs(simulation) if whole else simulation
+    times, speeds = [], []
+    for _ in steps(simulation, UNTIL):
+        times.append(simulation.time)
+        speeds.append(float(simulation.particles.velocity.numpy()[:, :2].mean(axis=0) @ down))
+    at = np.array(times) > AFTER
+    return float(np.polyfit(np.array(times)[at], np.array(speeds)[at], 1)[0])
+
+
+def discharge(shift: float, cells: int, *, whole: bool = False) -> list[float]:
+    """Return a hopper's rate in parts of the time, over sqrt(g D^3).
+
+    Args:
+        shift: of the hopper [cells].
+        cells: of its width.
+        whole: solids are whole cells for the stresses.
+    """
+    dx, t, parts = WIDTH / cells, math.radians(STEEP), np.linspace(FROM, TO, PARTS + 1)
+    middle, foot = 0.5 * WIDTH + shift * dx, 0.2 + 0.61 * shift * dx
+    walls: list[dict[str, Any]] = []
+    for side in (-1.0, 1.0):
+        x = middle + side * (0.5 * SLOT + LIP)
+        end = [x + side * 0.6 * math.cos(t), foot + 0.6 * math.sin(t)]
+        walls.append({"shape": "capsule", "from": [x, foot], "to": end, "radius": LIP, "friction": SLICK})
+    fill = box([0.0, foot + 0.01], [WIDTH, foot + 0.4])
+    drain = box([-1.0, -1.0], [WIDTH + 1.0, 0.08])
+    simulation = create_sand([WIDTH, 2.0 * WIDTH], 2 * cells, [fill], walls, drain=[drain], **CORRECTED)
+    simulation = with_stairs(simulation) if whole else simulation
+    left = []
+    for time in parts:
+        for _ in steps(simulation, time):
+            pass
+        left.append(np.count_nonzero(simulation.particles.position.numpy()[:, 1] > foot) * dx * dx / simulation.scene.particles.per_axis**2)
+    return [float(rate) / math.sqrt(GRAVITY * SLOT**3) for rate in -np.diff(left) / np.diff(parts)]
+
+
+def with_stairs(simulation: SandSimulation) -> SandSimulation:
+    """Return a simulation of the same, not yet begun, whose solids are whole cells for the stresses."""
+    scene, boundary = simulation.scene, simulation.boundary
+    solids = SandSolids(simulation.grid, boundary.cut.solids, boundary, scene.wall_frictions())  # type: ignore[attr-defined]
+    return SandSimulation(scene, simulation.grid, boundary, solids, simulation.particles, outlets=simulation.outlets)
+
+
+OBLIQUE = Check(
+    about="""
+Sand on walls that lie askew to the grid: a stiff block slides as Coulomb says, and a smooth hopper runs evenly wherever the grid lies.
+
+The control are solids of whole cells, whose stairs hold the block, and whose hopper runs as its stairs happen to lie.
+""",
+    trials=[(planes, (8, 16)), (hopper, [()])],
+)

@@ -1,19 +1,20 @@
-"""Liquids at rest: they stay there, and their pressure is that of their depth."""
+"""Liquids at rest and nearly so: they stay there, their pressure is that of their depth, and small waves go as linear theory says."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Chart, Lines
-from warp_lcp.benchmarks.validation import tank
-from warp_lcp.benchmarks.validation.enclosed import enclosed_cells
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
-from warp_lcp.benchmarks.validation.tank import DENSITY, GRAVITY, SMOOTHED, SUB_CELL, VOXEL, Numerics
-from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.validation import scenes
+from warp_lcp.benchmarks.validation.finding import Check, Curve, Findings, Trial, check_at, plot
+from warp_lcp.benchmarks.validation.scenes import DENSITY, GRAVITY, SUB_CELL, VOXEL, Numerics, box, pressures, steps, tilted
+from warp_lcp.benchmarks.validation.signals import enclosed_cells, mode, period
 
 RESOLUTIONS = (20, 40)  # cells a side
 SIDE, LEVEL = 0.8, 0.4  # [m]: of the domain, and of a pool
@@ -21,22 +22,32 @@ DURATION, TILTED_DURATION = 10.0, 20.0  # [s]
 AVERAGED = 1.0  # [s] at the end over which the pressure's bias is averaged
 SLOPE, TILT = 30.0, 20.0  # degrees: of the planes of a V, and of gravity
 
-POOL = [tank.box([0.0, 0.0], [SIDE, LEVEL])]
-FULL = [tank.box([0.0, 0.0], [SIDE, SIDE])]
+POOL = [box([0.0, 0.0], [SIDE, LEVEL])]
 V = [
     {"shape": "plane", "point": [0.5 * SIDE, 0.0], "normal": [side * math.sin(math.radians(SLOPE)), math.cos(math.radians(SLOPE))]}
     for side in (-1, 1)
 ]
-CASES: dict[str, dict[str, Any]] = {
+FULL = [box([0.0, 0.0], [SIDE, SIDE])]
+CASES: dict[str, scenes.Row] = {
     "pool": {"liquid": POOL},
     "pool in a V": {"liquid": POOL, "solid": V},
     "full box": {"liquid": FULL},
-    "full tilted box": {"liquid": FULL, "physics": tank.tilted(TILT)},
+    "full tilted box": {"liquid": FULL, "physics": tilted(TILT)},
 }
 
+WAVE_RESOLUTIONS = (14, 28)  # cells of depth
+LENGTH, DEPTH, HEIGHT = 1.0, 0.5, 0.75  # [m]: of the tank, of the liquid, of the tank
+AMPLITUDE = 0.05 * DEPTH
+WAVENUMBER = math.pi / LENGTH
+PERIOD = 2.0 * math.pi / math.sqrt(GRAVITY * WAVENUMBER * math.tanh(WAVENUMBER * DEPTH))
+PERIODS = 5
+SEEDS = (2015, 1, 2)  # of the particles: with whole cells the period is a matter of chance too, once the wave is lower than a cell
+POINTS = 257  # of the surface at the start
+SPEED = "t [s]", "largest speed / sqrt(g dx)"
+STAIRS = "whole cells: error of the period"  # a control
 
-@dataclass(frozen=True)
-class Rest:
+
+class Rest(NamedTuple):
     """What a liquid that should rest did."""
 
     time: np.ndarray  # ends of the steps [s]
@@ -50,89 +61,71 @@ class Rest:
         return float(self.speed[(self.time > begin) & (self.time <= end + 1e-9)].max())
 
 
-def check(device: str) -> tuple[list[Trial], list[Chart]]:
-    """Run the check at its resolutions."""
-    trials = [trial(n, device) for trial in (whole_cells, sub_cell, tilted_surface) for n in RESOLUTIONS]
-    profiles = {t.resolution: t.curves["profile"] for t in trials if "profile" in t.curves}
-    charts: list[Chart] = []
-    for check, title in (("rest", "Largest speed at rest"), ("tilted rest", "Largest speed of a tilted surface at rest")):
-        speeds = {label: c for label, c in curves_of([t for t in trials if t.check == check]).items() if not label.endswith("profile")}
-        charts.append(Lines(check.replace(" ", "-"), title, "t [s]", "largest speed / sqrt(g dx)", speeds, log="y"))
-    exact = {"rho g (h - y)": ([0.0, 1.0], [1.0, 0.0])}
-    charts.append(Lines("pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", exact | profiles, log=""))
-    return trials, charts
-
-
 @check_at("rest", "{resolution} cells, {numerics.name}")
-def whole_cells(found: Findings, resolution: int, device: str, numerics: Numerics = VOXEL) -> None:
+def whole_cells(found: Findings, resolution: int, numerics: Numerics = VOXEL) -> None:
     """Rest with a surface and solids of whole cells; the controls are a pool that gravity tilts, and a surface within the cells."""
     for case, tables in CASES.items():
-        rest = settle(resolution, device, VOXEL, DURATION, **tables)
+        rest = settle(resolution, VOXEL, DURATION, **tables)
         found.add(f"{case}: largest speed", rest.largest(0.0, DURATION), high=1e-3)
         if case.startswith("pool"):
             found.add(f"{case}: bias of the pressure", rest.bias, low=0.48, high=0.52, unit="rho g dx")
         if case == "pool":
-            found.curves["profile"] = _normalized(rest)
-    tilted = settle(resolution, device, VOXEL, AVERAGED, liquid=POOL, physics=tank.tilted(TILT))
-    found.must_break("level pool under tilted gravity: largest speed", tilted.largest(0.0, AVERAGED), high=1e-3)
-    within = settle(resolution, device, SUB_CELL, 2 * AVERAGED, **CASES["pool"])
+            _draw_profile(found, rest)
+    tilts = settle(resolution, VOXEL, AVERAGED, liquid=POOL, physics=tilted(TILT))
+    found.must_break("level pool under tilted gravity: largest speed", tilts.largest(0.0, AVERAGED), high=1e-3)
+    within = settle(resolution, SUB_CELL, 2 * AVERAGED, **CASES["pool"])
     found.must_break("sub-cell pool: bias of the pressure", within.bias, low=0.48, high=0.52, unit="rho g dx")
 
 
 @check_at("rest", "{resolution} cells, {numerics.name}")
-def sub_cell(found: Findings, resolution: int, device: str, numerics: Numerics = SUB_CELL) -> None:
+def sub_cell(found: Findings, resolution: int, numerics: Numerics = SUB_CELL) -> None:
     """Rest with a sub-cell surface and cut cells; the control is the bias that a surface of whole cells has."""
     for case, tables in CASES.items():
-        rest = settle(resolution, device, numerics, DURATION, **tables)
+        rest = settle(resolution, numerics, DURATION, **tables)
         found.add(f"{case}: largest speed in the first second", rest.largest(0.0, 1.0), high=0.05)
         found.add(f"{case}: largest speed from 8 to 10 s", rest.largest(8.0, DURATION), high=0.01)
-        found.curves[case] = (rest.time.tolist(), rest.speed.tolist())
+        found.curve(case, rest.time, rest.speed)
         if case.startswith("pool"):
             found.add(f"{case}: |bias of the pressure|", abs(rest.bias), high=0.02, unit="rho g dx")
         if case == "pool":
-            found.curves["profile"] = _normalized(rest)
+            _draw_profile(found, rest)
     level = LEVEL + 0.5 * SIDE / resolution  # its surface goes through the cells' centers
-    rest = settle(resolution, device, numerics, DURATION, level, liquid=[tank.box([0.0, 0.0], [SIDE, level])])
+    rest = settle(resolution, numerics, DURATION, level, liquid=[box([0.0, 0.0], [SIDE, level])])
     found.add("pool half a cell higher: |bias of the pressure|", abs(rest.bias), high=0.02, unit="rho g dx")
-    found.curves["pool half a cell higher"] = (rest.time.tolist(), rest.speed.tolist())
-    whole = settle(resolution, device, VOXEL, 2 * AVERAGED, **CASES["pool"])
+    found.curve("pool half a cell higher", rest.time, rest.speed)
+    whole = settle(resolution, VOXEL, 2 * AVERAGED, **CASES["pool"])
     found.must_break("whole cells: |bias of the pressure|", abs(whole.bias), high=0.02, unit="rho g dx")
 
 
 @check_at("tilted rest", "{resolution} cells, {numerics.name}")
-def tilted_surface(found: Findings, resolution: int, device: str, numerics: Numerics = SMOOTHED) -> None:
+def tilted_surface(found: Findings, resolution: int, numerics: Numerics = scenes.SMOOTHED) -> None:
     """Rest of a free surface that gravity tilts; the control is a surface of whole cells, whose stairs run."""
     normal = [-math.sin(math.radians(TILT)), math.cos(math.radians(TILT))]
-    tables: dict[str, Any] = {
-        "liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}],
-        "physics": tank.tilted(TILT),
-    }
-    rest = settle(resolution, device, numerics, TILTED_DURATION, **tables)
-    half = 0.5 * TILTED_DURATION
-    late, early = (rest.speed[rest.time > half].mean(), rest.speed[rest.time <= half].mean())
+    tables: scenes.Row = {"liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}], "physics": tilted(TILT)}
+    rest, stairs = (settle(resolution, each, TILTED_DURATION, **tables) for each in (numerics, VOXEL))
+    late = rest.time > 0.5 * TILTED_DURATION
     found.add("largest speed", rest.largest(0.0, TILTED_DURATION), high=0.1)
     found.add("largest speed after the first second", rest.largest(1.0, TILTED_DURATION), high=0.1)
-    found.add("mean of the largest speeds, second half over first", late / early, high=1.0)
+    found.add("mean of the largest speeds, second half over first", rest.speed[late].mean() / rest.speed[~late].mean(), high=1.0)
     found.add("change of volume", 100.0 * abs(rest.volume - 1.0), high=0.5, unit="%")
-    stairs = settle(resolution, device, VOXEL, TILTED_DURATION, **tables)
     found.must_break("whole cells: largest speed", stairs.largest(0.0, TILTED_DURATION), high=0.3)
-    for name, curve in (("surface", rest), ("whole cells", stairs)):
-        found.curves[name] = (curve.time.tolist(), curve.speed.tolist())
+    found.curve("surface", rest.time, rest.speed)
+    found.curve("whole cells", stairs.time, stairs.speed)
 
 
-def settle(resolution: int, device: str, numerics: Numerics, duration: float, level: float = LEVEL, **tables: Any) -> Rest:
+def settle(resolution: int, numerics: Numerics, duration: float, level: float = LEVEL, **tables: Any) -> Rest:
     """Let a liquid rest for a time [s]; `level` is how high it stands if it stands level [m]."""
-    simulation = tank.create(numerics, size=[SIDE, SIDE], resolution=resolution, device=device, **tables)
-    before, unit = _enclosed(simulation), tank.gravity_speed(simulation)
+    simulation = scenes.create_liquid(numerics, [SIDE, SIDE], resolution, **tables)
+    dx = simulation.grid.spacing
+    before, unit = enclosed_cells(*scenes.particles_in_cells(simulation)), math.sqrt(GRAVITY * dx)
     time, speed, fields = [], [], []
-    for row in tank.steps(simulation, duration):
+    for row in steps(simulation, duration):
         time.append(row["time"])
         speed.append(row["max_speed"] / unit)
         if row["time"] > duration - AVERAGED:
-            fields.append(tank.pressures(simulation))
-    mean = np.mean(fields, axis=0)
-    bias, profile = _bias(mean, simulation.grid.spacing, level)
-    return Rest(np.array(time), np.array(speed), bias, profile, _enclosed(simulation) / before)
+            fields.append(pressures(simulation))
+    bias, profile = _bias(np.mean(fields, axis=0), dx, level)
+    return Rest(np.array(time), np.array(speed), bias, profile, enclosed_cells(*scenes.particles_in_cells(simulation)) / before)
 
 
 def _bias(pressure: np.ndarray, dx: float, level: float = LEVEL) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
@@ -146,12 +139,98 @@ def _bias(pressure: np.ndarray, dx: float, level: float = LEVEL) -> tuple[float,
     return float((pressure - hydrostatic)[deep].mean() / (DENSITY * GRAVITY * dx)), (y[rows], means)
 
 
-def _normalized(rest: Rest) -> tuple[list[float], list[float]]:
+def _draw_profile(found: Findings, rest: Rest) -> None:
     y, pressure = rest.profile
-    return (y / LEVEL).tolist(), (pressure / (DENSITY * GRAVITY * LEVEL)).tolist()
+    found.curve("profile", y / LEVEL, pressure / (DENSITY * GRAVITY * LEVEL))
 
 
-def _enclosed(simulation: LiquidSimulation) -> float:
-    """Return the volume inside the sub-cell surface [cells]; the domain's box is the only solid it knows."""
-    nx, ny, _ = simulation.grid.counts
-    return enclosed_cells(tank.positions(simulation) / simulation.grid.spacing, (nx, ny), 1.0 / tank.PER_AXIS**2)
+def _profiles(trials: Sequence[Trial]) -> Lines:
+    curves: dict[str, Curve] = {"rho g (h - y)": ([0.0, 1.0], [1.0, 0.0])}
+    curves |= {t.resolution: t.curves["profile"] for t in trials if "profile" in t.curves}
+    return Lines("pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", curves, log="")
+
+
+RESTING = Check(
+    about="Liquids at rest: they stay there, and their pressure is that of their depth.",
+    trials=[(run, RESOLUTIONS) for run in (whole_cells, sub_cell, tilted_surface)],
+    charts=[
+        plot("rest", "Largest speed at rest", *SPEED, log="y", check="rest", but="profile"),
+        plot("tilted-rest", "Largest speed of a tilted surface at rest", *SPEED, log="y", check="tilted rest"),
+        _profiles,
+    ],
+    known="single particles that leave a tilted free surface run down above it, beyond 10 % of sqrt(g dx)",
+)
+
+
+@check_at("sloshing", "{cells} cells of depth, {numerics.name}")
+def sloshing(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+    """Measure the period, the worst of some samples; the control is a surface of whole cells, which follows waves in stairs."""
+    for each in (numerics, VOXEL):
+        waves = [slosh(cells, each, seed) for seed in SEEDS]
+        periods = [period(*wave) for wave in waves]
+        worst = int(np.argmax(np.abs(np.array(periods) - PERIOD)))
+        error = 100.0 * abs(periods[worst] / PERIOD - 1.0)
+        time, elevation = waves[worst]
+        found.curve(f"{cells} cells, {each.name}, {periods[worst]:.4f} s", time, elevation / AMPLITUDE)
+        if each is numerics:
+            found.add("error of the period", error, high=3.0, unit="%")
+        else:
+            found.must_break(STAIRS, error, high=8.0, unit="%")
+
+
+def slosh(cells: int, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and the amplitude of the first mode [m]; the seed is that of the particles' places."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, size = Path(name), [LENGTH, HEIGHT]
+        write_wave(folder / "wave.obj")
+        wave = {"shape": "mesh", "file": "wave.obj"}
+        simulation = scenes.create_liquid(numerics, size, round(cells * LENGTH / DEPTH), [wave], particles={"seed": seed}, folder=folder)
+    area = (simulation.grid.spacing / scenes.PER_AXIS) ** 2
+
+    def amplitude() -> float:
+        return mode(scenes.positions(simulation)[:, 0], WAVENUMBER, area, LENGTH)
+
+    curve = [(0.0, amplitude()), *((row["time"], amplitude()) for row in steps(simulation, PERIODS * PERIOD))]
+    time, elevation = np.array(curve).T
+    return time, elevation
+
+
+def write_wave(path: Path) -> None:
+    """Write the liquid at the start as a closed surface, extruded along z: its cut by z = 0 lies below y = h + a cos(k x)."""
+    margin = 0.1 * LENGTH  # beyond the walls, so that none of the liquid's sides lies on them
+    x = np.linspace(-margin, LENGTH + margin, POINTS)
+    outline = [*zip(x, DEPTH + AMPLITUDE * np.cos(WAVENUMBER * x), strict=True), (x[-1], -margin), (x[0], -margin)]
+    n = len(outline)
+    vertices = [f"v {a:.9g} {b:.9g} {z:g}" for z in (-1.0, 1.0) for a, b in outline]
+    sides = []
+    for p in range(n):
+        q = (p + 1) % n
+        sides += [(p + 1, q + 1, n + q + 1), (p + 1, n + q + 1, n + p + 1)]
+    low, high = POINTS + 2, POINTS + 1  # corners at the floor, left and right, counted from 1
+    fans = [(low, p + 1, p + 2) for p in range(POINTS - 1)] + [(low, POINTS, high)]
+    caps = [*fans, *((a + n, c + n, b + n) for a, b, c in fans)]
+    faces = [f"f {a} {b} {c}" for a, b, c in [*sides, *caps]]
+    path.write_text("\n".join([*vertices, *faces]) + "\n", encoding="utf-8")
+
+
+def finer(found: Findings, trials: Sequence[Trial]) -> None:
+    """Compare the errors of the period at both resolutions."""
+    (coarse, _), (fine, stairs) = ([t.value(what) for what in ("error of the period", f"control: {STAIRS}")] for t in trials)
+    found.add("error of the period", fine, high=max(coarse, 0.5), unit="%")
+    found.must_break(STAIRS, stairs, high=max(coarse, 0.5), unit="%")
+
+
+def _modes(trials: Sequence[Trial]) -> Lines:
+    time = np.linspace(0.0, PERIODS * PERIOD, 400)
+    curves = {"linear theory": (time.tolist(), np.cos(2.0 * math.pi * time / PERIOD).tolist())}
+    for t in trials:
+        curves |= t.curves
+    return Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, log="")
+
+
+SLOSHING = Check(
+    about="Sloshing of a small amplitude: omega^2 = g k tanh(k h), linear theory of waves on water of depth h.",
+    trials=[(sloshing, WAVE_RESOLUTIONS)],
+    across=(f"{WAVE_RESOLUTIONS[1]} against {WAVE_RESOLUTIONS[0]} cells", finer),
+    charts=[_modes],
+)

@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.benchmarks.harness.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
-from warp_lcp.benchmarks.validation.sand_pit import GRAVITY, Row, create
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
+from warp_lcp.benchmarks.validation.scenes import GRAVITY, box, create_sand
 from warp_lcp.granular.simulator import SandSimulation
 
 RESOLUTIONS = {2: (16, 24), 3: (16,)}  # cells of the width, by dimension
@@ -39,15 +38,13 @@ RISE = 0.01  # [m/s] of a floor
 Step = Callable[[SandSimulation, float], None]
 
 
-@dataclass(frozen=True)
-class Silo:
+class Silo(NamedTuple):
     """What a silo bears."""
 
     depth: np.ndarray  # of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,)
     load: np.ndarray  # the vertical stress there [rho g W], shape (rows,)
     shear: np.ndarray  # what walls bear, upward, over the load, shape (rows,)
     fell: float  # how far the center of mass has gone at most, over the height
-    rows: list[Row]  # of the log
 
     def at(self, depth: float) -> float:
         """Return the vertical stress [rho g W] at a depth [widths]."""
@@ -60,24 +57,10 @@ def janssen(depth: float, friction: float, ratio: float, walls: int = 2) -> floa
     return depth if rate == 0.0 else (1.0 - math.exp(-rate * depth)) / rate
 
 
-def check(device: str) -> tuple[list[Trial], list[Chart]]:
-    """Run the check at its resolutions."""
-    trials = [trial(n, dimension, device) for dimension, cells in RESOLUTIONS.items() for n in cells]
-    trials += [slot(n, device) for n in RESOLUTIONS[2]] + [controls(RESOLUTIONS[2][0], device)]
-    curves: dict[str, Any] = curves_of(trials)
-    depths = np.linspace(0.0, DEEP[2], 40).tolist()
-    for ratio in RATIOS:
-        curves[f"Janssen, mu = 0.5, K = {ratio:.2g}"] = (depths, [janssen(z, 0.5, ratio) for z in depths])
-    title = "Vertical stress in a silo"
-    return trials, [Lines("sand-silo", title, "z / W", "sigma / (rho g W)", curves, log="")]
-
-
 @check_at("sand silo", "{cells} cells of width, {dimension}-D")
-def trial(
-    found: Findings, cells: int, dimension: int = 2, device: str = "cpu", frictions: tuple[float, ...] = FRICTIONS, deep: float = 0.0
-) -> None:
+def trial(found: Findings, cells: int, dimension: int = 2, frictions: tuple[float, ...] = FRICTIONS, deep: float = 0.0) -> None:
     """Compare what a silo bears with Janssen's law: as it is, with short steps, under a lid, and between walls without friction."""
-    more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3, "device": device}
+    more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3}
     depths = range(1, math.ceil(more["deep"]))
     for friction in frictions:
         bears(found, f"mu = {friction:g}", rest(fill(cells, friction, **more)), friction, depths, walls=2 * dimension - 2)
@@ -93,27 +76,27 @@ def trial(
 
 
 @check_at("sand silo", "{cells} cells between two walls, 3-D")
-def slot(found: Findings, cells: int, device: str = "cpu") -> None:
+def slot(found: Findings, cells: int) -> None:
     """Compare a silo of two walls in 3-D with Janssen's law."""
-    bears(found, "mu = 0.5", rest(fill(cells, 0.5, deep=DEEP[3], deeper=SLOT, device=device)), 0.5, range(1, math.ceil(DEEP[3])))
+    bears(found, "mu = 0.5", rest(fill(cells, 0.5, deep=DEEP[3], deeper=SLOT)), 0.5, range(1, math.ceil(DEEP[3])))
 
 
 @check_at("sand silo, wrong", "{cells} cells of width, 2-D")
-def controls(found: Findings, cells: int, device: str = "cpu") -> None:
+def controls(found: Findings, cells: int) -> None:
     """Push sand up, which turns the walls' friction over, and pack and start solves as was done before: all must miss the law."""
     depths = range(1, 6)
-    plain = rest(fill(cells, 0.5, device=device))
+    plain = rest(fill(cells, 0.5))
     for label, silo in (
-        ("a floor that rises", rest(fill(cells, 0.5, rise=RISE, device=device))),
-        ("sand that is too dense is pushed out", rest(fill(cells, 0.5, device=device), each=_pack_as_before)),
+        ("a floor that rises", rest(fill(cells, 0.5, rise=RISE))),
+        ("sand that is too dense is pushed out", rest(fill(cells, 0.5), each=_pack_as_before)),
     ):
         most = max(silo.at(z) / janssen(z, 0.5, RATIOS[0]) for z in depths)
         found.must_break(f"{label}: largest load over that of K = 1/3", most, high=1.0 + BEYOND)
         found.must_break(f"{label}: least shear of the walls, upward", float(silo.shear[silo.depth > NEAR].min()), low=0.0)
-        found.curves[label] = (silo.depth.tolist(), silo.load.tolist())
-    gaps = rest(fill(cells, 0.5, device=device), each=_close_all_gaps)
+        found.curve(label, silo.depth, silo.load)
+    gaps = rest(fill(cells, 0.5), each=_close_all_gaps)
     found.must_break("gaps of the sampling close: way of the center of mass over the height", gaps.fell, high=2e-4)
-    short = rest(fill(cells, 0.5, device=device), tiny=TINY, each=_keep_impulses)
+    short = rest(fill(cells, 0.5), tiny=TINY, each=_keep_impulses)
     found.must_break("impulses of steps of other lengths: largest change of a load", change(plain, short, depths), high=0.02)
 
 
@@ -129,7 +112,7 @@ def bears(found: Findings, label: str, silo: Silo, friction: float, depths: rang
     below = (silo.depth > NEAR) & (silo.depth < depths[-1])
     found.add(f"{label}: least shear of the walls over the load, upward", float(silo.shear[below].min()), low=0.0)
     found.add(f"{label}: way of the center of mass over the height", silo.fell, high=2e-4)
-    found.curves[label] = (silo.depth.tolist(), silo.load.tolist())
+    found.curve(label, silo.depth, silo.load)
 
 
 def change(one: Silo, other: Silo, depths: range) -> float:
@@ -139,7 +122,7 @@ def change(one: Silo, other: Silo, depths: range) -> float:
 
 def fill(
     cells: int, friction: float | str, *, deep: float = DEEP[2], deeper: int = 1, lid: float = 0.0, square: bool = False,
-    rise: float = 0.0, device: str = "cpu", **tables: Any,
+    rise: float = 0.0, **tables: Any,
 ) -> SandSimulation:  # fmt: skip
     """Return a silo filled at rest.
 
@@ -151,7 +134,6 @@ def fill(
         lid: what lies on the sand [rho g W].
         square: whether z has walls as x has; else it has no end.
         rise: speed of the floor [m/s], in 2-D.
-        device: where it runs.
         tables: of the scene.
     """
     dx, high = WIDTH / cells, round(deep * cells)
@@ -161,17 +143,17 @@ def fill(
     if lid:
         low, top, gap = high * dx, (high + math.ceil(LID * cells)) * dx, CLEAR * dx
         mass = lid * DENSITY * WIDTH**2 * (more[0] if more else 1.0)
-        ends = [[gap, low, gap], [WIDTH - gap, top, WIDTH - gap]]
-        solids = [{"shape": "box", "min": ends[0][: 2 + len(more)], "max": ends[1][: 2 + len(more)], "mass": mass, "friction": 0.0}]
+        ends = ([gap, low, gap], [WIDTH - gap, top, WIDTH - gap])
+        solids = [box(*(end[: 2 + len(more)] for end in ends), mass=mass, friction=0.0)]
     if more and not square:
         tables["domain"] = {"size": [WIDTH, ny * dx, *more], "resolution": ny, "friction": friction, "periodic": [False, False, True]}
     tables = {"physics": {"gravity": [0.0, -GRAVITY, 0.0][: 2 + len(more)], "density": DENSITY}, "walls": friction} | tables
     floor = dx if rise else 0.0
     if rise:
-        piston = {"shape": "box", "min": [-1.0, -1.0], "max": [2.0 * WIDTH, floor], "friction": 0.0}
-        solids, ny = [piston | {"motion": {"kind": "translation", "velocity": [0.0, rise]}}], ny + 2
-    sand = {"shape": "box", "min": [0.0, floor, 0.0][: 2 + len(more)], "max": [WIDTH, floor + high * dx, *more]}
-    return create([WIDTH, ny * dx, *more], ny, [sand], solids, device=device, **tables)
+        motion, ny = {"kind": "translation", "velocity": [0.0, rise]}, ny + 2
+        solids = [box([-1.0, -1.0], [2.0 * WIDTH, floor], friction=0.0, motion=motion)]
+    sand = box([0.0, floor, 0.0][: 2 + len(more)], [WIDTH, floor + high * dx, *more])
+    return create_sand([WIDTH, ny * dx, *more], ny, [sand], solids, **tables)
 
 
 def rest(simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0, each: Step | None = None) -> Silo:
@@ -183,19 +165,14 @@ def rest(simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0,
         tiny: length of a short step after `PERIOD` others [s]; 0: there are none.
         each: called before each step with its length [s].
     """
-    rows: list[Row] = []
+    heights: list[Any] = []
     while simulation.time < duration:
         dt = min(simulation.stable_dt(), simulation.scene.time.dt_max)
         if tiny and simulation.step_count % PERIOD == PERIOD // 2:
             dt = tiny
         if each is not None:
             each(simulation, dt)
-        rows.append({**simulation.step(dt), "dt": dt})
-    return measure(simulation, rows)
-
-
-def measure(simulation: SandSimulation, rows: list[Row]) -> Silo:
-    """Return what the last step's stresses are."""
+        heights.append(simulation.step(dt)["center_of_mass_y"])
     grid, packing = simulation.grid, simulation.packing
     inner = tuple(slice(low, high) for low, high in zip(grid.domain.low, grid.domain.high, strict=True))
     x = simulation.stress.now.numpy()[(slice(None), *inner)].astype(np.float64)
@@ -209,18 +186,7 @@ def measure(simulation: SandSimulation, rows: list[Row]) -> Silo:
     phi = packing.fraction.numpy()[inner].mean(axis=across)
     depth = (np.cumsum(phi[::-1]) - 0.5 * phi[::-1]) / cells
     shear = np.mean(sides, axis=0) / unit / np.maximum(load, 1e-12)
-    heights = [row["center_of_mass_y"] for row in rows]
-    return Silo(depth, load[::-1], shear[::-1], float(np.ptp(heights) / (2.0 * heights[0])), rows)
-
-
-def _pack_as_before(simulation: SandSimulation, dt: float) -> None:
-    """Let what is too dense expand through the stresses: drive = (1 - phi) dx / dt of either sign below the surface."""
-    _drive(simulation, dt, lambda phi, drive: np.where(phi >= 0.9, 1.0 - phi, drive))
-
-
-def _close_all_gaps(simulation: SandSimulation, dt: float) -> None:
-    """Count a cell as full at the nominal density, and no sooner."""
-    _drive(simulation, dt, lambda phi, drive: np.where(phi >= 0.9, np.maximum(1.0 - phi, 0.0), drive))
+    return Silo(depth, load[::-1], shear[::-1], float(np.ptp(heights) / (2.0 * heights[0])))
 
 
 def _drive(simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
@@ -235,6 +201,25 @@ def _drive(simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np
     packing.update = update  # type: ignore[method-assign]
 
 
+# let what is too dense expand through the stresses: drive = (1 - phi) dx / dt of either sign below the surface
+_pack_as_before = partial(_drive, rule=lambda phi, drive: np.where(phi >= 0.9, 1.0 - phi, drive))
+# count a cell as full at the nominal density, and no sooner
+_close_all_gaps = partial(_drive, rule=lambda phi, drive: np.where(phi >= 0.9, np.maximum(1.0 - phi, 0.0), drive))
+
+
 def _keep_impulses(simulation: SandSimulation, dt: float) -> None:
     """Start a solve from the last impulses, however long they acted."""
     simulation.stress.kick_dt = 0.5 * (simulation.last_dt + dt)
+
+
+DEPTHS = np.linspace(0.0, DEEP[2], 40)
+LAWS = {f"Janssen, mu = 0.5, K = {ratio:.2g}": (DEPTHS, [janssen(z, 0.5, ratio) for z in DEPTHS]) for ratio in RATIOS}
+CHECK = Check(
+    about=__doc__ or "",
+    trials=[
+        (trial, [(n, dimension) for dimension, cells in RESOLUTIONS.items() for n in cells]),
+        (slot, RESOLUTIONS[2]),
+        (controls, RESOLUTIONS[2][:1]),
+    ],
+    charts=[plot("sand-silo", "Vertical stress in a silo", "z / W", "sigma / (rho g W)", exact=LAWS)],
+)

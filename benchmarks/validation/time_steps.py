@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.benchmarks.harness.record import Chart, Lines
-from warp_lcp.benchmarks.validation import sand_pit, tank
 from warp_lcp.benchmarks.validation.energy import Ledger
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, check_at, curves_of
-from warp_lcp.benchmarks.validation.tank import SUB_CELL, VOXEL, box
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at, plot
+from warp_lcp.benchmarks.validation.scenes import SHORTEST, SUB_CELL, VOXEL, box, create_liquid, create_sand
 from warp_lcp.operators.grid_poisson import FLUID
 
 RESOLUTIONS = (24, 48)  # cells along the domain
@@ -25,41 +23,30 @@ CHANGE = 5e-3  # of the total, that the last halving may change
 Watched = Callable[[Any], None]
 
 
-def check(device: str) -> tuple[list[Trial], list[Chart]]:
-    """Run the check at its resolutions."""
-    trials = [trial(n, device, what) for n in RESOLUTIONS for what in LONGEST]
-    curves = curves_of(trials)
-    title = "Energy of a collapse by the length of steps"
-    return trials, [Lines("time-steps", title, "t [s]", "energy / start", curves, log="")]
-
-
 @check_at("time steps", "{what}, {cells} cells")
-def trial(found: Findings, cells: int, device: str, what: str) -> None:
+def trial(found: Findings, cells: int, what: str) -> None:
     """Halve the steps of a collapse; the controls push crowds apart within the step, and let gravity act for whole steps."""
     lengths = LONGEST[what] * 0.5 ** np.arange(HALVINGS + 1)
-    runs = [collapse(what, cells, dt, device) for dt in lengths]
+    runs = [collapse(what, cells, dt) for dt in lengths]
     changes = [float(np.abs(a - b).max()) for (a, _), (b, _) in pairwise(runs)]
     found.add("most that a step adds", max(gained for _, gained in runs), high=MOST, unit="of the total")
     found.add("highest energy over that at the start", max(float(E.max()) for E, _ in runs), high=1.0 + MOST)
     found.add("change by the last halving", changes[-1], high=CHANGE, unit="of the total")
     found.add("change by the last halving over that by the first", changes[-1] / changes[0], high=1.0)
     for dt, (energy, _) in zip(lengths, runs, strict=True):
-        found.curves[f"{what}, {1e3 * dt:g} ms"] = (MOMENTS.tolist(), energy.tolist())
+        found.curve(f"{what}, {1e3 * dt:g} ms", MOMENTS, energy)
     if what in PUSHED_APART:
-        _, gained = collapse(what, cells, lengths[-1], device, change=PUSHED_APART[what])
+        _, gained = collapse(what, cells, lengths[-1], change=PUSHED_APART[what])
         found.must_break("old relaxation: most that a step adds", gained, high=MOST, unit="of the total")
 
 
-def collapse(
-    what: str, cells: int, dt: float, device: str = "cpu", *, change: Watched | None = None, moments: np.ndarray = MOMENTS
-) -> tuple[np.ndarray, float]:
+def collapse(what: str, cells: int, dt: float, *, change: Watched | None = None, moments: np.ndarray = MOMENTS) -> tuple[np.ndarray, float]:
     """Let a column collapse from rest.
 
     Args:
         what: a key of `LONGEST`.
         cells: along the domain.
         dt: length of the steps [s].
-        device: where it runs.
         change: makes the simulation a control.
         moments: at which the energy is wanted [s].
 
@@ -68,17 +55,17 @@ def collapse(
     """
     simulation: Any
     if what == "sand":
-        simulation = sand_pit.create(SIZE, cells, [COLUMN], walls=0.5, device=device)
+        simulation = create_sand(SIZE, cells, [COLUMN], walls=0.5)
     else:
         numerics = SUB_CELL if what == "liquid, sub-cell" else VOXEL
         tables: dict[str, Any] = {"pressure": {"model": "unilateral"}} if what == "liquid, unilateral" else {}
-        simulation = tank.create(numerics, size=SIZE, resolution=cells, liquid=[COLUMN], device=device, **tables)
+        simulation = create_liquid(numerics, SIZE, cells, [COLUMN], **tables)
     if change is not None:
         change(simulation)
     ledger = Ledger(simulation)
     total, most, energy = ledger.total(), -np.inf, []
     for moment in moments:
-        while simulation.time < moment - tank.SHORTEST:
+        while simulation.time < moment - SHORTEST:
             most = max(most, ledger.step(min(dt, moment - simulation.time)).gained / total)
         energy.append(ledger.total() / total)
     return np.array(energy), float(most)
@@ -114,3 +101,9 @@ def _push_liquid_apart(simulation: Any) -> None:
 
 
 PUSHED_APART: dict[str, Watched] = {"sand": _push_sand_apart, "liquid, unilateral": _push_liquid_apart}
+
+CHECK = Check(
+    about="The energy of a collapse converges as its steps get shorter, and no step makes any, the first one from rest included.",
+    trials=[(trial, [(n, what) for n in RESOLUTIONS for what in LONGEST])],
+    charts=[plot("time-steps", "Energy of a collapse by the length of steps", "t [s]", "energy / start")],
+)

@@ -10,8 +10,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.harness.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt, check_at
+from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.validation.finding import Check, Findings, check_at
+from warp_lcp.benchmarks.validation.scenes import DEVICE
 from warp_lcp.benchmarks.validation.signals import order
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -28,15 +29,6 @@ CENTER = np.array([0.5, 0.5, 0.0])
 TURN_STEPS = (20, 40, 80)  # of one turn of Zalesak's disk
 VORTEX_GRIDS = (16, 32, 64)
 VORTEX_SIZE, VORTEX_TIME, VORTEX_STEPS = 0.15, 3.0, 96  # [m], [s] at 1 rad/s in the middle; steps enough for the grid's error to show
-
-
-def check(device: str) -> tuple[list[Trial], list[Chart]]:
-    """Run the checks at their resolutions."""
-    order_trial = attempt("advection", f"{TURN_STEPS[0]} to {TURN_STEPS[-1]} steps, {VORTEX_GRIDS[0]} to {VORTEX_GRIDS[-1]} cells",
-                          lambda found: _orders(found, device))  # fmt: skip
-    trials = [round_trip(n, device) for n in RESOLUTIONS] + [order_trial]
-    chart = Lines("advection", "Error of the advection", "steps a turn, or cells a side", "largest error [m]", order_trial.curves)
-    return trials, [chart]
 
 
 @dataclass
@@ -85,10 +77,10 @@ def angular_momentum(position: np.ndarray, velocity: np.ndarray, gradients: list
     return total
 
 
-def cloud(n: int, real: str, device: str, *, affine: bool) -> Cloud:
+def cloud(n: int, real: str, *, affine: bool) -> Cloud:
     """Return a spinning, disturbed disk of particles in the middle of n x n cells."""
     scalar, vector, numpy_type, _ = REALS[real]
-    grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, device)
+    grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, DEVICE.get())
     rng = np.random.default_rng(RANDOM_SEED)
     position = np.zeros((PER_CELL * n * n, 3))
     position[:, :2] = rng.random((len(position), 2))
@@ -99,19 +91,19 @@ def cloud(n: int, real: str, device: str, *, affine: bool) -> Cloud:
     velocity = np.stack([-arm[:, 1], arm[:, 0], 0.0 * arm[:, 0]], axis=1) + noise[0]
     gradients = [np.array(row) + noise[1 + c] for c, row in enumerate(([0.0, -1.0, 0.0], [1.0, 0.0, 0.0]))] if affine else []
     position, velocity, *gradients = (
-        wp.array(values.astype(numpy_type), dtype=vector, device=device) for values in (position, velocity, *gradients)
+        wp.array(values.astype(numpy_type), dtype=vector, device=DEVICE.get()) for values in (position, velocity, *gradients)
     )
     return Cloud(grid, position, velocity, gradients, grid.faces(scalar), grid.faces(scalar))
 
 
 @check_at("transfers", "{n} cells")
-def round_trip(found: Findings, n: int, device: str) -> None:
+def round_trip(found: Findings, n: int) -> None:
     """Transfer to the grid and back; the control is PIC, which loses angular momentum."""
     for real, (*_, limit) in REALS.items():
-        linear, angular = changes(cloud(n, real, device, affine=True))
+        linear, angular = changes(cloud(n, real, affine=True))
         found.add(f"APIC, {real}: change of momentum", linear, high=limit)
         found.add(f"APIC, {real}: change of angular momentum", angular, high=limit)
-    linear, angular = changes(cloud(n, "float64", device, affine=False))
+    linear, angular = changes(cloud(n, "float64", affine=False))
     found.add("PIC, float64: change of momentum", linear, high=1e-12)
     found.must_break("PIC, float64: change of angular momentum", angular, high=1e-5)
 
@@ -125,26 +117,27 @@ def changes(c: Cloud) -> tuple[float, float]:
     return float(lost / speed.sum()), abs(c.angular_momentum() - angular) / float((arm * speed).sum())
 
 
-def _orders(found: Findings, device: str) -> None:
+@check_at("advection", f"{TURN_STEPS[0]} to {TURN_STEPS[-1]} steps, {VORTEX_GRIDS[0]} to {VORTEX_GRIDS[-1]} cells")
+def orders(found: Findings) -> None:
     """Find the order of the advection in time on Zalesak's disk, and in space in a vortex."""
-    turns = [zalesak_error(steps, device) for steps in TURN_STEPS]
+    turns = [zalesak_error(steps) for steps in TURN_STEPS]
     found.add("Zalesak's disk, one turn: order in time", order(turns), low=2.7, high=3.3)
     found.add(f"Zalesak's disk, {TURN_STEPS[-1]} steps: largest error over the slot's width", turns[-1] / 0.05, high=0.01)
-    errors = [vortex_error(n, device) for n in VORTEX_GRIDS]
+    errors = [vortex_error(n) for n in VORTEX_GRIDS]
     found.add("rotating blob in a vortex: order in space", order(errors), low=1.8, high=2.4)
     found.must_break("Euler's steps, one turn: order in time", order([euler_error(steps) for steps in TURN_STEPS]), low=2.7, high=3.3)
-    collocated = [vortex_error(n, device, off=0.5) for n in VORTEX_GRIDS]
+    collocated = [vortex_error(n, off=0.5) for n in VORTEX_GRIDS]
     found.must_break("fields half a cell off: order in space", order(collocated), low=1.8, high=2.4)
     found.curves["Zalesak's disk, steps a turn"] = (TURN_STEPS, turns)
     found.curves["vortex, cells a side"] = (VORTEX_GRIDS, errors)
 
 
-def zalesak_error(steps: int, device: str, n: int = 64) -> float:
+def zalesak_error(steps: int, n: int = 64) -> float:
     """Return the largest error [m] of particles of Zalesak's disk after a turn; the grid interpolates a rigid rotation exactly."""
     x, y = np.meshgrid(*[(np.arange(2 * n) + 0.5) / (2 * n)] * 2)
     disk = ((x - 0.5) ** 2 + (y - 0.75) ** 2 < 0.15**2) & ~((abs(x - 0.5) < 0.025) & (y < 0.85))
     start = np.stack([x[disk], y[disk], 0.0 * x[disk]], axis=1)
-    moved = carried(start, n, 2.0 * math.pi / steps, steps, np.ones_like, device)
+    moved = carried(start, n, 2.0 * math.pi / steps, steps, np.ones_like)
     return float(np.linalg.norm(moved - start, axis=1).max())
 
 
@@ -155,12 +148,11 @@ def euler_error(steps: int) -> float:
     return math.hypot(0.15, 0.25) * abs(growth * complex(math.cos(turned), math.sin(turned)) - 1.0)
 
 
-def vortex_error(n: int, device: str, *, off: float = 0.0) -> float:
+def vortex_error(n: int, *, off: float = 0.0) -> float:
     """Return the largest error [m] of a ring of particles in a vortex whose angular velocity falls off with the radius.
 
     Args:
         n: cells a side.
-        device: where it runs.
         off: cells by which the fields are sampled off their faces, along both axes.
     """
     angle = np.linspace(0.0, 2.0 * math.pi, 97)[:-1]
@@ -169,18 +161,18 @@ def vortex_error(n: int, device: str, *, off: float = 0.0) -> float:
     def rate(r: np.ndarray) -> np.ndarray:
         return np.exp(-((r / VORTEX_SIZE) ** 2))
 
-    moved = carried(start, n, VORTEX_TIME / VORTEX_STEPS, VORTEX_STEPS, rate, device, off)
+    moved = carried(start, n, VORTEX_TIME / VORTEX_STEPS, VORTEX_STEPS, rate, off)
     turn = VORTEX_TIME * float(rate(np.array(0.15)))
     exact = CENTER + np.stack([0.15 * np.cos(angle + turn), 0.15 * np.sin(angle + turn), 0.0 * angle], axis=1)
     return float(np.linalg.norm(moved - exact, axis=1).max())
 
 
-def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, device: str, off: float = 0.0) -> np.ndarray:
+def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, off: float = 0.0) -> np.ndarray:
     """Return where particles are [m] after `count` steps in a steady field that turns about the center with rate(r) [rad/s].
 
     The field is sampled `off` cells beside its faces.
     """
-    grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, device)
+    grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, DEVICE.get())
     j, i = np.meshgrid(np.arange(n + 2), np.arange(n + 2), indexing="ij")
     fields = grid.faces()
     for axis, field in enumerate(fields):
@@ -189,9 +181,16 @@ def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, device:
         field.assign(np.broadcast_to(turning, grid.shape).astype(np.float32))
     cells = np.full(grid.shape, wl.SOLID, np.int8)
     cells[1:-1, 1:-1, 1:-1] = wl.AIR
-    room = clearance(grid, wp.array(cells, dtype=wp.int8, device=device))
-    position = wp.array(start.astype(np.float32), dtype=wp.vec3, device=device)
-    stopped = wp.zeros(1, dtype=wp.int32, device=device)
+    room = clearance(grid, wp.array(cells, dtype=wp.int8, device=DEVICE.get()))
+    position = wp.array(start.astype(np.float32), dtype=wp.vec3, device=DEVICE.get())
+    stopped = wp.zeros(1, dtype=wp.int32, device=DEVICE.get())
     for _ in range(count):
         advect(grid, fields, room, dt, position, stopped)
     return np.asarray(position.numpy(), dtype=np.float64)
+
+
+CHECK = Check(
+    about="Particles and grid: what the transfers conserve, and the order of the advection.",
+    trials=[(round_trip, RESOLUTIONS), (orders, [()])],
+    charts=[lambda ran: Lines("advection", "Error of the advection", "steps a turn, or cells a side", "largest error [m]", ran[-1].curves)],
+)

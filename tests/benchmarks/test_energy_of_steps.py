@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from warp_lcp.benchmarks.validation import flight, sand_pit, tank, time_steps
+from warp_lcp.benchmarks.validation import flight, scenes, time_steps
 from warp_lcp.benchmarks.validation.energy import Ledger
-from warp_lcp.benchmarks.validation.tank import DENSITY, SUB_CELL, VOXEL, box
+from warp_lcp.benchmarks.validation.scenes import DENSITY, SUB_CELL, VOXEL, box
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -17,7 +17,7 @@ STILL = {"gravity": [0.0, 0.0]}
 
 
 def test_free_fall_makes_no_energy_whatever_the_steps() -> None:
-    ledger = Ledger(tank.create(VOXEL, size=[1.0, 1.0], resolution=16, liquid=[box([0.3, 0.6], [0.6, 0.9], velocity=[0.5, 1.0])]))
+    ledger = Ledger(scenes.create_liquid(VOXEL, [1.0, 1.0], 16, [box([0.3, 0.6], [0.6, 0.9], velocity=[0.5, 1.0])]))
     start = ledger.total()
     for dt in LENGTHS:
         assert abs(ledger.step(dt).gained) < 1e-6 * start
@@ -30,7 +30,7 @@ def test_free_fall_makes_no_energy_whatever_the_steps() -> None:
 def test_what_a_source_brings_is_not_made() -> None:
     """The first step emits what the velocity brings in: its energy is that of particles at that velocity, nothing else happens."""
     source = box([0.0, 0.25], [0.125, 0.5], velocity=[2.0, 0.0])
-    simulation = tank.create(VOXEL, size=[1.0, 1.0], resolution=16, liquid=[], source=[source], physics=STILL)
+    simulation = scenes.create_liquid(VOXEL, [1.0, 1.0], 16, [], source=[source], physics=STILL)
     ledger = Ledger(simulation)
     before = simulation.particles.count
     done = ledger.step(0.0625)  # the way of two cells
@@ -44,8 +44,8 @@ def test_the_work_of_a_wall_that_sets_a_plug_in_motion_is_its_momentum_times_its
     """From rest to u at once takes m u^2: half of it becomes motion, half is lost in the blow."""
     motion = {"kind": "translation", "velocity": [0.8, 0.0]}
     piston = box([-2.0, -1.0], [0.25, 2.0], motion=motion, wall="free-slip")
-    simulation = tank.create(
-        SUB_CELL, size=[1.0, 0.25], resolution=32, liquid=[box([0.25, 0.0], [0.5, 0.25])], solid=[piston], physics=STILL, wall="free-slip",
+    simulation = scenes.create_liquid(
+        SUB_CELL, [1.0, 0.25], 32, [box([0.25, 0.0], [0.5, 0.25])], solid=[piston], physics=STILL, wall="free-slip",
         solver={"tolerance": 1e-8},
     )  # fmt: skip
     done = Ledger(simulation).step(1e-4)
@@ -108,10 +108,10 @@ def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
     """But for what the density correction lifts, which is a matter of positions and the same whatever the step."""
     simulation: Any
     if what == "sand":
-        simulation = sand_pit.create([0.8, 0.4], 24, [box([0.0, 0.0], [0.2, 0.3])], walls=0.5)
+        simulation = scenes.create_sand([0.8, 0.4], 24, [box([0.0, 0.0], [0.2, 0.3])], walls=0.5)
     else:
         tables: dict[str, Any] = {"source": [TAP]} if what == "liquid and a tap" else {"pressure": {"model": "unilateral"}}
-        simulation = tank.create(VOXEL, size=[1.0, 0.75], resolution=16, liquid=[box([0.0, 0.0], [0.375, 0.5])], **tables)
+        simulation = scenes.create_liquid(VOXEL, [1.0, 0.75], 16, [box([0.0, 0.0], [0.375, 0.5])], **tables)
     found = along(Ledger(simulation), [0.02, 0.2], simulation.scene.time.dt_max)
     assert len(found) > 20
     assert max(rise.gained - rise.displaced for rise in found) < MOST

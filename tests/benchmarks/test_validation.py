@@ -4,7 +4,6 @@ import json
 import math
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +13,10 @@ import warp_lcp.benchmarks.__main__ as process
 from warp_lcp.benchmarks import validation
 from warp_lcp.benchmarks.harness.record import Lines
 from warp_lcp.benchmarks.suite import VALIDATION
-from warp_lcp.benchmarks.validation import ceiling, dam_break, rest, signals, slope, sloshing, transfers
-from warp_lcp.benchmarks.validation.enclosed import cumulative, enclosed_cells, filled_fraction
-from warp_lcp.benchmarks.validation.finding import Finding, Findings, Trial, attempt, control, table
-from warp_lcp.benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, create, fill
+from warp_lcp.benchmarks.validation import dam_break, rest, signals, transfers, walls
+from warp_lcp.benchmarks.validation.finding import Check, Finding, Findings, Trial, attempt, control, table
+from warp_lcp.benchmarks.validation.scenes import SUB_CELL, VOXEL, Numerics, create_liquid, fill
+from warp_lcp.benchmarks.validation.signals import cumulative, enclosed_cells, filled_fraction
 from warp_lcp.grid.triangle_mesh import load_surface
 from warp_lcp.simulation import StepFailed
 
@@ -133,7 +132,7 @@ def test_the_data_are_those_of_the_experiment() -> None:
     assert (np.diff(dam_break.Z) > 0).all()
     assert (np.diff(dam_break.TAU) > 0).all()
     assert (np.diff(dam_break.H) < 0).all()
-    assert abs(sloshing.PERIOD - 1.18182) < 1e-5
+    assert abs(rest.PERIOD - 1.18182) < 1e-5
 
 
 def test_the_kernel_of_the_density_is_a_quadratic_spline() -> None:
@@ -158,10 +157,10 @@ def test_the_volume_inside_a_surface_is_that_of_the_half_space(degrees: float) -
 
 
 def test_the_wave_is_a_closed_surface_of_the_right_volume(tmp_path: Path) -> None:
-    sloshing.write_wave(tmp_path / "wave.obj")
+    rest.write_wave(tmp_path / "wave.obj")
     surface = load_surface("wave.obj", tmp_path)
-    x = np.linspace(-0.1, 1.1, sloshing.POINTS)
-    area = trapezoid(sloshing.DEPTH + 0.1 + sloshing.AMPLITUDE * np.cos(np.pi * x), x)
+    x = np.linspace(-0.1, 1.1, rest.POINTS)
+    area = trapezoid(rest.DEPTH + 0.1 + rest.AMPLITUDE * np.cos(np.pi * x), x)
     assert surface.volume == pytest.approx(2.0 * area, rel=1e-4)
 
 
@@ -176,7 +175,7 @@ def test_the_bias_of_a_pressure() -> None:
 
 def test_angular_momentum_is_that_of_the_grid_around_the_particles() -> None:
     """A rigid rotation has |x|^2 of each tent's nodes, not of the particles: that difference is the affine part."""
-    c = transfers.cloud(16, "float64", "cpu", affine=True)
+    c = transfers.cloud(16, "float64", affine=True)
     expected = c.angular_momentum()
     c.round_trip()
     total = 0.0
@@ -189,20 +188,20 @@ def test_angular_momentum_is_that_of_the_grid_around_the_particles() -> None:
 
 
 def test_cells_are_filled_by_their_particles() -> None:
-    simulation = create(VOXEL, size=[1.0, 0.5], resolution=8, liquid=[{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.25]}])
+    simulation = create_liquid(VOXEL, [1.0, 0.5], 8, [{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.25]}])
     expected = np.zeros((4, 8))
     expected[:2, :4] = 1.0
     assert np.array_equal(fill(simulation), expected)
 
 
 def test_round_trips_keep_what_they_must() -> None:
-    trial = transfers.round_trip(16, "cpu")
+    trial = transfers.round_trip(16)
     assert trial.failures() == []
     assert trial.record().facts["controls_failed_as_they_must"]
 
 
 def test_the_advection_has_its_orders_and_worse_ones_do_not() -> None:
-    trial = transfers.check("cpu")[0][-1]
+    trial = transfers.orders()
     assert trial.failures() == []
     assert [f.what for f in trial.findings if f.control] == [
         "control: Euler's steps, one turn: order in time",
@@ -213,13 +212,13 @@ def test_the_advection_has_its_orders_and_worse_ones_do_not() -> None:
 
 @pytest.mark.parametrize(("numerics", "shape"), [(VOXEL, "flat"), (SUB_CELL, "slanted")])
 def test_a_block_lets_go_of_the_ceiling_and_its_controls_do_not(numerics: Numerics, shape: str) -> None:
-    trial = ceiling.trial(24, "cpu", numerics, shape)
+    trial = walls.falling(24, numerics, shape)
     assert trial.failures() == []
     assert len([f for f in trial.findings if f.control]) == 3
 
 
 def test_a_layer_slides_along_a_slope_and_is_stopped_by_stairs() -> None:
-    trial = slope.trial(5, "cpu")
+    trial = walls.sliding(5)
     assert trial.failures() == []
     assert trial.findings[-1].control
     assert trial.findings[-1].value > 5.0
@@ -228,9 +227,8 @@ def test_a_layer_slides_along_a_slope_and_is_stopped_by_stairs() -> None:
 @pytest.mark.parametrize("error", [0.5, 2.0])
 def test_a_failed_check_ends_the_process_with_1_after_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float) -> None:
     chart = Lines("waves", "waves", "t", "y", {"c": ([0.0, 1.0], [-1.0, 1.0])}, log="")
-    check = SimpleNamespace(check=lambda device: ([found(error, 3.0)], [chart]))
+    check = Check(about="Waves.", trials=[(found, [(error, 3.0)])], charts=[lambda trials: chart], known="steep")
     monkeypatch.setattr(validation, "CHECKS", {"waves": check})
-    monkeypatch.setattr(validation, "KNOWN", {"waves": "steep"})
     monkeypatch.setattr(sys, "argv", ["benchmarks", "validation", "--out", str(tmp_path), "--repeat", "1"])
     if error > 1.0:
         with pytest.raises(SystemExit) as ended:

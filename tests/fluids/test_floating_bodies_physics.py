@@ -46,6 +46,6 @@ def test_a_sphere_sets_off_with_its_added_mass(ratio):
 @pytest.mark.parametrize(("dimension", "cells"), [(2, 48), (3, 32)])
 def test_a_box_floats_at_its_displacement(dimension, cells):
     """The mean over its bobbing, measured from the free surface around it."""
-    trial = displacement(dimension, cells, 0.6, "cpu")
+    trial = displacement(dimension, cells, 0.6)
     assert trial.failures() == []
     assert trial.findings[0].value == pytest.approx(1.0, abs=0.02)

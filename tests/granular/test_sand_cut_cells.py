@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.validation import sand_oblique
+from warp_lcp.benchmarks.validation import inclined
 from warp_lcp.granular.coupled import AcceleratedProjection
 from warp_lcp.granular.cut_walls import CutWalls
 from warp_lcp.granular.packing import SHEARS, Packing
@@ -229,7 +229,7 @@ def test_a_block_slides_on_an_oblique_plane_as_coulomb_says(theta: float, mu: fl
 def test_slits_bear_nothing() -> None:
     """A cell here is open by 2e-3 of one of its faces: a pressure of 8,000 cells' depth used to hold the block back there, unsolved."""
     t, mu = math.radians(10.3), 0.09
-    assert sand_oblique.acceleration(10.3, mu, 11, shift=0.47) == pytest.approx(
+    assert inclined.acceleration(10.3, mu, 11, shift=0.47) == pytest.approx(
         G * (math.sin(t) - mu * math.cos(t)), abs=0.02 * G * math.sin(t)
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warp_lcp.benchmarks.validation import sand_heap
-from warp_lcp.benchmarks.validation.sand_pit import positions, steps
+from warp_lcp.benchmarks.validation.scenes import positions, steps
 
 CELLS, STANDS = 40, 0.5  # cells of length; [s]
 

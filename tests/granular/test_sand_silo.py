@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warp_lcp.benchmarks.validation import sand_silo
-from warp_lcp.benchmarks.validation.sand_pit import create
+from warp_lcp.benchmarks.validation.scenes import create_sand
 
 SHORT = 0.125  # [s]: at rest after the first steps
 
@@ -47,7 +47,7 @@ def test_sand_put_down_stays_where_it_is_however_its_particles_lie(per_axis: int
     gravity = {"gravity": [9.81 * math.sin(angle), -9.81 * math.cos(angle)]}
     particles = {"per_axis": per_axis, "jitter": jitter, "seed": 23}
     box = {"shape": "box", "min": [0.0, 0.0], "max": [0.16, height]}
-    simulation = create([0.16, 0.2], 20, [box], walls=0.5, physics=gravity, particles=particles)
+    simulation = create_sand([0.16, 0.2], 20, [box], walls=0.5, physics=gravity, particles=particles)
     start, weight = simulation.particles.position.numpy().mean(axis=0), 1600.0 * 9.81 * 0.16 * height**2
     energy = [simulation.step(5e-3)["kinetic_energy"] for _ in range(12)]
     assert np.abs(simulation.particles.position.numpy().mean(axis=0) - start).max() < 2e-4 * height

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_lcp.benchmarks.validation import sand_collapse, sand_hourglass, sand_invariants, sand_pit, sand_rest
+from warp_lcp.benchmarks.validation import sand_collapse, sand_hourglass, scenes
 
 
 def test_the_envelope_is_that_of_the_experiments() -> None:
@@ -21,13 +21,13 @@ def test_the_height_is_that_of_the_experiments() -> None:
 
 
 def test_a_column_runs_as_far_as_in_experiments_and_stops() -> None:
-    trial = sand_collapse.trial(12, aspects=(1.0,), controls=False)
+    trial = sand_collapse.runouts(12, aspects=(1.0,), controls=False)
     assert trial.failures() == []
 
 
 def test_half_the_friction_runs_too_far() -> None:
-    angle = float(np.degrees(np.arctan(0.5 * sand_pit.WALL_FRICTION)))
-    c = sand_collapse.collapse(2.0, 10, length=12.0, angle=angle, floor=0.5 * sand_pit.WALL_FRICTION)
+    angle = float(np.degrees(np.arctan(0.5 * scenes.WALL_FRICTION)))
+    c = sand_collapse.collapse(2.0, 10, length=12.0, angle=angle, floor=0.5 * scenes.WALL_FRICTION)
     assert c.runout > sand_collapse.envelope(2.0)[1]
 
 
@@ -50,31 +50,31 @@ def test_rates_are_areas_over_times() -> None:
 
 
 def test_a_collapse_keeps_its_invariants() -> None:
-    trial = sand_invariants.trial(12, duration=0.6)
+    trial = sand_collapse.invariants(12, duration=0.6)
     assert [line for line in trial.failures() if "densest" not in line] == []
     assert trial.findings[-1].control
     assert trial.findings[-1].passed
 
 
 def test_a_pile_at_rest_hardly_moves_inside() -> None:
-    (_, deep), (whole, later) = sand_rest.rest(10, "cpu", 2)
-    assert max(deep, later) < sand_rest.DEEP
-    assert whole < sand_rest.ALL  # few cells have a large share of them in the surface, where at first a grain still slides
+    (_, deep), (whole, later) = sand_collapse.rest(10, 2)
+    assert max(deep, later) < sand_collapse.DEEP
+    assert whole < sand_collapse.ALL  # few cells have a large share of them in the surface, where at first a grain still slides
 
 
 def test_drift_is_the_way_of_each_particle_whatever_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """Particles move by a rigid shift and are shuffled at every step: were they followed by number, they would seem to go far."""
-    simulation = sand_pit.create([0.2, 0.1], 20, [{"shape": "box", "min": [0.0, 0.0], "max": [0.1, 0.08]}])
+    simulation = scenes.create_sand([0.2, 0.1], 20, [{"shape": "box", "min": [0.0, 0.0], "max": [0.1, 0.08]}])
     random = np.random.default_rng(1)
 
-    def shift(s: sand_pit.SandSimulation, until: float):
+    def shift(s: scenes.SandSimulation, until: float):
         for _ in range(5):
             moved = s.particles.position.numpy() + np.array([1e-4, 0.0, 0.0], dtype=np.float32)
             s.particles.position.assign(moved[random.permutation(len(moved))])
             s.time += 0.1
             yield {}
 
-    monkeypatch.setattr(sand_pit, "steps", shift)
-    whole, deep = sand_pit.drift(simulation, 0.5, 0.1)
+    monkeypatch.setattr(scenes, "steps", shift)
+    whole, deep = scenes.drift(simulation, 0.5, 0.1)
     assert whole == pytest.approx(5e-4 / 0.5 / 0.1, rel=1e-3)
     assert deep == pytest.approx(whole, rel=1e-3)

@@ -10,7 +10,7 @@ import warp as wp
 
 import warp_lcp as wl
 from small_liquids import advance, box, create, dam, scene
-from warp_lcp.benchmarks.validation.enclosed import enclosed_cells
+from warp_lcp.benchmarks.validation.signals import enclosed_cells
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
