@@ -369,12 +369,7 @@ class SandScene(ParticleScene):
                 (bodies and sweeps, "solver.method", method, "moves no rigid bodies: take accelerated-projection"),
                 (bodies and closed, "domain.periodic", domain.periodic, "goes without rigid bodies"),
                 (holds, "domain.wall", domain.wall, pulls),
-                (
-                    height is not None and not 0.0 < height < top,
-                    "gauge.height",
-                    height,
-                    f"must lie in the domain, between 0 and {top:g} m",
-                ),
+                (height is not None and not 0.0 < height < top, "gauge.height", height, f"must lie in the domain, between 0 and {top:g} m"),
             ]
         )
 

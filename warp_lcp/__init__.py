@@ -3,17 +3,7 @@
 from importlib.metadata import PackageNotFoundError, version
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.operators import (
-    AIR,
-    FLUID,
-    SOLID,
-    DenseOperator,
-    GridPoisson,
-    LowRankOperator,
-    Operator,
-    SparseOperator,
-    SumOperator,
-)
+from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, LowRankOperator, Operator, SparseOperator, SumOperator
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual

@@ -98,10 +98,7 @@ def test_a_pool_drains_over_an_open_side_as_a_dam_breaks(dimension: int, cut: bo
     assert lost == pytest.approx(expected, rel=0.25)  # shallow water has no vertical motion at the start
 
 
-@pytest.mark.parametrize(
-    ("sides", "message"),
-    [(["top", "top"], "named twice"), (["front"], "3-D"), (["up"], "left"), ("top", "list")],
-)
+@pytest.mark.parametrize(("sides", "message"), [(["top", "top"], "named twice"), (["front"], "3-D"), (["up"], "left"), ("top", "list")])
 def test_what_sides_may_not_be(sides: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         opened(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])]), sides)

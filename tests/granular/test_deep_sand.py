@@ -14,10 +14,7 @@ def silo(cells: int, depth: int, slot: int, **tables: Any) -> SandSimulation:
     """Return a silo of some cells' width and depth, with a slot in its floor."""
     dx, left = 0.0125, (cells - slot) // 2
     low, floor, high = 4 * dx, 6 * dx, (6 + depth) * dx
-    solid = [
-        box([-1.0, low], [left * dx, floor], friction="stick"),
-        box([(left + slot) * dx, low], [1.0, floor], friction="stick"),
-    ]
+    solid = [box([-1.0, low], [left * dx, floor], friction="stick"), box([(left + slot) * dx, low], [1.0, floor], friction="stick")]
     sand, drain = [box([0.0, floor], [cells * dx, high])], [box([-1.0, -1.0], [1.0, 2 * dx])]
     size = [cells * dx, (depth + 10) * dx]
     return create(scene(size=size, resolution=depth + 10, sand=sand, friction=0.5, solid=solid, drain=drain, **tables))

@@ -248,8 +248,7 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(monkeypat
 
 
 @pytest.mark.parametrize(
-    ("table", "key"),
-    [({"solver": {"method": "interleaved-sweeps"}}, "method"), ({"domain": {"periodic": [True, False]}}, "periodic")],
+    ("table", "key"), [({"solver": {"method": "interleaved-sweeps"}}, "method"), ({"domain": {"periodic": [True, False]}}, "periodic")]
 )
 def test_scenes_that_bodies_do_not_go_with(table: dict[str, Any], key: str) -> None:
     with pytest.raises(ValidationError, match=key):

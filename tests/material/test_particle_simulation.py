@@ -145,8 +145,7 @@ def test_it_goes_on_on_a_finer_grid() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [("velocity", np.nan, "velocity is not finite"), ("position", 2.0, "position is outside the domain")],
+    ("name", "value", "message"), [("velocity", np.nan, "velocity is not finite"), ("position", 2.0, "position is outside the domain")]
 )
 def test_what_cannot_be_ends_the_run(name: str, value: float, message: str) -> None:
     simulation = make()

@@ -122,10 +122,7 @@ def test_an_oblique_impact_keeps_momentum_and_angular_momentum():
     bodies = bodies_of(made, 3, restitution=0.7, settings=start, open_sides=SIDES)
 
     def total():
-        return (
-            sum(b.momentum for b in bodies.bodies),
-            sum(b.angular_momentum + np.cross(b.position, b.momentum) for b in bodies.bodies),
-        )
+        return (sum(b.momentum for b in bodies.bodies), sum(b.angular_momentum + np.cross(b.position, b.momentum) for b in bodies.bodies))
 
     linear, angular = total()
     energies = run(bodies, 0.3, dt=0.005, gravity=np.zeros(3))

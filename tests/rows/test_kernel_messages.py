@@ -44,11 +44,7 @@ def messages() -> tuple[KernelMessages, Said, io.StringIO]:
 def test_a_script_hears_of_its_kernels_once_and_its_compiler_warns_of_none(tmp_path: Path) -> None:
     for compiles in (1, 0):
         done = subprocess.run(
-            [sys.executable, "-c", SCRIPT],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)},
+            [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False, env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
         )
         assert done.stdout == "CONVERGED\n", done.stderr
         said = [line for line in done.stderr.splitlines() if not line.startswith("Warp CUDA warning")]

@@ -243,11 +243,7 @@ def test_going_on_clears_what_was_half_written(folder):
     fill(folder, [".log.csv.part", "frames/.grid_000004.vtu.part", "checkpoints/.step_000016.npz.part", "frames/grid_000001.vtu"])
     folder.go_on(RunRecord("dots", "dots", "cpu"), 8)
     assert [path.name for path in folder.path.rglob(".*")] == [SPARE]
-    assert sorted(path.name for path in folder.checkpoints.folder.iterdir()) == [
-        "refused_000012.npz",
-        "step_000004.npz",
-        "step_000008.npz",
-    ]
+    assert sorted(path.name for path in folder.checkpoints.folder.iterdir()) == ["refused_000012.npz", "step_000004.npz", "step_000008.npz"]
     assert (folder.path / "frames" / "grid_000001.vtu").is_file()
     folder.check_new(force=True)  # all of it is a run's
 

@@ -40,10 +40,7 @@ def test_a_line_tells_why_and_what_it_takes() -> None:
 
 def test_a_measured_step_scales_the_prices() -> None:
     lines = model_lines([Model("walls", "asked for")], LISTED, CELLS, PARTICLES, memory=200_000, measured=14e-3)
-    assert lines == [
-        ("model", "walls: asked for; 25 % of memory, 4 ms a step (29 %)"),
-        ("step", "about 14 ms here, all models together"),
-    ]
+    assert lines == [("model", "walls: asked for; 25 % of memory, 4 ms a step (29 %)"), ("step", "about 14 ms here, all models together")]
 
 
 @pytest.mark.parametrize("simulator", ["fluids", "granular"])

@@ -72,12 +72,7 @@ LIQUID: dict[str, Any] = {
     "output": QUIET,
 }
 THICK: dict[str, Any] = {"size": [1.0, 0.5, 0.25], "liquid": [small_liquids.box([0.0, 0.0, 0.0], [0.375, 0.375, 0.25])]}
-SAND: dict[str, Any] = {
-    "size": [1.0, 0.5],
-    "resolution": 16,
-    "sand": [small_sands.box([0.0, 0.0], [0.375, 0.375])],
-    "output": QUIET,
-}
+SAND: dict[str, Any] = {"size": [1.0, 0.5], "resolution": 16, "sand": [small_sands.box([0.0, 0.0], [0.375, 0.375])], "output": QUIET}
 
 
 def traces_of(patch: pytest.MonkeyPatch, tables: dict[str, Any], *, sand: bool) -> Traces:

@@ -8,11 +8,7 @@ import pytest
 
 from warp_lcp.scene.scene import Scene, SceneError, validate
 
-BASE: dict[str, Any] = {
-    "scene": {"simulator": "dots"},
-    "time": {"duration": 1.0},
-    "domain": {"size": [1.6, 0.8], "resolution": 64},
-}
+BASE: dict[str, Any] = {"scene": {"simulator": "dots"}, "time": {"duration": 1.0}, "domain": {"size": [1.6, 0.8], "resolution": 64}}
 BOX = {"shape": "box", "min": [0.0, 0.0], "max": [0.4, 0.4]}
 
 

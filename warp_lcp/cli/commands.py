@@ -71,8 +71,7 @@ ColorOption = Annotated[
     Color | None, typer.Option(help="What colors the particles, on one scale for the whole run; speed unless given.", show_default=False)
 ]
 CameraOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; may be repeated."),
+    list[str] | None, typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; may be repeated.")
 ]
 ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
 
@@ -182,12 +181,7 @@ def render(
 
 
 @app.command()
-def view(
-    folder: RunArgument,
-    show: ShowOption = None,
-    color: ColorOption = None,
-    overrides: CameraOption = None,
-) -> None:
+def view(folder: RunArgument, show: ShowOption = None, color: ColorOption = None, overrides: CameraOption = None) -> None:
     """Show a run's frames in a window: Space plays, the arrow keys step, the mouse turns (needs a display and the extra `render`)."""
     devices()
     with _wrong_input():

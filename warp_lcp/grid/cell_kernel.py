@@ -26,11 +26,7 @@ LOOP = "for i in range(first, end): pass"
 @wp.func
 def cell_below(axis: int, k: int, j: int, i: int):
     """Return the cell on the other side of a cell's lower face; at the array's edge the cell itself."""
-    return (
-        wp.max(k - wp.where(axis == 2, 1, 0), 0),
-        wp.max(j - wp.where(axis == 1, 1, 0), 0),
-        wp.max(i - wp.where(axis == 0, 1, 0), 0),
-    )
+    return (wp.max(k - wp.where(axis == 2, 1, 0), 0), wp.max(j - wp.where(axis == 1, 1, 0), 0), wp.max(i - wp.where(axis == 0, 1, 0), 0))
 
 
 @wp.func

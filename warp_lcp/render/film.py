@@ -20,11 +20,7 @@ GIF_FASTEST = 50.0  # frames a second: viewers slow down what changes every hund
 QUALITY = "18"  # of x264, from 0 (no loss) to 51: flat colors and thin lines stay clean
 OWN_COLORS = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=none"  # for each image of a GIF
 ENCODERS: dict[str, dict[str, Any]] = {  # H.264 in MP4; a GIF repeats for ever
-    ".mp4": {
-        "codec": "libx264",
-        "pix_fmt_out": "yuv420p",
-        "output_params": ["-crf", QUALITY, "-movflags", "+faststart", "-f", "mp4"],
-    },
+    ".mp4": {"codec": "libx264", "pix_fmt_out": "yuv420p", "output_params": ["-crf", QUALITY, "-movflags", "+faststart", "-f", "mp4"]},
     ".gif": {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-filter_complex", OWN_COLORS, "-loop", "0", "-f", "gif"]},
 }
 

@@ -112,8 +112,7 @@ class Solver(Table):
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
     method: GridMethod = Field(default="projected-multigrid", description="projected-multigrid is the fastest")
     tolerance: Tolerance = Field(
-        default=1e-4,
-        description='the relative residual to reach; "auto": what leaves a tenth of the error that the time step makes',
+        default=1e-4, description='the relative residual to reach; "auto": what leaves a tenth of the error that the time step makes'
     )
     precision: PrecisionName = Field(default="mixed", description="of the method's arithmetic")
     max_iterations: Count = Field(default=100, description="iterations before the step counts as failed")

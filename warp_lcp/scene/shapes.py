@@ -60,8 +60,7 @@ class Shape(Table):
         default=None, description="degrees: one angle in 2-D, [x, y, z] in 3-D; it turns the shape about the origin, or the point of about"
     )
     about: Vector | None = Field(
-        default=None,
-        description="the point that scale and rotate leave where it is, such as the shape's center [m]; else the origin",
+        default=None, description="the point that scale and rotate leave where it is, such as the shape's center [m]; else the origin"
     )
     scale: Positive = Field(default=1.0, description="a factor, the same along every axis")
     invert: bool = Field(default=False, description="true: everything but the shape")
@@ -235,8 +234,7 @@ class SolidProperties(Shape):
     density: float | None = Field(default=None, ge=1e-18, description="in place of mass: of the solid, filled evenly [kg/m^3]")
     velocity: Vector | None = Field(default=None, description="of a rigid body at the start [m/s]; at rest unless given")
     angular_velocity: Angles | None = Field(
-        default=None,
-        description="of a rigid body at the start [degrees/s]: a number in 2-D, [x, y, z] in 3-D; 0 unless given",
+        default=None, description="of a rigid body at the start [degrees/s]: a number in 2-D, [x, y, z] in 3-D; 0 unless given"
     )
     friction: WallFriction | None = Field(
         default=None,
