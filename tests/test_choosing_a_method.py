@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from warp_lcp import gallery, reformulate
+from warp_lcp import gallery
 from warp_lcp.gallery import Plant, planted
 from warp_lcp.gallery.matrices import spectrum_matrix
+from warp_lcp.problem import reformulate
 from warp_lcp.recommend import RULES
 
 DOCS = Path(__file__).parents[1] / "docs"
