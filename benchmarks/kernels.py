@@ -30,7 +30,7 @@ SIZES = (128, 256)
 PRODUCT = "stencil.product, float32"
 # kernels that run once in a while: for a new operator, problem or set of cells
 SET_UP = (
-    "grid_poisson.copy_cells", "grid_poisson.count_faces", "grid_poisson.diagonal", "grid_poisson.weights", "components", "problem",
+    "grid_poisson.copy_cells", "grid_poisson.count_faces", "grid_poisson.diagonal", "grid_poisson.weights", "problem",
     "residual.within", "residual.unknown_square", "residual.settle",
 )  # fmt: skip
 SERIAL = ("stencil.relax",)  # in place and in two colors: bound by store forwarding, not by memory
@@ -175,7 +175,10 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
     kinds: dict[str, Heard] = {}
     for one in heard:
         declared = one.bound.form.declared
-        if one.bound.rows.size == A.layout.size and not declared.box and not declared.listed:
+        alone = not declared.name.startswith(
+            "components."
+        )  # those follow each other's trees in borrowed memory: `search` times them together
+        if alone and one.bound.rows.size == A.layout.size and not declared.box and not declared.listed:
             kinds.setdefault(one.name, one)
     return kinds, kinds[heard[-1].name]
 
