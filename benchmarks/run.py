@@ -28,10 +28,11 @@ SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated
 PARTICLES = 128  # cells along the longest side of the scene whose particles are timed
 PARTICLE_STEPS = 12
 WALL_TIME = 0.6  # [s] simulated of the scene in which solves with and without walls are compared: the splash lies in it
+WHOLE = "domain.solids=voxel"  # solids fill whole cells, as they do by themselves at the suite's own resolutions
 STAGES: dict[str, tuple[ModuleType | type, str]] = {
     "to grid": (particle_simulation, "particles_to_faces"),
     "to particles": (particle_simulation, "faces_to_particles"),
-    "advection": (WholeCells, "advect"),  # the scenes' solids fill whole cells
+    "advection": (WholeCells, "advect"),
     "extrapolation": (WholeCells, "extend"),
     "solve": (wl, "solve"),
 }
@@ -79,7 +80,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _overrides(duration: float, size: int) -> list[str]:
-    return [f"time.duration={duration}", *([f"domain.resolution={size}"] if size else [])]
+    return [f"time.duration={duration}", WHOLE, *([f"domain.resolution={size}"] if size else [])]
 
 
 def _run(name: str, duration: float, size: int, device: str) -> dict[str, float]:
@@ -174,7 +175,7 @@ def _walls(size: int, options: Options) -> Record:
 
 def _particles(size: int, options: Options) -> Record:
     """Step a dam break and time what its particles cost."""
-    scene = load_scene("dam-break", [f"domain.resolution={size}"])
+    scene = load_scene("dam-break", [WHOLE, f"domain.resolution={size}"])
     simulation: Any = simulators()[scene.scene.simulator].create(scene, device=options.device, folder=Path.cwd())
     count = simulation.particles.count
     with timed(options.device, STAGES) as seconds:

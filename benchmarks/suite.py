@@ -39,24 +39,7 @@ class Suite:
         seed: int | None = None,
         shared: bool = False,
     ) -> list[Path]:
-        """Measure and write the files.
-
-        Args:
-            device: Warp device.
-            out: folder of the files.
-            sizes: cells along a side; the suite's own without any.
-            repeat: samples of each timing.
-            scene: the only one to measure, its name or file.
-            seed: first one of its random problems, >= 0; new ones without.
-            shared: measure on several ranks; the files are then ranks.json and so on.
-
-        Returns:
-            The files.
-
-        Raises:
-            ValueError: a size, a seed or the number of samples is out of range, or the suite has no such choice.
-            RuntimeError: a measurement or a check failed; what it said is on the error stream. A failed check leaves the files.
-        """
+        """Measure in a process of its own, as `warp_lcp.cli.suites.Benchmark.run` says; a failed check leaves the files and is an error."""
         if sizes and not self.resizable:
             raise ValueError(f"size = {sizes[0]}: the suite {self.name} has its own resolutions")
         if repeat < 1:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import signal
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
@@ -90,7 +91,7 @@ class Attempt:
 
 
 @dataclass(frozen=True)
-class Case:
+class Case(ABC):
     """What can be attempted; subclasses try."""
 
     family: str  # the cases that share an expectation
@@ -116,9 +117,9 @@ class Case:
             broken = isinstance(error, BROKEN)
             return Attempt(type(error).__name__ if broken else REFUSED, seconds=time.perf_counter() - begun, message=str(error))
 
+    @abstractmethod
     def tried(self, precision: str, device: str) -> Attempt:
         """Return what comes of it."""
-        raise NotImplementedError
 
 
 class OverBudgetError(Exception):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -44,7 +45,7 @@ class Found:
     bytes: int | None = None  # of device arrays that the method holds
 
 
-class Probe:
+class Probe(ABC):
     """Problems of a run that are solved once for each setting."""
 
     kind: str  # of problem
@@ -57,9 +58,9 @@ class Probe:
     def __init__(self, scene: Scene, device: str) -> None:
         self.scene, self.device, self.read = scene, device, clock(device)
 
+    @abstractmethod
     def solves(self, method: str, precision: str, tolerance: float) -> Iterator[Callable[[], Found]]:
         """Yield what solves each problem."""
-        raise NotImplementedError
 
 
 def measure_solves(scene: Scene, options: Options, frames: int) -> list[Record]:
