@@ -34,7 +34,7 @@ def test_stages_follow_each_other(passes, cells, threads):
     y = wp.zeros_like(x)
     adding, halving, doubling = add.bind(rows, x=x, y=y), scale.bind(rows, x=x, y=y, factor=0.5), scale.bind(rows, x=x, y=y, factor=2.0)
     sequence = Sequence("test_sequence.all", [adding, halving, adding, adding, doubling])
-    assert len(sequence.order) == 5
+    assert len(sequence.tables.order) == 5
     assert len(sequence.tables.pieces0) == 1  # what is the same object is kept once
     if threads == 1:
         sequence.launch()

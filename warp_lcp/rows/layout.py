@@ -28,6 +28,8 @@ PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
 class RowLayout:
     """Where the rows lie, and how threads share them: a thread takes a chunk of a row in a slab of planes."""
 
+    begin: int  # of the tasks that a team's thread takes, see `warp_lcp.rows.team`: the first, one past the last; 0: one task a thread
+    end: int
     base: wp.int64  # element of the first cell
     s1: wp.int64  # elements from plane to plane
     s2: wp.int64  # elements from row to row
@@ -37,9 +39,11 @@ class RowLayout:
     grain: int  # cells that a thread takes
     chunks: int  # threads of a row
     slab: int  # planes that a thread takes
-    lines: int  # rows of a plane that it takes
     turn: int  # fields of three planes: planes before the first that they keep, too, that of ghosts, or none
     lift: int  # the plane at which they begin, counted from the first
+    cut: int  # planes of a slab of such fields, each with three planes of its own but beside the next
+    slabs: int  # their number
+    apart: int  # planes on either side of a cut that keep a place of their own
     spans: wp.array2d(dtype=wp.vec2i)  # first (even, for `pairs`) and one past the last cell of each row (k, j) with unknowns; null: all
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
@@ -218,8 +222,7 @@ class Rows:
     def edge(padding: Padding, device: wp.Device, axis: int) -> "Rows":
         """Return the first stored cells along axis 0, 1, 2 for x, y, z, those of its edges too."""
         counts = [1 if 2 - axis == a else n + 2 for a, n in enumerate(padding.counts)]
-        lines = 1 if device.is_cuda else counts[1]
-        return Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(counts), lines=lines)
+        return Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(counts))
 
     @staticmethod
     def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":
@@ -236,7 +239,7 @@ class Rows:
         if not all(0 <= begin <= end for begin, end in zip(low, high, strict=True)):
             raise ValueError(f"box: from {low} to {high}: expected 0 <= low <= high")
         counts = tuple(end - begin for begin, end in zip(low, high, strict=True))
-        made = Rows.strided(0, device, (0, 0, 0), counts, cells=cells, lines=1 if device.is_cuda else counts[1])
+        made = Rows.strided(0, device, (0, 0, 0), counts, cells=cells)
         return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)))
 
     @staticmethod
@@ -255,23 +258,21 @@ class Rows:
 
     @staticmethod
     def strided(
-        size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: Any = None, slab: Any = None, lines: int = 1
+        size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: Any = None, slab: Any = None
     ) -> "Rows":
         """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells.
 
         Raises:
             TypeError: spans are of another type.
-            ValueError: a count is negative or too large, lines do not share the rows of a plane out, or spans have another shape.
+            ValueError: a count is negative or too large, or spans have another shape.
         """
         slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device) or 1
-        lines = lines or 1
-        if not 0 <= min(counts) <= max(counts) < 1 << 31 or counts[1] % lines:
-            raise ValueError(f"rows: counts {tuple(counts)} with {lines} rows a thread: expected below 2^31, a multiple of those")
+        if not 0 <= min(counts) <= max(counts) < 1 << 31:
+            raise ValueError(f"rows: counts {tuple(counts)}: expected below 2^31")
         if spans is not None:
             check_memory("spans", spans, wp.vec2i, tuple(counts[:2]))
         names = ("base", "s1", "s2", "planes", "rows", "nx")
         shared = dict(zip(names, (*first, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
-        shared["lines"] = lines
         single = put(copy_of(BLANK), shared | {"slab": 1})
         return Rows(single if slab == 1 else put(copy_of(single), {"slab": slab}), single, size, 0, device)
 
@@ -328,14 +329,6 @@ def _flat(size: int, name: str, serial: bool) -> Rows:
     return Rows.by_turns(size, device, min(size, CUDA_THREADS))
 
 
-@functools.cache
-def no_rows() -> Any:
-    """Return the layout of a pass that is left out."""
-    L = RowLayout()
-    L.slab = L.lines = 1
-    return L
-
-
 def threads(layout: Any) -> tuple[int, int, int]:
     """Return the threads of a launch."""
-    return -(-layout.planes // layout.slab), -(-layout.rows // layout.lines), layout.chunks
+    return -(-layout.planes // layout.slab), layout.rows, layout.chunks

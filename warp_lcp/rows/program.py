@@ -11,14 +11,12 @@ from typing import Any, Protocol
 import warp as wp
 
 from warp_lcp.deadline import check_time
-
-CPU_RUNS_BEFORE_CAPTURE = 24  # recording a CPU graph costs about as much as it saves in so many runs
-
+from warp_lcp.rows.team import Operation, Table, launched_alone, team
 
 def loops_on_device(device: wp.Device) -> bool:
     """Return whether loops run on the device, without the host: on CUDA, from driver 12.4.
 
-    A CPU graph can loop as well, but would hold up Ctrl-C for all of a loop to save a microsecond an iteration.
+    Native code could loop on the CPU as well, but would hold up Ctrl-C for all of a loop to save a microsecond an iteration.
     """
     return bool(device.is_cuda and wp.is_conditional_graph_supported())
 
@@ -41,21 +39,35 @@ class Task:
         perform(self.function, launch)
 
 
-def perform(function: Callable[[], object], launch: Launch) -> None:
-    """Call a function now if `launch` launches now, else record the call between the launches."""
+def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
+    """Call a function, or have the team do an operation, now if `launch` launches now; else record it among the launches."""
     program = getattr(launch, "__self__", None)
     if isinstance(program, Program):
-        program.record(function)
+        program.record(what)
+    elif isinstance(what, Operation):
+        run_now(what)
     else:
-        function()
+        what()
+
+
+def run_table(table: Table) -> None:
+    """Have the team work through a table."""
+    at_work = team()
+    assert at_work is not None, "a table is made for a team"
+    at_work.run(table)
+
+
+def run_now(operation: Operation) -> None:
+    """Have the team do an operation."""
+    run_table(Table([operation]))
 
 
 class Program:
     """A sequence of kernel launches with fixed arguments.
 
-    Functions that launch take `launch: Launch = wp.launch`; handed `program.launch`, they record instead. The first run loads every
-    kernel, so that later a graph can be captured: at once on CUDA, where launches cost most, after some runs on the CPU. Where the host
-    has tasks between launches, see `perform`, there is a graph for each stretch without one.
+    Functions that launch take `launch: Launch = wp.launch`; handed `program.launch`, they record instead. On the CPU the team works through
+    a table of them, on CUDA a graph is captured once the first run has loaded every kernel. Where the host has tasks between launches, see
+    `perform`, there is a table or a graph for each stretch without one.
 
     Args:
         device: where the kernels run.
@@ -65,8 +77,8 @@ class Program:
         self.device = device
         self._commands: list[Any] = []
         self._arguments: list[Any] = []  # a recorded launch holds addresses only
-        self._runs, self._replaced = 0, False
-        self._graph: Any = None
+        self._runs = 0
+        self._stretches: list[Callable[[], object]] | None = None
         self._loops: dict[int, Any] = {}  # graphs by the address of their condition
 
     def __len__(self) -> int:
@@ -76,30 +88,30 @@ class Program:
     def launch(self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
         """Record a launch, and keep its arguments alive."""
         self._arguments.append(inputs)
-        self._commands.append(wp.launch(kernel, dim, inputs, device=device, block_dim=block_dim, record_cmd=True))
+        made = wp.launch(kernel, dim, inputs, device=device, block_dim=block_dim, record_cmd=True)
+        self.record(made if self.device.is_cuda or team() is None else launched_alone(made))
 
-    def record(self, function: Callable[[], object]) -> None:
-        """Record a task of the host."""
-        self._commands.append(Task(function))
+    def record(self, what: Any) -> None:
+        """Record a recorded launch, an operation of the team or a task of the host."""
+        self._commands.append(Task(what) if callable(what) else what)
+        self._stretches = None
 
     def extend(self, other: Program) -> None:
         """Append the launches of another program."""
         self._commands += other._commands
         self._arguments += other._arguments
+        self._stretches = None
 
     def run(self) -> None:
-        """Launch everything once, as a graph where one has been made."""
-        if self._graph is not None:
-            wp.capture_launch(self._graph)
-            return
-        self._launch()
-        self._runs += 1
-        if self._runs < (1 if self.device.is_cuda else CPU_RUNS_BEFORE_CAPTURE) or self._replaced:
-            return
-        if self._has_tasks:
-            self._replace()
+        """Launch everything once."""
+        if self._stretches is None and self.device.is_cuda and self._runs == 0:
+            self._launch()
         else:
-            self._graph = self._captured(self._commands)
+            if self._stretches is None:
+                self._stretches = self._prepared()
+            for stretch in self._stretches:
+                stretch()
+        self._runs += 1
 
     def run_while(self, condition: wp.array[Any]) -> None:
         """Launch everything again and again while the condition is not 0; the launches update it.
@@ -126,20 +138,27 @@ class Program:
     def _has_tasks(self) -> bool:
         return any(isinstance(command, Task) for command in self._commands)
 
+    def _prepared(self) -> list[Callable[[], object]]:
+        """Return a graph, a table or the launches of every stretch between tasks, and the tasks."""
+        made: list[Callable[[], object]] = []
+        for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
+            stretch = list(group)
+            if is_task:
+                made += [task.function for task in stretch]
+            elif self.device.is_cuda:
+                made.append(partial(wp.capture_launch, self._captured(stretch)))
+            elif all(isinstance(command, Operation) for command in stretch):
+                made.append(partial(run_table, Table(stretch)))
+            else:
+                made += [command.launch for command in stretch]
+        return made
+
     def _captured(self, commands: Sequence[Any]) -> Any:
         """Return the graph of some launches."""
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for command in commands:
                 command.launch()
         return capture.graph
-
-    def _replace(self) -> None:
-        """Make a graph of every stretch of launches between tasks."""
-        commands: list[Any] = []
-        for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
-            stretch = list(group)
-            commands += stretch if is_task or len(stretch) == 1 else [Task(partial(wp.capture_launch, self._captured(stretch)))]
-        self._commands, self._replaced = commands, True
 
     def _launch(self) -> None:
         for command in self._commands:

@@ -4,8 +4,8 @@
 A row function sees a piece: pointers to its first cell, the number n of its cells, the offsets ym, yp, zm, zp of the rows beside it.
 """
 
+import ctypes
 import functools
-import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_lcp.rows.layout import BoundFields, Known, RowLayout, Rows, joined, make_struct, no_rows, stencil_struct, threads
+from warp_lcp.rows.layout import BoundFields, Known, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
+from warp_lcp.rows.native import HEADERS, shared, text
+from warp_lcp.rows.program import Launch, perform
+from warp_lcp.rows.team import GAPS, SLABS, TASKS, Entry, Operation, Stage, get_threads, team
 
-HEADERS = Path(__file__).parent / "headers"
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
@@ -25,36 +27,14 @@ INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
 NO_BOUNDS, SIDES = BoundFields(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
-STAGES = ("L1", "F1", "L2", "F2", "L3", "F3", "L4", "F4")  # their layouts and fields
+CELLS = 8192  # of a piece of a pass, at least: some microseconds, many times what it costs to take one
+PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
+SLAB_PIECES, SLAB_PLANES = 4, 8  # of waves: their pieces beside each other have work to finish together
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
 
 
-def text(path: Path) -> str:
-    """Return a header with those that it includes, from beside it or from here. As text, Warp sees changes; errors name file and line."""
-    lines = [f'#line 1 "{path.name}"']
-    for number, line in enumerate(path.read_text().splitlines(), 1):
-        found = re.fullmatch(r'#include "(\w+\.h)"', line)
-        included = [h / found[1] for h in (path.parent, HEADERS) if (h / found[1]).exists()] if found else []
-        lines += [text(included[0]), f'#line {number + 1} "{path.name}"'] if found else [line]
-    return "\n".join(lines)
-
-
-@functools.cache
-def shared(name: str) -> str:
-    """Return a header of the layer's own."""
-    return text(HEADERS / name)
-
-
-@wp.struct
-class Nothing:
-    """Fields of a pass that a wave does not have; of eight bytes, as `joined` asks for."""
-
-    unused: wp.int64
-
-
-NOTHING = Nothing()
-OWN = frozenset(("self", "rows", "stencil", "bounds", "given", "P", "n", "p", "ym", "yp", "zm", "zp", "down", "up", "_ctype"))  # names
+OWN = frozenset(("self", "rows", "stencil", "bounds", "given", "P", "n", "p", "ym", "yp", "zm", "zp", "down", "up", "c_", "_ctype"))  # names
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +65,7 @@ class RowPass:
         optional: which arrays may be None, or empty: their pointers are null then.
         numbers: given by the host.
         sums: variables of the row function that are summed over the cells.
+        ordered: whether tasks write what others read or write: on the CPU one thread takes them, in order.
         constants: numbers that are known when the kernel is made, with their usual values; those that are given are integers, and macros.
 
     Raises:
@@ -110,6 +91,7 @@ class RowPass:
     constants: Mapping[str, float] = field(default_factory=dict)
     box: Mapping[str, Any] = field(default_factory=dict)
     listed: str = ""
+    ordered: bool = False
 
     def __post_init__(self) -> None:
         """Check names, and make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
@@ -270,7 +252,7 @@ class Form:
         words: what tells it from other forms.
         blank: its arguments, none of them given.
         fields: struct of its arguments.
-        run: native function (layout, fields, planes k ... end, rows j ... last, chunk).
+        run: native function (layout, fields, slab, row, chunk of the first task, number of tasks).
     """
 
     def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], shape: str, bounds: str) -> None:
@@ -286,9 +268,9 @@ class Form:
         self._numbers = struct.Struct("".join(PACKED[of(t)] for t in d.numbers.values()))
         self.fields = Fields = make_struct(f"{d.name.replace('.', '_')}_{'_'.join(self.words)}", parts | members)
 
-        def run(L: RowLayout, given: Fields, k_: int, end_: int, j_: int, last_: int, c_: int): ...
+        def run(L: RowLayout, given: Fields, slab_: int, row_: int, chunk_: int, count_: int): ...
 
-        self.blank = Fields()
+        self.blank, self._entry = Fields(), None
         variant = f"warp_lcp.{d.name}.{'_'.join(self.words)}"
         run.__module__ = d.name.rpartition(".")[0] if d.box else variant  # apart from other forms, which Warp would take for overloads
         run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
@@ -305,7 +287,7 @@ class Form:
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
         head += [f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros]
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
-        each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n; const long long p = P.p;"]
+        each = ["const Piece P = piece(k_i, j_i, c_, ring_); const int n = P.n; const long long p = P.p;"]
         each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
         each += [f"const long long ym = {'-yp' if d.finer else 'P.ym'}, zm = {'-zp' if d.finer else 'P.zm'};"]
         each += ["const long long down = P.down, up = P.up;" if d.ring and not into else "const long long down = zm, up = zp;"]
@@ -329,23 +311,10 @@ class Form:
         sums = [f"const double all_[] = {{{', '.join(f'(double){s}' for s in d.sums)}}}; double* sums_ = given.out.data + P.t;"]
         sums += [f"for (int s = 0; s < {len(d.sums)}; ++s, sums_ += places_) *sums_ = P.more ? all_[s] + *sums_ : all_[s];"]
         common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
-        loops = ["for (int k_i = k_ < 0 ? 0 : k_; k_i < end_ && k_i < L.planes; ++k_i)", "for (int j_i = j_; j_i < last_; ++j_i) {"]
-        before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), '#line 1 "fields"', *loops, *each]
+        before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', *each]
         body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass
-        tail = ['#line 1 "end"', "}", *["}"] * bool(d.listed), *(f"#undef {n}" for n in macros), ""]
+        tail = ['#line 1 "end"', "}}}", *["}"] * bool(d.listed), *(f"#undef {n}" for n in macros), ""]
         return "\n".join(["", *before, *common, *body, '#line 1 "sums"', *(sums if d.sums else []), *tail])
-
-    def alike(self, declared: RowPass) -> "Form":
-        """Return another pass without a stencil in the form that has the same types.
-
-        Raises:
-            TypeError: it has a stencil, or letters that are not known here.
-        """
-        used = {kind for kind in declared.arrays.values() if isinstance(kind, str)}
-        if declared.stencil or not used <= self.letters.keys():
-            raise TypeError(f"{declared.name}: cannot be left out beside {self.declared.name}, which does not tell its types")
-        letters = {kind: self.letters[kind] for kind in used}
-        return _form(declared, tuple(sorted(letters.items())), tuple(declared.constants.items()), UNIFORM, self.bounds)
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
         """Return the struct of arguments."""
@@ -369,9 +338,28 @@ class Form:
 
         def alone(L: RowLayout, F: Fields):
             i, j, c = wp.tid()
-            run(L, F, i * L.slab, (i + 1) * L.slab, j * L.lines, (j + 1) * L.lines, c)
+            first = first_task(L)
+            run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
 
-        return _make_kernel(alone, self.declared.name, run.module.name)
+        alone.__name__ = alone.__qualname__ = self.declared.name.rpartition(".")[2]
+        return wp.kernel(enable_backward=False, module=run.module.name)(alone)
+
+    def entry(self, layout: Any, fields: Any) -> Entry:
+        """Return the kernel as the team calls it."""
+        if self._entry is None:
+            self._entry = Entry(wp.launch(self.kernel, (1, 1, 1), [layout, fields], device="cpu", record_cmd=True))
+        return self._entry
+
+
+@wp.func_native("""
+#ifdef __CUDA_ARCH__
+return wp::vec3i(0, 0, 0);
+#else
+return wp::vec3i(L.begin / (L.rows*L.chunks), L.begin / L.chunks % L.rows, L.begin % L.chunks);
+#endif
+""")
+def first_task(L: RowLayout) -> wp.vec3i:
+    """Slab, row and chunk of a range's first task; 0 on CUDA, where a thread has one of its own."""
 
 
 class Bound(NamedTuple):
@@ -386,13 +374,30 @@ class Bound(NamedTuple):
         """Where the rows are, for a pass that sums or one that does not."""
         return self.rows.summed if self.form.declared.sums else self.rows.single
 
-    def launch(self, launch: Any = None) -> None:
+    def launch(self, launch: Launch = wp.launch) -> None:
         """Launch the pass, or record it."""
-        (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
+        if self.rows.device.is_cuda or team() is None:
+            launch(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
+        elif 0 not in threads(self.layout):
+            perform(self._operation(), launch)
+
+    def _operation(self) -> Operation:
+        """Return the pass for the team, cut into ranges of tasks."""
+        stage = self.stage()
+        each = max(-(-stage.tasks // (PIECES * get_threads())), -(-CELLS // self.layout.grain))
+        pieces = 1 if self.form.declared.ordered or get_threads() == 1 else -(-stage.tasks // each)
+        return Operation(TASKS, [stage], pieces, stage.tasks if pieces == 1 else each, stage.tasks)
+
+    def stage(self, lag: int = 0, **members: int) -> Stage:
+        """Return the pass for the team, as a stage of a wave whose layout has these members."""
+        L = put(copy_of(self.layout), members) if members else self.layout
+        memory = ctypes.create_string_buffer(bytes(L.__ctype__()) + bytes(self.fields.__ctype__()))
+        entry = self.form.entry(L, self.fields)
+        return Stage(entry, memory, self, L.rows * L.chunks, threads(L)[0], lag, max(L.fz, 1), L.n1)
 
 
 class Wave:
-    """Passes each of which follows some planes behind the one before: one CPU thread streams through memory once; on CUDA, launches.
+    """Passes each of which follows some planes behind the one before: a CPU streams through memory once; on CUDA, launches.
 
     Args:
         name: of the kernel, as a pass has one.
@@ -408,81 +413,41 @@ class Wave:
         self.name, self.stages = name, stages
 
     def launch(self, *passes: Bound | None, launch: Any = wp.launch) -> None:
-        """Launch the passes, or record them; None leaves one out, and no other kernel is needed for the rest.
+        """Launch the passes, or record them; None leaves one out.
 
         Raises:
-            TypeError: passes are others, or in another order, than declared, or left out though nothing else tells their types.
+            TypeError: passes are others, or in another order, than declared.
             ValueError: threads share the rows of one out, as those of a flat field.
         """
         declared = tuple(stage for stage, _ in self.stages)
-        given = [b for b in passes if b is not None]
+        given = [(b, lag) for b, (_, lag) in zip(passes, self.stages, strict=False) if b is not None]
         if len(passes) != len(declared) or any(b and b.form.declared is not stage for b, stage in zip(passes, declared, strict=True)):
             raise TypeError(f"{self.name}: takes {', '.join(stage.name for stage in declared)}, in this order")
         if not given:
             return
-        if given[0].rows.device.is_cuda:
-            for bound in given:
+        if given[0][0].rows.device.is_cuda or team() is None:
+            for bound, _ in given:
                 bound.launch(launch)
             return
-        if max([b.rows.single.chunks for b in given]) > 1:
+        if max([b.rows.single.chunks for b, _ in given]) > 1:
             raise ValueError(f"{self.name}: takes whole rows, not chunks of them")
-        forms = tuple(b.form if b else given[0].form.alike(stage) for b, stage in zip(passes, declared, strict=True))
-        kernel, Stages = _wave_kernel(self.name, forms, tuple(lag for _, lag in self.stages))
-        parts = [part for b, form in zip(passes, forms, strict=True) for part in ((b.layout, b.fields) if b else (no_rows(), form.blank))]
-        parts += [no_rows(), NOTHING] * (LARGEST - len(passes))
-        launch(kernel, 1, [joined(Stages, dict(zip(STAGES, parts, strict=True)))], device=given[0].rows.device)
+        for operation in self._operations(given):
+            perform(operation, launch)
 
-
-@wp.func
-def plane_after(L: RowLayout, i: int):
-    """Plane whose turn it is once plane i of the wave is done; on a coarser level, once, when its last finer one is; -1: none."""
-    k = i
-    if L.fz > 1:
-        k = i // L.fz
-        if i >= L.n1 or ((i + 1) % L.fz != 0 and i != L.n1 - 1):
-            k = -1
-    return k
-
-
-@wp.func
-def nothing(L: RowLayout, F: Nothing, k: int, end: int, j: int, last: int, c: int):
-    """Stand for a pass that a wave does not have."""
-
-
-@functools.cache
-def _wave_kernel(name: str, forms: tuple[Form, ...], lags: tuple[int, ...]) -> Any:
-    first, second, third, fourth = (*(f.run for f in forms), *(nothing,) * (LARGEST - len(forms)))
-    One, Two, Three, Four = (*(f.fields for f in forms), *(Nothing,) * (LARGEST - len(forms)))
-    _, two, three, four = (*lags, *(0,) * (LARGEST - len(lags)))
-    most = max(lags)
-    letters: dict[str, Any] = {}
-    for form in forms:
-        for letter, kind in form.letters.items():
-            if letters.setdefault(letter, kind) is not kind:
-                raise TypeError(f"{name}: {letter} is {kind.__name__} in {form.declared.name}, {letters[letter].__name__} before")
-    types = [kind.__name__ for _, kind in sorted(letters.items())]
-    words = dict.fromkeys([word for f in forms for word in f.words if word not in types])
-    shape = [word for word in words if word in (UNIFORM, VARIABLE, KNOWN, "coded", "fields")]
-    variant = "_".join([*shape, *types, *(word for word in words if word not in shape)])
-
-    types = (RowLayout, One, RowLayout, Two, RowLayout, Three, RowLayout, Four)
-    Stages = make_struct(
-        f"{name.replace('.', '_')}_{variant}", dict(zip(STAGES, types, strict=True))
-    )  # one argument, which takes a fraction of the time of eight
-
-    def wave(W: Stages):
-        for s in range(wp.max(wp.max(W.L1.planes, W.L2.planes), wp.max(W.L3.planes, W.L4.planes)) + most):
-            first(W.L1, W.F1, s, s + 1, 0, W.L1.rows, 0)
-            k = plane_after(W.L2, s - two)
-            second(W.L2, W.F2, k, k + 1, 0, W.L2.rows, 0)
-            k = plane_after(W.L3, s - three)
-            third(W.L3, W.F3, k, k + 1, 0, W.L3.rows, 0)
-            k = plane_after(W.L4, s - four)
-            fourth(W.L4, W.F4, k, k + 1, 0, W.L4.rows, 0)
-
-    return _make_kernel(wave, name, f"warp_lcp.{name}.{variant}"), Stages()
-
-
-def _make_kernel(function: Any, name: str, module: str) -> Any:
-    function.__name__ = function.__qualname__ = name.rpartition(".")[2]
-    return wp.kernel(enable_backward=False, module=module)(function)
+    def _operations(self, given: list[tuple[Bound, int]]) -> list[Operation]:
+        """Return the wave for the team: slabs of planes, and the gaps beside the cuts between them."""
+        layouts = [b.layout for b, _ in given]
+        planes, most = max(L.planes for L in layouts), max(lag for _, lag in given)
+        least = max(SLAB_PLANES, 2 * most + 5)  # so that the gaps lie apart, and three planes between those that are kept
+        each = max(-(-planes // (SLAB_PIECES * get_threads())), least)
+        each += each % 2  # coarser planes stand for two
+        slabs = max(planes // each, 1)
+        if get_threads() == 1 or any(L.turn or L.lift for L in layouts) or planes * max(L.rows * L.nx for L in layouts) < 4 * CELLS:
+            slabs = 1
+        members = {}
+        if slabs > 1:
+            apart = max([lag for b, lag in given if b.form.declared.ring], default=0) + 1
+            members = {"cut": each, "slabs": slabs, "apart": apart}
+        stages = [b.stage(lag, **(members if b.form.declared.ring else {})) for b, lag in given]
+        made = [Operation(SLABS, stages, slabs, each, planes, most)]
+        return made if slabs == 1 else [*made, Operation(GAPS, stages, slabs - 1, each, planes, most)]

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Passes one after another in one launch: of one block of threads on CUDA, which meet at a barrier after each, of one thread on the CPU."""
+"""Passes one after another in one launch of one block of threads on CUDA, which meet at a barrier after each; on the CPU, launches."""
 
 import functools
 from typing import Any
@@ -8,10 +8,23 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows.layout import RowLayout, make_struct
-from warp_lcp.rows.row_pass import Bound, Form, Nothing, nothing
+from warp_lcp.rows.program import Launch
+from warp_lcp.rows.row_pass import Bound, Form
 
 CUDA_THREADS = 1024  # of the block: latency is all there is to hide, and a block of a GPU holds no more
 MOST = 5  # forms
+
+
+@wp.struct
+class Nothing:
+    """Fields of a form that a sequence does not have; of eight bytes, as `joined` asks for."""
+
+    unused: wp.int64
+
+
+@wp.func
+def nothing(L: RowLayout, F: Nothing, slab: int, row: int, chunk: int, count: int):
+    """Stand for a form that a sequence does not have."""
 
 
 class Sequence:
@@ -34,27 +47,35 @@ class Sequence:
             raise ValueError(f"{name}: {', '.join(names)} are {len(forms)} forms: a sequence takes {MOST}")
         if summing := [form.declared.name for form in forms if form.declared.sums]:
             raise ValueError(f"{name}: {summing[0]} sums, which passes of a sequence cannot")
-        self.device, stages = stages[0].rows.device, tuple(stages)
-        self.threads = CUDA_THREADS if self.device.is_cuda else 1
-        self.kernel, Tables, structs = _sequence_kernel(name, forms)
+        self.device, self._stages, self._forms = stages[0].rows.device, tuple(stages), forms
+        self.kernel, self._Tables, self._structs = _sequence_kernel(name, forms)
+
+    @functools.cached_property
+    def tables(self) -> Any:
+        """The passes, those of each form in a table, and the order in which they follow."""
         places = dict[int, tuple[int, int]]()
-        kept: list[list[bytes]] = [[] for _ in forms]
-        for bound in {id(stage): stage for stage in stages}.values():
-            which = forms.index(bound.form)
+        kept: list[list[bytes]] = [[] for _ in self._forms]
+        for bound in {id(stage): stage for stage in self._stages}.values():
+            which = self._forms.index(bound.form)
             places[id(bound)] = which, len(kept[which])
             kept[which].append(bytes(bound.layout.__ctype__()) + bytes(bound.fields.__ctype__()))
-        self.tables = Tables()
-        self.order = self.tables.order = wp.array([places[id(stage)] for stage in stages], dtype=wp.vec2i, device=self.device)
-        for table, struct, pieces in zip(TABLES, structs, kept, strict=False):
+        made = self._Tables()
+        made.order = wp.array([places[id(stage)] for stage in self._stages], dtype=wp.vec2i, device=self.device)
+        for table, struct, pieces in zip(TABLES, self._structs, kept, strict=False):
             stored = wp.array(np.frombuffer(b"".join(pieces), dtype=np.uint8), device=self.device)
             typed = wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device)
-            typed.kept = stored, stages  # a recorded launch keeps the tables alone, and they what they have the addresses of
-            setattr(self.tables, table, typed)
+            typed.kept = stored, self._stages  # a recorded launch keeps the tables alone, and they what they have the addresses of
+            setattr(made, table, typed)
+        return made
 
-    def launch(self, launch: Any = wp.launch) -> None:
+    def launch(self, launch: Launch = wp.launch) -> None:
         """Launch all passes, or record their launch."""
-        inputs = [self.tables, 0, len(self.order), self.threads]
-        launch(self.kernel, self.threads, inputs, device=self.device, block_dim=self.threads)
+        if self.device.is_cuda:
+            inputs = [self.tables, 0, len(self._stages), CUDA_THREADS]
+            launch(self.kernel, CUDA_THREADS, inputs, device=self.device, block_dim=CUDA_THREADS)
+            return
+        for stage in self._stages:
+            stage.launch(launch)
 
 
 TABLES = tuple(f"pieces{i}" for i in range(MOST))
@@ -80,13 +101,9 @@ def _shared(form: Form | None) -> Any:
 
     def share(given: pieces, place: int, t: int, threads: int):
         P = given[place]
-        lines = int(1)
-        if threads == 1:
-            lines = wp.max(P.L.rows, 1)
-        shares = P.L.rows // lines * P.L.chunks
-        for q in range(t, P.L.planes * shares, threads):
-            j = (q % shares) // P.L.chunks * lines
-            run(P.L, P.F, q // shares, q // shares + 1, j, j + lines, q % P.L.chunks)
+        a_plane = P.L.rows * P.L.chunks
+        for q in range(t, (P.L.planes + P.L.slab - 1) // P.L.slab * a_plane, threads):
+            run(P.L, P.F, q // a_plane, q % a_plane // P.L.chunks, q % P.L.chunks, 1)
 
     share.__module__ = run.module.name if form else __name__
     share.__qualname__ = f"{run.key}_shared"

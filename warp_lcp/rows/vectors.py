@@ -13,12 +13,16 @@ import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.program import Launch, perform
-from warp_lcp.rows.row_pass import HEADERS, text
+from warp_lcp.rows.native import HEADERS, text
 
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
 DOT = RowPass("vectors.dot", HEADERS / "dot.h", wp.float64, reads={"a": "A", "b": "B"}, sums=("ab",))
 ADD = RowPass("vectors.add", HEADERS / "add.h", "S", reads={"z": "S"}, writes={"x": "S"})  # x += z
+ADD_UP = RowPass(
+    "vectors.add_up", HEADERS / "add_up_columns.h", wp.float64, whole={"partials": wp.float64, "scalars": wp.float64},
+    numbers={"count": int, "slot": int},
+)  # fmt: skip
 CONVERT = RowPass("vectors.convert", HEADERS / "convert.h", "B", reads={"a": "A"}, writes={"b": "B"})
 
 
@@ -87,12 +91,16 @@ class Reduction:
     def add_up(self, slot: int, columns: int = 1, *, launch: Launch = wp.launch) -> None:
         """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
         source, n, device = self.partials, self.threads, self.partials.device
-        if self._segments > 1:
-            inputs = [source, n, self.block, self._segments, self._folded, 0]
-            launch(add_up_kernel, columns * self._segments * self.block, inputs, device=device, block_dim=self.block)
-            source, n = self._folded, self._segments
-        inputs = [source, n, self.block, 1, self.scalars, slot]
-        launch(add_up_kernel, columns * self.block, inputs, device=device, block_dim=self.block)
+        if device.is_cpu:  # Warp's tiles are not for several threads at a time
+            given: dict[str, Any] = {"partials": source, "count": n, "scalars": self.scalars, "slot": slot}
+            ADD_UP.bind(Rows.flat(columns, device), **given).launch(launch)
+        else:
+            if self._segments > 1:
+                inputs = [source, n, self.block, self._segments, self._folded, 0]
+                launch(add_up_kernel, columns * self._segments * self.block, inputs, device=device, block_dim=self.block)
+                source, n = self._folded, self._segments
+            inputs = [source, n, self.block, 1, self.scalars, slot]
+            launch(add_up_kernel, columns * self.block, inputs, device=device, block_dim=self.block)
         if self._across is not None:
             perform(partial(_add_across, self._across, self.scalars, slice(slot, slot + columns)), launch)
 

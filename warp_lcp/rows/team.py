@@ -1,0 +1,328 @@
+# mypy: ignore-errors
+"""A team of threads that runs tables of CPU launches in native code: all cores of a machine in one process, with the bits of one.
+
+A pass is cut into ranges of tasks, a wave of passes into slabs of planes, and whoever is free takes the next: `headers/team.h` says how. What
+is computed depends neither on who does it nor on how it is cut.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import os
+import threading
+import warnings
+from collections.abc import Iterable
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.rows.native import shared
+
+VARIABLE = "WARP_LCP_THREADS"
+RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")  # where launchers of ranks tell how many are on this machine
+MOST_THREADS = 1024
+PATIENCE = 50_000_000  # nanoseconds in native code after which the interpreter is asked whether there is a signal
+ROOM = 4096  # bytes of the arguments of what can be cut
+RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
+ALONE, TASKS, SLABS, GAPS = range(4)
+DONE_ALONE, SHARED, RESUMED = range(3)
+TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS = 1, 56, 64, 24, 8
+COUNT, TOTAL, OPERATIONS, LATE, SHARED_TIME, UNFINISHED = range(16, 22)
+SYSTEM = (
+    "sched_yield", "clock_gettime", "nanosleep", "pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast",
+)  # fmt: skip
+
+
+@wp.func_native("\n".join(["", shared("team.h"), ""]))
+def work_through(team_: wp.uint64, table_: wp.uint64, mode: int, me: int, share: int, limit_: wp.int64):
+    """Do what `mode` asks of thread `me`."""
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.team")
+def team_kernel(team: wp.uint64, table: wp.uint64, mode: int, me: int, share: int, limit: wp.int64):
+    """Do what `mode` asks of thread `me`; one thread."""
+    work_through(team, table, mode, me, share, limit)
+
+
+class Arguments(ctypes.Structure):
+    """Arguments of `team_kernel`."""
+
+    _fields_ = (
+        ("team", ctypes.c_uint64), ("table", ctypes.c_uint64), ("mode", ctypes.c_int32), ("me", ctypes.c_int32), ("share", ctypes.c_int32),
+        ("limit", ctypes.c_int64),
+    )  # fmt: skip
+
+
+class Entry:
+    """A kernel on the CPU: what C calls, and the bounds of a launch.
+
+    Args:
+        launch: a recorded launch of it.
+    """
+
+    def __init__(self, launch: Any) -> None:
+        self._launch, self.function = launch, launch.hooks.forward  # which keeps the module loaded
+        self.call = ctypes.cast(self.function, ctypes.c_void_p).value
+        self.bounds = ctypes.addressof(launch.bounds)
+
+
+class Stage:
+    """A kernel with arguments, as words for C.
+
+    Args:
+        entry: the kernel.
+        memory: its arguments; they begin with the range of tasks if it can be cut.
+        kept: what must live as long.
+        plane_tasks: tasks of a plane.
+        planes: how many there are.
+        lag: planes that it is behind the first stage of a wave.
+        finer: planes of the finer level that one of its planes stands for.
+        finer_planes: their number.
+    """
+
+    def __init__(
+        self, entry: Entry, memory: Any, kept: Any, plane_tasks: int = 1, planes: int = 1, lag: int = 0, finer: int = 1, finer_planes: int = 0
+    ) -> None:
+        self.kept, self.tasks, self.planes = (entry, memory, kept), plane_tasks * planes, planes
+        size = ctypes.sizeof(memory)
+        self.words = entry.call, entry.bounds, ctypes.addressof(memory), size, plane_tasks, planes, lag, finer, finer_planes, 0
+
+
+class Operation:
+    """Stages that are done together: a launch, or a wave of them.
+
+    Args:
+        kind: ALONE for a launch as it is; TASKS, SLABS, GAPS for what is cut.
+        stages: what is launched.
+        chunks: into how many pieces it is cut.
+        each: tasks, or planes, of a piece.
+        everything: tasks, or planes, in all.
+        margin: planes that the last stage of a wave is behind the first.
+    """
+
+    __slots__ = ("_kept", "_stages", "chunks", "words")
+
+    def __init__(self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0) -> None:
+        made = [word for stage in stages for word in stage.words]
+        self._stages, self._kept, self.chunks = (ctypes.c_uint64 * len(made))(*made), stages, chunks
+        self.words = kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks
+
+
+class Table:
+    """Operations one after another, as C works through them."""
+
+    def __init__(self, operations: Iterable[Operation]) -> None:
+        self._kept, total, words = tuple(operations), 0, []
+        for operation in self._kept:
+            total += operation.chunks
+            words += (total, *operation.words)
+        self.words = (ctypes.c_uint64 * (TABLE_WORDS + len(words)))(*(0,) * TABLE_WORDS, *words)
+        self.address = ctypes.addressof(self.words)
+        self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
+        self.cut = total > len(self._kept)
+
+
+class Team:
+    """Threads that help the caller; the bits are those of one.
+
+    Args:
+        size: threads, the caller among them.
+        entry: of `team_kernel`.
+    """
+
+    def __init__(self, size: int, entry: Entry) -> None:
+        self.size, self._entry = size, entry
+        self.words = (ctypes.c_uint64 * (THREADS + 8 * size))()
+        self.address = ctypes.addressof(self.words)
+        for i, function in enumerate(_system()):
+            self.words[CALLS + i] = function
+        self._lock, self._inside = threading.Lock(), 0
+        self._table, self._retired = None, []
+        self.shared_time = 0.0  # seconds that callers have spent in what the team shared
+        self._workers = [threading.Thread(target=self._serve, args=(me,), daemon=True) for me in range(1, size)]
+        for worker in self._workers:
+            worker.start()
+
+    def run(self, table: Table) -> None:
+        """Work through a table: with the others if nobody else uses them."""
+        with self._lock:
+            self._inside += 1
+            share = SHARED if table.cut and self.size > 1 and self._inside == 1 else DONE_ALONE
+            if share and self._table is not table:
+                self._retire(table)
+        asked = Arguments(self.address, table.address, RUN, 0, share, PATIENCE)
+        try:
+            self._do(asked)
+            while table.words[UNFINISHED]:  # the interpreter has looked after signals
+                asked.share = RESUMED
+                self._do(asked)
+        except BaseException:
+            self._do(Arguments(self.address, table.address, CANCEL))
+            raise
+        finally:
+            with self._lock:
+                self._inside -= 1
+        if share:
+            self.shared_time += table.words[SHARED_TIME] * 1e-9
+
+    def stop(self) -> None:
+        """Send the others home; what is called later is done by the caller."""
+        self._do(Arguments(self.address, 0, QUIT))
+        for worker in self._workers:
+            worker.join()
+        self.size = 1
+
+    def _retire(self, table: Table) -> None:
+        """Keep the table before as long as a thread that came late may read it."""
+        seen = {self.words[THREADS + 8 * me] for me in range(1, self.size)}
+        self._retired = [old for old in self._retired if old.address in seen]
+        if self._table is not None:
+            self._retired.append(self._table)
+        self._table = table
+
+    def _serve(self, me: int) -> None:
+        self._do(Arguments(self.address, 0, SERVE, me))
+
+    def _do(self, asked: Arguments) -> None:
+        self._entry.function(ctypes.c_void_p(self._entry.bounds), ctypes.byref(asked))
+
+
+def arguments_of(launch: Any) -> Any:
+    """Return the memory of a recorded launch's arguments, as C has them."""
+    params = launch.params[1:]
+    made = type("LaunchArguments", (ctypes.Structure,), {"_fields_": [(f"p{i}", type(p)) for i, p in enumerate(params)]})
+    return made(*params)
+
+
+def launched_alone(launch: Any) -> Operation:
+    """Return a recorded launch as an operation that is not cut."""
+    return Operation(ALONE, [Stage(Entry(launch), arguments_of(launch), launch)])
+
+
+def _system() -> list[int]:
+    """Return the addresses of what the team needs of the system, and the number of its clock; [] where there is no such thing."""
+    try:
+        library = ctypes.CDLL(None)
+        return [*(ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in SYSTEM), _clock()]
+    except (OSError, TypeError, AttributeError):
+        return []
+
+
+def _clock() -> int:
+    import time
+
+    return getattr(time, "CLOCK_MONOTONIC", 1)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.team")
+def trial_kernel(a: wp.array(dtype=wp.float32), first: int, value: float):
+    """a[first + i] = value + i."""
+    i = wp.tid()
+    a[first + i] = value + float(i)
+
+
+@functools.cache
+def _entry() -> Entry | None:
+    """Return the executor, tried on a launch whose result is known; None, with a notice, where this Warp's launches are not as expected."""
+    try:
+        made = Entry(wp.launch(team_kernel, 1, [0, 0, 0, 0, 0, 0], device="cpu", record_cmd=True))
+        a = wp.zeros(8, dtype=wp.float32, device="cpu")
+        launch = wp.launch(trial_kernel, 5, [a, 2, 3.0], device="cpu", record_cmd=True)
+        Team(1, made).run(Table([launched_alone(launch)]))
+        if a.numpy().tolist() != [0, 0, 3, 4, 5, 6, 7, 0]:
+            raise RuntimeError("a launch did not do what was asked")
+    except Exception as error:
+        warnings.warn(f"one CPU thread: Warp {wp.__version__} records launches in another way than expected ({error})", stacklevel=2)
+        return None
+    return made
+
+
+def available_threads() -> int:
+    """Return the cores that this process may use, shared among the ranks on this machine."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    ranks = next((int(os.environ[name]) for name in RANKS if os.environ.get(name, "").isdigit()), 1)
+    return min(max(cores // max(ranks, 1), 1), MOST_THREADS)
+
+
+def _asked_threads() -> int:
+    value = os.environ.get(VARIABLE, "")
+    if not value:
+        return available_threads()
+    return _checked(value, VARIABLE)
+
+
+def _checked(value: Any, name: str) -> int:
+    try:
+        count = int(value)
+    except (TypeError, ValueError):
+        count = 0
+    if not 1 <= count <= MOST_THREADS or isinstance(value, float):
+        raise ValueError(f"{name}: {value!r}: expected a number of threads from 1 to {MOST_THREADS}")
+    return count
+
+
+_lock = threading.Lock()
+_threads: int | None = None
+_team: Team | None = None
+
+
+def get_threads() -> int:
+    """Return how many threads work on the CPU: those of `set_threads`, else of WARP_LCP_THREADS, else all that there are cores for.
+
+    Raises:
+        ValueError: WARP_LCP_THREADS is no such number.
+    """
+    global _threads
+    if _threads is None:
+        _threads = _asked_threads()
+    return _threads if _system() else 1
+
+
+def set_threads(count: int | None) -> None:
+    """Let so many threads work on the CPU from now on. Results have the same bits for any number.
+
+    Args:
+        count: from 1 to 1024; None: as many as at the start.
+
+    Raises:
+        ValueError: it is no such number.
+    """
+    global _threads, _team
+    asked = _asked_threads() if count is None else _checked(count, "count")
+    with _lock:
+        if asked != _threads:
+            _threads, old, _team = asked, _team, None
+            if old is not None:
+                old.stop()
+
+
+def team() -> Team | None:
+    """Return the team, made at its first use; None where launches must go through Warp."""
+    global _team
+    if _team is None:
+        entry = _entry()
+        if entry is None:
+            return None
+        with _lock:
+            if _team is None:
+                _team = Team(get_threads(), entry)
+    return _team
+
+
+def _forget() -> None:
+    """Have no team in a forked child: its threads are the parent's."""
+    global _team, _lock
+    _team, _lock = None, threading.Lock()
+
+
+def _leave() -> None:
+    """Send the threads home before the interpreter goes."""
+    if _team is not None:
+        _team.stop()
+
+
+atexit.register(_leave)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
