@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.grid import level_set_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate
-from warp_lcp.grid.particle_loops import launch, on_grid
+from warp_lcp.grid.particle_loops import on_grid, scatter, touched_planes
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 
@@ -136,7 +136,7 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
     if particles.offsets is not None:
         window.run(kernels.GATHER, offsets=particles.offsets, **given, **on_grid(grid))
     else:
-        launch(kernels.SCATTER, particles.count, grid, **given)
+        scatter(kernels.SCATTER, grid, touched=touched_planes(grid, particles.position), **given)
 
 
 def whole_cell_capacity(grid: StaggeredGrid, base: wp.array, capacity: wp.array) -> None:

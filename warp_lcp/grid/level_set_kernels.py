@@ -9,7 +9,7 @@ G(-s) = 1 - G(s).
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
-from warp_lcp.grid.particle_loops import cell_pass, particle_pass
+from warp_lcp.grid.particle_loops import cell_pass, particle_pass, scatter_pass
 from warp_lcp.operators.grid_poisson import SOLID
 
 # Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and an empty wedge deep in the liquid would
@@ -29,7 +29,7 @@ VOLUME = cell_pass(  # in a module of its own: few runs ask for it
     "warp_lcp.grid.volume.volume", "phi distance", {"known": wp.int8}, whole={"sums": wp.float64},
     numbers={"planes": int, "parts": int}, optional=("distance",),
 )  # fmt: skip
-SCATTER = particle_pass(f"{_DENSITY}.scatter_density", {"position": wp.vec3}, whole={"density": wp.float32}, numbers={"each": wp.float32})
+SCATTER = scatter_pass("grid.density.scatter_density", {"position": wp.vec3, "density": wp.float32}, numbers={"each": wp.float32})
 GATHER = particle_pass(
     f"{_DENSITY}.gather_density", {"density": wp.float32}, whole={"offsets": wp.int32, "position": wp.vec3}, numbers={"each": wp.float32}
 )

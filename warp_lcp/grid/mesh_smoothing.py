@@ -16,7 +16,7 @@ _SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
 _options = {"enable_backward": False, "module": "warp_lcp.grid.mesh_smoothing"}
 
 _WHOLE = {"points": wp.vec3, "sums": wp.float32}
-SEE_NEIGHBORS = cell_pass("warp_lcp.grid.mesh_smoothing.see_neighbors", "", {"corners": wp.int32}, whole=_WHOLE)
+SEE_NEIGHBORS = cell_pass("warp_lcp.grid.mesh_smoothing.see_neighbors", "", {"corners": wp.int32}, whole=_WHOLE, ordered=True)
 
 
 @wp.kernel(**_options)

@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.team import get_threads
 
 if TYPE_CHECKING:
     from warp_lcp.grid.staggered import StaggeredGrid
 
 CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
+SHARES = 4  # that a thread's planes are cut into where particles add to them: chunks that touch two shares are read twice
+PARTICLE = 16  # cells of a usual pass that a particle of one costs
 MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 HEADERS = Path(__file__).parent / "headers"
 NONE: Mapping[str, Any] = {}
@@ -49,8 +52,62 @@ def particle_pass(
         headers: where the header is.
         more: of the pass.
     """
-    grid = {"planes": int, "dx": real, "inverse_dx": real, "before_x": int, "before_y": int, "before_z": int}
-    return RowPass(name, headers / f"{name.rpartition('.')[2]}.h", real, box=box, numbers={**grid, **numbers}, **more)
+    return RowPass(name, headers / f"{name.rpartition('.')[2]}.h", real, box=box, numbers={**_grid_numbers(real), **numbers}, **more)
+
+
+def _grid_numbers(real: Any) -> dict[str, Any]:
+    return {"planes": int, "dx": real, "inverse_dx": real, "before_x": int, "before_y": int, "before_z": int}
+
+
+def scatter_pass(name: str, whole: Mapping[str, Any], *, real: Any = wp.float32, numbers: Mapping[str, Any] = NONE, **more: Any) -> RowPass:
+    """Return a pass for `scatter`, in the header that its name ends in, with `each_share` of `shares.h`.
+
+    Args:
+        name: of the pass.
+        whole: lists with an entry a particle, and the fields that they add to.
+        real: of coordinates.
+        numbers: others that it takes.
+        more: of the pass.
+    """
+    return RowPass(
+        name, HEADERS / f"{name.rpartition('.')[2]}.h", real, whole={**whole, "touched": wp.int32},
+        numbers={**_grid_numbers(real), **numbers, "count": int, "chunk": int}, optional=(*more.pop("optional", ()), "touched"), **more,
+    )  # fmt: skip
+
+
+TOUCHED: dict[Any, RowPass] = {
+    vector: particle_pass(f"warp_lcp.grid.touched_{real.__name__}.touched", {"position": vector}, real=real, whole={"touched": wp.int32})
+    for vector, real in ((wp.vec3, wp.float32), (wp.vec3d, wp.float64))
+}
+
+
+def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[wp.int32] | None:
+    """Return the planes (rows in 2-D) of a field that the particles of each chunk may add to; None where one thread adds up all."""
+    if grid.device.is_cuda or get_threads() == 1:
+        return None
+    touched = wp.empty(2 * -(-max(len(position), 1) // CPU_GRAIN), dtype=wp.int32, device=grid.device)
+    launch(TOUCHED[position.dtype], len(position), grid, position=position, touched=touched)
+    return touched
+
+
+def scatter(passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], touched: wp.array[wp.int32] | None, **given: Any) -> None:
+    """Launch a pass in which particles add to a field: on the CPU each task has planes of its own (rows in 2-D).
+
+    Args:
+        passed: a `scatter_pass`.
+        grid: of the particles.
+        position: theirs.
+        touched: what `touched_planes` returns for them.
+        given: what else the pass takes.
+    """
+    count, planes = len(position), grid.shape[3 - grid.dimension]
+    if not count:
+        return
+    if grid.device.is_cuda:
+        rows = Rows.listed(count, grid.device)
+    else:
+        rows = Rows.listed(planes, grid.device, planes if touched is None else max(4, -(-planes // (SHARES * get_threads()))), weight=1 << 20)
+    passed.bind(rows, **on_grid(grid), position=position, touched=touched, count=count, chunk=CPU_GRAIN, **given).launch()
 
 
 def on_grid(grid: "StaggeredGrid") -> dict[str, Any]:
@@ -61,7 +118,7 @@ def on_grid(grid: "StaggeredGrid") -> dict[str, Any]:
 
 def chunks(count: int, device: wp.Device) -> Rows:
     """Return how a list's entries are shared out."""
-    return Rows.entries(count, device, 1 if device.is_cuda else CPU_GRAIN)
+    return Rows.entries(count, device, 1 if device.is_cuda else CPU_GRAIN, weight=PARTICLE)
 
 
 def launch(passed: RowPass, count: int, grid: "StaggeredGrid", **given: Any) -> None:

@@ -12,7 +12,7 @@ from warp_lcp.grid.extrapolate import extrapolate, weighted_kernel
 from warp_lcp.grid.level_set_kernels import BINOMIAL, SCATTER
 from warp_lcp.grid.marching_cubes import DeviceMesh, MarchingCubes
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
-from warp_lcp.grid.particle_loops import MARGIN, launch
+from warp_lcp.grid.particle_loops import MARGIN, launch, scatter, touched_planes
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
@@ -115,7 +115,7 @@ class SurfaceMesh:
             self._place(self.obstacles)
         raw, first, second = self._fields
         raw.zero_()
-        launch(SCATTER, len(position), lattice, each=self._each, position=position, density=raw)
+        scatter(SCATTER, lattice, position, touched_planes(lattice, position), each=self._each, density=raw)
         self._mirror(raw, fold=True)
         if interior is not None:
             inputs = [lattice.planes, self._parts, interior.least, interior.depth, interior.base, raw]

@@ -27,6 +27,7 @@ CARVE = cell_pass(f"{_MODULE}.carve", "room phi")
 BOOST = particle_pass(
     f"{_MODULE}.boost",
     {"position": wp.vec3},
+    ordered=True,
     whole=dict.fromkeys(("smooth", "capacity", "thin"), wp.float32),
     numbers=dict.fromkeys(("each", "gain", "most"), wp.float32),
     constants={"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "POWER": POWER},

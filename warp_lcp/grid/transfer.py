@@ -4,8 +4,8 @@ APIC [Jiang et al. 2015] carries the gradient of each component. With multilinea
 m_i v_i = sum_p w_ip m_p (v_p + c_p . (x_i - x_p)) and the gradient on the way back is that of the interpolated field, c_p = sum_i
 grad w_ip v_i, so that linear and angular momentum survive the round trip.
 
-The sum over particles has two forms. Particles *scatter* to the faces around them: the faster form on a CPU, whose launches are serial
-and so always add in the same order. Or each face *gathers* from the particles of the cells around it, which takes sorted particles and
+The sum over particles has two forms. Particles *scatter* to the faces around them: the faster form on a CPU, where each thread adds to
+planes of its own, always in the same order. Or each face *gathers* from the particles of the cells around it, which takes sorted particles and
 the first particle of each cell: no two threads write one face, so that a GPU too gives the same bits on every run.
 
 Node (k, j, i) of component `axis` lies at the grid coordinates (i, j + 1/2, k + 1/2) with the axis' own 1/2 left out, plus the origin of a
@@ -22,7 +22,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
-from warp_lcp.grid.particle_loops import launch, on_grid, particle_pass
+from warp_lcp.grid.particle_loops import launch, on_grid, particle_pass, scatter, scatter_pass, touched_planes
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import RowPass
 
@@ -52,8 +52,11 @@ def transfer_passes(real: Any) -> SimpleNamespace:
         else:
             field[k, j, i] = real(0.0)
 
+    scattered = {**particles, "momentum": real, "weight": real}
     return SimpleNamespace(
-        scatter=made("scatter", particles, {"momentum": real, "weight": real}, {}),
+        scatter=scatter_pass(
+            f"grid.transfer_{real.__name__}.scatter", scattered, real=real, numbers={"axis": int}, constants=constants, optional=("gradient",)
+        ),
         interpolate=made("interpolate", particles, {"field": real, "saved": real}, {"flip": real}),
         gather_weights=made("gather_weights", {"field": real, "weight": real}, {"offsets": wp.int32, **particles}, {}),
         normalize=normalize,
@@ -79,6 +82,7 @@ def particles_to_faces(
     """
     passes = transfer_passes(fields[0].dtype)
     window = window or grid.everywhere
+    touched = touched_planes(grid, position) if offsets is None else None
     for axis, (field, weight) in enumerate(zip(fields, weights, strict=True)):
         field.zero_()
         weight.zero_()
@@ -87,7 +91,7 @@ def particles_to_faces(
         if offsets is not None:
             window.run(passes.gather_weights, offsets=offsets, field=field, weight=weight, **particles, **on_grid(grid))
             continue
-        launch(passes.scatter, len(position), grid, momentum=field, weight=weight, **particles)
+        scatter(passes.scatter, grid, touched=touched, momentum=field, weight=weight, **particles)
         window.launch(passes.normalize, [weight, field])
 
 

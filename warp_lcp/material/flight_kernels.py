@@ -52,7 +52,7 @@ _MORE: dict[str, Any] = {
     "headers": Path(__file__).parent / "headers",
     "constants": {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT},
 }
-UNITE = cell_pass("warp_lcp.material.flight.unite", "u v w", whole={"parent": wp.int32}, optional=("w",), **_MORE)
+UNITE = cell_pass("warp_lcp.material.flight.unite", "u v w", whole={"parent": wp.int32}, optional=("w",), ordered=True, **_MORE)
 HOLD = cell_pass(
     "warp_lcp.material.flight.hold", "", {"kind": wp.int8, "touch": wp.uint8},
     whole={"parent": wp.int32, "held": wp.uint8, "several": wp.uint8}, **_MORE,

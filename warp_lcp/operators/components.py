@@ -76,7 +76,7 @@ HEADERS = Path(__file__).parent / "headers"
 FACES, UNIFORM = dict.fromkeys(("face_x", "face_y", "face_z"), "F"), dict.fromkeys(("cx", "cy", "cz"), wp.float64)
 SINGLETONS = RowPass("components.singletons", HEADERS / "singletons.h", wp.float32, writes={"parent": wp.int32, "grounded": wp.uint8})
 UNITE = RowPass(
-    "components.unite", HEADERS / "unite.h", wp.float32, reads={"cells": wp.int8, **FACES}, optional=tuple(FACES),
+    "components.unite", HEADERS / "unite.h", wp.float32, ordered=True, reads={"cells": wp.int8, **FACES}, optional=tuple(FACES),
     whole={"parent": wp.int32}, numbers=UNIFORM,
 )  # fmt: skip
 GROUND = RowPass(

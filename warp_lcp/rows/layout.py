@@ -174,6 +174,7 @@ class Rows:
         other_size: elements of a field of the other level of a transfer; 0: there is none.
         device: where the fields are.
         place: first stored cell of a box.
+        weight: cells of a usual pass that one costs as much as.
     """
 
     summed: Any
@@ -182,6 +183,7 @@ class Rows:
     other_size: int
     device: wp.Device
     place: Mapping[str, int] = field(default_factory=dict)
+    weight: int = 1
 
     @staticmethod
     def of(padding: Padding, device: wp.Device, spans: Any = None, *, whole: bool = False, more: int = 0) -> "Rows":
@@ -243,9 +245,14 @@ class Rows:
         return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)))
 
     @staticmethod
-    def entries(count: int, device: wp.Device, cells: int | None = None) -> "Rows":
-        """Return a list's entries as the row of a box; a thread takes some `cells` of them."""
-        return Rows.box((0, 0, 0), (1, 1, count), device, cells=cells)
+    def entries(count: int, device: wp.Device, cells: int | None = None, *, weight: int = 1) -> "Rows":
+        """Return a list's entries as the row of a box; a thread takes some `cells` of them, which cost as much as `weight` of a grid."""
+        return replace(Rows.box((0, 0, 0), (1, 1, count), device, cells=cells), weight=weight)
+
+    @staticmethod
+    def listed(count: int, device: wp.Device, cells: int | None = None, *, weight: int = 1) -> "Rows":
+        """Return the same for a pass without a box: of arrays as a whole."""
+        return replace(Rows.strided(0, device, (0, 0, 0), (1, 1, count), cells=cells), weight=weight)
 
     @staticmethod
     def by_turns(size: int, device: wp.Device, width: int) -> "Rows":

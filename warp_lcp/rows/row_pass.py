@@ -384,7 +384,7 @@ class Bound(NamedTuple):
     def _operation(self) -> Operation:
         """Return the pass for the team, cut into ranges of tasks."""
         stage = self.stage()
-        each = max(-(-stage.tasks // (PIECES * get_threads())), -(-CELLS // self.layout.grain))
+        each = max(-(-stage.tasks // (PIECES * get_threads())), -(-CELLS // (self.layout.grain * self.rows.weight)))
         pieces = 1 if self.form.declared.ordered or get_threads() == 1 else -(-stage.tasks // each)
         return Operation(TASKS, [stage], pieces, stage.tasks if pieces == 1 else each, stage.tasks)
 

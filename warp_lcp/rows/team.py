@@ -201,6 +201,7 @@ def launched_alone(launch: Any) -> Operation:
     return Operation(ALONE, [Stage(Entry(launch), arguments_of(launch), launch)])
 
 
+@functools.cache
 def _system() -> list[int]:
     """Return the addresses of what the team needs of the system, and the number of its clock; [] where there is no such thing."""
     try:

@@ -58,5 +58,5 @@ for (int start = first; start < last; start += M) {
 #endif
     for (int m = 0; m < n; ++m) cell(start + m);
 }
-if (dropped) wp::atomic_add(counts, dropped);
-if (partial) wp::atomic_add(counts + 1, partial);
+if (dropped) count_up(counts, dropped);
+if (partial) count_up(counts + 1, partial);

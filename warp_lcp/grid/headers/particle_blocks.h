@@ -1,7 +1,6 @@
 // What the steps of particles see. Cells have the numbers of the larger grid where this is a part of one, from `first_cell` to `nx`, `ny`,
 // `nz`; a stored field begins `back` elements before the first one of the larger grid's. So coordinates are rounded alike in all parts.
 #include "origin.h"
-#include "add.h"
 typedef T Block[3][M];
 const T margin = (T)MARGIN;
 T* position = (T*)given.position.data;

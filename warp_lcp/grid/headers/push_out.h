@@ -1,6 +1,5 @@
 // Put some particles that are inside walls, or too near, outside; count those it moved and those it could not.
 #include "grid_coordinate.h"
-#include "add.h"
 typedef T Block[3][M];
 const T margin = (T)MARGIN;
 T* position = (T*)given.position.data;
@@ -36,5 +35,5 @@ for (int start = first; start < last; start += M) {
         ++moved;
     }
 }
-if (moved > 0) add(given.moved.data[0], moved);
-if (left > 0) add(given.left.data[0], left);
+if (moved > 0) count_up(given.moved.data, moved);
+if (left > 0) count_up(given.left.data, left);

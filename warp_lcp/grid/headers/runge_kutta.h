@@ -18,4 +18,4 @@ for (int start = first; start < last; start += M) {
         SIMD for (int m = 0; m < n; ++m) x[3*m + d] = d <= planes ? (to[d][m] - 1)*dx : (T)0;
     }
 }
-if (stopped > 0) add(given.stopped.data[0], stopped);
+if (stopped > 0) count_up(given.stopped.data, stopped);

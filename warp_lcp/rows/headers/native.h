@@ -3,12 +3,14 @@
 #ifdef __CUDA_ARCH__
 #define FAST_MATH
 #define EXACT_MATH
+#define PLAIN_MATH
 #define VECTORS(WIDTH)
 #define UNROLLED _Pragma("unroll 4")  // so that several loads are under way at a time
 #define BUFFERED 1
 #else
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define FAST_MATH PRAGMA(clang fp reassociate(on) contract(fast))
+#define PLAIN_MATH PRAGMA(clang fp reassociate(off) contract(fast))
 #define EXACT_MATH PRAGMA(clang fp reassociate(off) contract(off))
 #define VECTORS(WIDTH) PRAGMA(clang loop vectorize(assume_safety) vectorize_width(WIDTH) interleave_count(1))
 #define UNROLLED
@@ -31,6 +33,22 @@ const auto fetch = [](int begin, int end, const auto*... fields) {
 #ifndef __CUDA_ARCH__
     const auto one = [&](const auto* q) { for (int i = begin; i < end; i += 64 / (int)sizeof(*q)) __builtin_prefetch(q + i + 512); };
     (one(fields), ...);
+#endif
+};
+// What other threads, too, add to or make larger; the order changes nothing.
+const auto count_up = [](int* to, int v) {
+#ifdef __CUDA_ARCH__
+    atomicAdd(to, v);
+#else
+    __atomic_fetch_add(to, v, __ATOMIC_RELAXED);
+#endif
+};
+const auto make_at_least = [](double* to, double v) {
+#ifdef __CUDA_ARCH__
+    wp::atomic_max(to, v);
+#else
+    double was;
+    for (__atomic_load(to, &was, __ATOMIC_RELAXED); was < v && !__atomic_compare_exchange(to, &was, &v, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED);) {}
 #endif
 };
 const auto clipped = [](auto v, auto l, auto u) { const auto w = v < l ? l : v; return w > u ? u : w; };

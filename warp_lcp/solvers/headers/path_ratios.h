@@ -24,4 +24,4 @@ if (FUSED && second == 0) {  // the predictor: ds = -s (1 + dx / w), dt = -t (1 
         LOWER_DIRECTION
         const double first = -dx*iw, next = s[i] > 0 ? -ds/s[i] : 0.0, m = first > next ? first : next;
         note(m); products += dx*ds;) }
-wp::atomic_max(longest, __builtin_bit_cast(double, most));
+make_at_least(longest, __builtin_bit_cast(double, most));
