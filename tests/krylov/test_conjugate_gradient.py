@@ -9,7 +9,7 @@ from oracle import assemble
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.krylov.conjugate_gradient import BEST, ITERATIONS, LIMIT, RR, RZ, RZ_OLD, SLOTS, TOLERANCE, end_kernel
 from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.rows import program
+from warp_lcp.rows import program, team
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.principal_system import DIVIDE
 
@@ -56,6 +56,8 @@ def krylov(request, cells, device, monkeypatch):
     """The three ways to loop; a CPU graph stands for the GPU's where there is none."""
     if request.param == "device loop":
         monkeypatch.setattr(program, "loops_on_device", lambda _: True)
+        monkeypatch.setattr(team, "_team", None)
+        monkeypatch.setattr(team, "_entry", lambda: None)
     A = GridPoisson(cells, device=device, dtype=wp.float64)
     preconditioner = Jacobi(A, recorded=request.param != "launches")
     krylov = ConjugateGradient(A.stencil.product, preconditioner)
@@ -133,6 +135,8 @@ def test_every_reason_to_stop(norm, best, iterations, going, device):
 
 def test_a_device_loop_is_captured_once(cells, device, monkeypatch):
     monkeypatch.setattr(program, "loops_on_device", lambda _: True)
+    monkeypatch.setattr(team, "_team", None)
+    monkeypatch.setattr(team, "_entry", lambda: None)
     A = GridPoisson(cells, device=device, dtype=wp.float64)
     preconditioner = Jacobi(A, recorded=True)
     krylov = ConjugateGradient(A.stencil.product, preconditioner)

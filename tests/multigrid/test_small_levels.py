@@ -58,9 +58,9 @@ def test_cycles_and_levels_are_those_of_single_launches(shape, periodic, faces, 
         expected = run_cycle(apart, cells, projected)
         np.testing.assert_allclose(run_cycle(together, cells, projected), expected, rtol=0, atol=20 * eps * np.abs(expected).max())
         assert np.abs(expected).max() > 0.1
-        # the last launches of the descent, the visits and the first of the ascent have become one
+        # on CUDA, the last launches of the descent, the visits and the first of the ascent have become one
         program = "monotone_cycle" if projected else "cycle"
-        assert len(getattr(together, program)) < len(getattr(apart, program))
+        assert device == "cpu" or len(getattr(together, program)) < len(getattr(apart, program))
 
 
 @pytest.mark.parametrize("projected", [False, True])
@@ -104,7 +104,7 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
             for w in (level.stencil.d, *level.stencil.weights) if level is not first else ():
                 w.zero_()
         for sequence in (small.coarsening, cycles):
-            for i in range(len(sequence.order)):
+            for i in range(len(sequence.tables.order)):
                 wp.launch(sequence.kernel, threads, [sequence.tables, i, i + 1, threads], device="cpu")
         found = [a.numpy() for level in rows.levels[1:] for a in (level.stencil.d, *level.stencil.weights)]
         for a, expected_field in zip(found, made, strict=True):

@@ -176,16 +176,6 @@ def test_a_wrong_launch_is_named(product, change, error, message):
         product.bind(A.stencil.rows, **{name: value for name, value in given.items() if value is not ...})
 
 
-def test_waves_refuse_letters_that_differ(product, tmp_path):
-    A, _, x, _ = scene(wp.float32, {})
-    y, out = wp.zeros_like(x), wp.zeros(A.stencil.rows.places, dtype=wp.float64, device="cpu")
-    clear = row_pass(tmp_path, "clear", "for (int k = 0; k < n; ++k) x[k] = 0;\n", writes={"x": "S"})
-    wave = Wave("test_rows.mixed", (clear, 0), (product, 1))
-    double = clear.bind(A.stencil.rows, x=wp.zeros(x.size, dtype=wp.float64, device="cpu"))
-    with pytest.raises(TypeError, match=r"test_rows.mixed: S is float32 in test_rows.product, float64 before"):
-        wave.launch(double, product.bind(A.stencil.rows, stencil=A.stencil, x=x, y=y, out=out))
-
-
 def test_a_changed_header_is_compiled_anew(tmp_path):
     """Headers go in as text, so that Warp's hash covers what they include; the compiler still knows file and line."""
     hashes = []

@@ -6,7 +6,7 @@ import pytest
 import warp_lcp as wl
 from warp_lcp.benchmarks import problems
 from warp_lcp.multigrid import Hierarchy
-from warp_lcp.rows import layout, program
+from warp_lcp.rows import layout, team
 
 BOUNDS = ["none", "walls", "everywhere"]
 
@@ -101,15 +101,17 @@ def test_convergence_to_ten_digits():
 
 @pytest.mark.parametrize("bounds", ["none", "walls"])
 def test_every_way_to_launch_gives_the_same_iterates(bounds, monkeypatch):
-    """Fused legs, sums over slabs of planes and captured graphs change no iteration; the sums alone may round otherwise."""
+    """Fused legs, sums over slabs of planes and launches without a team change no iteration; the sums alone may round otherwise."""
     _, plain = solve(24, bounds, "multigrid")
     monkeypatch.setattr(Hierarchy, "_fuses", lambda self, level: False)
     _, unfused = solve(24, bounds, "multigrid")
     np.testing.assert_array_equal(unfused.x.numpy(), plain.x.numpy())
     monkeypatch.setitem(layout.PLANES_A_THREAD, "cpu", 5)
     _, slabs = solve(24, bounds, "multigrid")
-    monkeypatch.setattr(program, "CPU_RUNS_BEFORE_CAPTURE", 1)
-    _, captured = solve(24, bounds, "multigrid")
-    np.testing.assert_array_equal(captured.x.numpy(), slabs.x.numpy())
-    assert slabs.iterations == captured.iterations == plain.iterations
+    monkeypatch.undo()
+    monkeypatch.setattr(team, "_team", None)
+    monkeypatch.setattr(team, "_entry", lambda: None)
+    _, alone = solve(24, bounds, "multigrid")
+    np.testing.assert_array_equal(alone.x.numpy(), plain.x.numpy())
+    assert slabs.iterations == alone.iterations == plain.iterations
     np.testing.assert_allclose(slabs.x.numpy(), plain.x.numpy(), atol=1e-6 * np.abs(plain.x.numpy()).max())

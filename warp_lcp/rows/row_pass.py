@@ -425,14 +425,28 @@ class Wave:
             raise TypeError(f"{self.name}: takes {', '.join(stage.name for stage in declared)}, in this order")
         if not given:
             return
-        if given[0][0].rows.device.is_cuda or team() is None:
+        if given[0][0].rows.device.is_cuda or max(b.layout.slab for b, _ in given) > 1:
             for bound, _ in given:
                 bound.launch(launch)
             return
         if max([b.rows.single.chunks for b, _ in given]) > 1:
             raise ValueError(f"{self.name}: takes whole rows, not chunks of them")
+        if team() is None:
+            self._launch_planes(given, launch)
+            return
         for operation in self._operations(given):
             perform(operation, launch)
+
+    def _launch_planes(self, given: list[tuple[Bound, int]], launch: Launch) -> None:
+        """Launch the wave plane after plane, as `team.h` works through a slab."""
+        for turn in range(max(b.layout.planes for b, _ in given) + max(lag for _, lag in given)):
+            for bound, lag in given:
+                L, i = bound.layout, turn - lag
+                finer = max(L.fz, 1)  # planes that one of a coarser level stands for, whose turn comes with the last of them
+                whole = finer == 1 or (i < L.n1 and ((i + 1) % finer == 0 or i == L.n1 - 1))
+                if 0 <= (k := i // finer) < L.planes and whole:
+                    there = put(copy_of(L), {"begin": k * L.rows, "end": (k + 1) * L.rows})
+                    launch(bound.form.kernel, (1, 1, 1), [there, bound.fields], device=bound.rows.device)
 
     def _operations(self, given: list[tuple[Bound, int]]) -> list[Operation]:
         """Return the wave for the team: slabs of planes, and the gaps beside the cuts between them."""

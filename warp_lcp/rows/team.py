@@ -87,6 +87,8 @@ class Stage:
     ) -> None:
         self.kept, self.tasks, self.planes = (entry, memory, kept), plane_tasks * planes, planes
         size = ctypes.sizeof(memory)
+        if size > ROOM:
+            raise ValueError(f"a kernel's arguments take {size} bytes: expected at most {ROOM}")
         self.words = entry.call, entry.bounds, ctypes.addressof(memory), size, plane_tasks, planes, lag, finer, finer_planes, 0
 
 
@@ -139,7 +141,7 @@ class Team:
         for i, function in enumerate(_system()):
             self.words[CALLS + i] = function
         self._lock, self._inside = threading.Lock(), 0
-        self._table, self._retired = None, []
+        self._posted, self._retired = None, []
         self.shared_time = 0.0  # seconds that callers have spent in what the team shared
         self._workers = [threading.Thread(target=self._serve, args=(me,), daemon=True) for me in range(1, size)]
         for worker in self._workers:
@@ -150,8 +152,8 @@ class Team:
         with self._lock:
             self._inside += 1
             share = SHARED if table.cut and self.size > 1 and self._inside == 1 else DONE_ALONE
-            if share and self._table is not table:
-                self._retire(table)
+            if share and self._posted is not table.words:
+                self._retire(table.words)
         asked = Arguments(self.address, table.address, RUN, 0, share, PATIENCE)
         try:
             self._do(asked)
@@ -174,13 +176,13 @@ class Team:
             worker.join()
         self.size = 1
 
-    def _retire(self, table: Table) -> None:
-        """Keep the table before as long as a thread that came late may read it."""
+    def _retire(self, words: Any) -> None:
+        """Keep the words before as long as a thread that came late may read them: what they tell of is done, and may go."""
         seen = {self.words[THREADS + 8 * me] for me in range(1, self.size)}
-        self._retired = [old for old in self._retired if old.address in seen]
-        if self._table is not None:
-            self._retired.append(self._table)
-        self._table = table
+        self._retired = [old for old in self._retired if ctypes.addressof(old) in seen]
+        if self._posted is not None:
+            self._retired.append(self._posted)
+        self._posted = words
 
     def _serve(self, me: int) -> None:
         self._do(Arguments(self.address, 0, SERVE, me))

@@ -3,6 +3,7 @@
 // Operations are cut into chunks, which whoever is free takes, in order: one number counts those taken, another those done. An operation
 // begins when all chunks before it are done, so nobody waits for a thread that holds none, as one whose core another process has. Who takes
 // a chunk changes no result. A table's number of runs stands above the count, so that a thread that comes late takes nothing.
+#ifndef __CUDA_ARCH__
 typedef unsigned long long Word; typedef long long Long; typedef void (*Call)(void*, void*);
 enum { RUN, SERVE, CANCEL, QUIT };                                                                    // what is asked for
 enum { ALONE, TASKS, SLABS, GAPS };                                                                   // operations
@@ -123,3 +124,4 @@ else if (mode == CANCEL) {  // nobody takes any more; wait for those who have
             __atomic_fetch_sub(T + SLEEPERS, 1, __ATOMIC_SEQ_CST);
             call(UNLOCK, (void*)(T + MUTEX));
             spins = 0; } } }
+#endif
