@@ -232,8 +232,8 @@ def test_walls_without_friction_are_not_launched(slips: bool, monkeypatch: pytes
     """The kernel of Coulomb friction on walls runs and reads faces only where a wall rubs; a solid that does counts its own alone."""
     simulation = small_sands.create(small_sands.scene(**(SAND | {"friction": 0.0 if slips else 0.3})))
     ran: list[str] = []
-    launch = wp.launch
-    monkeypatch.setattr(wp, "launch", lambda kernel, *given, **more: (ran.append(kernel.key), launch(kernel, *given, **more))[1])
+    entry = row_pass.Form.entry
+    monkeypatch.setattr(row_pass.Form, "entry", lambda form, *given: (ran.append(form.kernel.key), entry(form, *given))[1])
     walls, faces = simulation.stress.walls, 2 * (16 + 8)  # those of the box
     assert walls.count == (0 if slips else faces)
     simulation.step(1e-3)

@@ -29,7 +29,7 @@ NO_BOUNDS, SIDES = BoundFields(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
 CELLS = 8192  # of a piece of a pass, at least: some microseconds, many times what it costs to take one
 PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
-SLAB_PIECES, SLAB_PLANES = 4, 8  # of waves: their pieces beside each other have work to finish together
+SLAB_PIECES, SLAB_PLANES = 2, 8  # of waves: their pieces beside each other have work to finish together
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
 
