@@ -3,14 +3,12 @@
 #ifdef __CUDA_ARCH__
 #define FAST_MATH
 #define EXACT_MATH
-#define PLAIN_MATH
 #define VECTORS(WIDTH)
 #define UNROLLED _Pragma("unroll 4")  // so that several loads are under way at a time
 #define BUFFERED 1
 #else
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define FAST_MATH PRAGMA(clang fp reassociate(on) contract(fast))
-#define PLAIN_MATH PRAGMA(clang fp reassociate(off) contract(fast))
 #define EXACT_MATH PRAGMA(clang fp reassociate(off) contract(off))
 #define VECTORS(WIDTH) PRAGMA(clang loop vectorize(assume_safety) vectorize_width(WIDTH) interleave_count(1))
 #define UNROLLED
@@ -51,5 +49,11 @@ const auto make_at_least = [](double* to, double v) {
     for (__atomic_load(to, &was, __ATOMIC_RELAXED); was < v && !__atomic_compare_exchange(to, &was, &v, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED);) {}
 #endif
 };
+// a*b + c rounded once, of numbers or of vectors, whatever the compiler may do elsewhere
+#ifdef __CUDA_ARCH__
+const auto fused = [](auto a, auto b, auto c) { return fma(a, b, c); };
+#else
+const auto fused = [](auto a, auto b, auto c) { return __builtin_elementwise_fma(a, b, c); };
+#endif
 const auto clipped = [](auto v, auto l, auto u) { const auto w = v < l ? l : v; return w > u ? u : w; };
 const auto reciprocal = [](auto v) { EXACT_MATH return 1/v; };  // else clang may divide each cell by v where it is used once
