@@ -135,7 +135,7 @@ class Stress(wl.ConvexSetProblem):
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
         self._momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
-        threads = int(np.prod(packing.grid.shape[:2])) * grid.domain.chunks
+        threads = int(np.prod(packing.grid.shape[:2])) * grid.domain.cells.chunks
         self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
         self._wall_sums: Reduction | None = None
         self._host = np.zeros(NUMBERS, dtype=np.float32)

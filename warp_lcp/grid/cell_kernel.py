@@ -14,7 +14,14 @@ F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int
 I16, I32 = wp.array3d(dtype=wp.int16), wp.array3d(dtype=wp.int32)
 INTS, POINTS = wp.array(dtype=wp.int32), wp.array(dtype=wp.vec3)  # lists
 PIECE = """
-plane, row, chunk = wp.tid()
+own_plane, own_row, own_chunk = wp.tid()
+for task in range(cells.begin, wp.max(cells.finish, cells.begin + 1)):
+    pass
+"""
+TASK = """
+plane = own_plane + task // (cells.rows * cells.chunks)
+row = own_row + task // cells.chunks % cells.rows
+chunk = own_chunk + task % cells.chunks
 k = cells.k + plane
 j = cells.j + row
 first = cells.i + chunk * cells.grain
@@ -50,13 +57,20 @@ def interpolated(field: F32, planes: int, x: float, y: float, z: float):
     return value
 
 
-def cell_kernel(module: str) -> Callable[[Callable], wp.Kernel]:
+def cell_kernel(module: str, *, ordered: bool = False) -> Callable[[Callable], wp.Kernel]:
     """Return a decorator that makes a kernel(cells, ...) for `Window.launch`, in a Warp module, of what is done to a cell or a piece.
 
     The function's parameters without a type are the kernel's own: the cell `k, j, i`, or the piece `k, j, first, end` of a row, the cells
-    first <= i < end, and how many planes, rows and pieces are before it, `plane, row, chunk`. A function of a cell cannot return early.
+    first <= i < end, and how many planes, rows and pieces are before it, `plane, row, chunk`. A function cannot return early. Where cells
+    write what others read or write, `ordered`, one CPU thread takes them in order.
     """
-    return lambda function: _kernel(function, module)
+
+    def made(function: Callable) -> wp.Kernel:
+        kernel = _kernel(function, module)
+        kernel.ordered = ordered
+        return kernel
+
+    return made
 
 
 def _kernel(function: Callable, module: str) -> wp.Kernel:
@@ -65,10 +79,12 @@ def _kernel(function: Callable, module: str) -> wp.Kernel:
     made, parameters = tree.body[0], inspect.signature(function).parameters.values()
     typed = [p for p in parameters if p.annotation is not p.empty]
     if "i" in function.__code__.co_varnames[: len(parameters) - len(typed)]:
-        opened = ast.parse(PIECE + LOOP).body
-        opened[-1].body = made.body
+        task = ast.parse(TASK + LOOP).body
+        task[-1].body = made.body
     else:
-        opened = ast.parse(PIECE).body + made.body
+        task = ast.parse(TASK).body + made.body
+    opened = ast.parse(PIECE).body
+    opened[-1].body = task
     made.body, made.decorator_list, made.args.args = opened, [], [ast.arg("cells"), *(ast.arg(p.name) for p in typed)]
     function.__signature__ = inspect.Signature([inspect.Parameter("cells", inspect.Parameter.POSITIONAL_OR_KEYWORD), *typed])
     function.__annotations__ = {"cells": CellRange} | {p.name: p.annotation for p in typed}

@@ -57,7 +57,7 @@ def open_face(near: F32, axis: int, planes: int, k: int, j: int, i: int):
     return open_area(near[k, j, i], near[k + c, j + b, i + a], near[k + c + z, j + b + y, i + a + x], near[k + z, j + y, i + x])
 
 
-@cell_kernel("warp_lcp.grid.cut_cells")
+@cell_kernel("warp_lcp.grid.cut_cells", ordered=True)
 def side_kernel(k, j, i, planes: int, axis: int, near: F32, owner: I16, open: F32, wall: I16, counts: wp.array(dtype=wp.int32)):
     """Fill open fractions and wall numbers of the faces on an open side of the domain; count the dropped and the partial ones."""
     free = open_face(near, axis, planes, k, j, i)

@@ -105,7 +105,7 @@ def claim_listed(block: Block, list: Listed, distance: Distances, snap: float, s
     enter(wp.vec3i(node[0], node[1], node[2]), d, solid, nodes)
 
 
-@cell_kernel("warp_lcp.grid.node_distance")
+@cell_kernel("warp_lcp.grid.node_distance", ordered=True)
 def find_flat_cells(k, j, i, planes: int, near: F32, list: Listed, count: wp.array(dtype=wp.int32)):
     """List the cells with distance 0 at all corners: a gap or a plate, one cell wide; only their centers tell which."""
     if near[k, j, i] == 0.0:

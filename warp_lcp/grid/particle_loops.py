@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from warp_lcp.grid.staggered import StaggeredGrid
 
 CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
-SHARES = 4  # that a thread's planes are cut into where particles add to them: chunks that touch two shares are read twice
+SHARES = 2  # that a thread's planes are cut into where particles add to them: chunks that touch two shares are read twice
 PARTICLE = 16  # cells of a usual pass that a particle of one costs
 MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 HEADERS = Path(__file__).parent / "headers"

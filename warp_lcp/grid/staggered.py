@@ -16,13 +16,17 @@ import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.layout import grain
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_ranges
 
 
 @wp.struct
 class CellRange:
     """A box of cells as kernels see it; a thread takes `grain` cells of a row."""
 
+    begin: int  # of the tasks that a team's thread takes: the first, one past the last; 0: one task a thread
+    finish: int
+    rows: int
+    chunks: int  # of a row
     k: int
     j: int
     i: int
@@ -83,17 +87,13 @@ class Window:
         box = CellRange()
         box.k, box.j, box.i = self.low
         box.end, box.grain = self.high[2], each
+        box.rows, box.chunks = self.rows[1], -(-(self.high[2] - self.low[2]) // each)
         return box
 
     @property
     def rows(self) -> tuple[int, int]:
         """Planes and rows of the box."""
         return self.high[0] - self.low[0], self.high[1] - self.low[1]
-
-    @property
-    def chunks(self) -> int:
-        """Threads that share a row."""
-        return -(-(self.high[2] - self.low[2]) // self.cells.grain)
 
     def rows_of(self, sums: wp.array) -> np.ndarray:
         """Return what rows of the box have in a field of sums, one entry or several a row of the grid."""
@@ -120,11 +120,16 @@ class Window:
 
     def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
         """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row), or record it with `Program.launch`."""
-        (launch or wp.launch)(kernel, (*self.rows, self.chunks), [self.cells, *inputs], device=self.device)
+        self._launch(kernel, self.cells, inputs, launch)
 
     def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
         """Launch kernel(cells, *inputs) with one thread a row (plane, row, 0), for sums that are the same on every run."""
-        wp.launch(kernel, (*self.rows, 1), [self._cells(self.high[2] - self.low[2]), *inputs], device=self.device)
+        self._launch(kernel, self._cells(self.high[2] - self.low[2]), inputs, None)
+
+    def _launch(self, kernel: wp.Kernel, cells: typing.Any, inputs: list[typing.Any], launch: Launch | None) -> None:
+        ordered = getattr(kernel, "ordered", False)
+        dim = (*self.rows, cells.chunks)
+        launch_ranges(kernel, dim, cells.grain, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
 
 
 @dataclass(frozen=True)

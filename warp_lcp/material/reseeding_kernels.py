@@ -34,7 +34,7 @@ def count_kernel(k, j, i, offsets: INTS, count: I32):
     count[k, j, i] = offsets[cell + 1] - offsets[cell]
 
 
-@cell_kernel("warp_lcp.material.reseeding")
+@cell_kernel("warp_lcp.material.reseeding", ordered=True)
 def find_kernel(k, j, i, s: ReseedingSetting, count: I32, capacity: F32, base: I8, touch: U8, takers: INTS, numbers: INTS):
     """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
 

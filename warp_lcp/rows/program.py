@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Any, Protocol
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.rows.team import Operation, Table, launched_alone, team
+from warp_lcp.rows.team import CELLS, Entry, Operation, Stage, Table, arguments_of, launched_alone, ranges, team
 
 def loops_on_device(device: wp.Device) -> bool:
     """Return whether loops run on the device, without the host: on CUDA, from driver 12.4.
@@ -45,7 +46,7 @@ def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
     if isinstance(program, Program):
         program.record(what)
     elif isinstance(what, Operation):
-        run_now(what)
+        run_table(Table([what]))
     else:
         what()
 
@@ -57,9 +58,25 @@ def run_table(table: Table) -> None:
     at_work.run(table)
 
 
-def run_now(operation: Operation) -> None:
-    """Have the team do an operation."""
-    run_table(Table([operation]))
+def launch_ranges(kernel: Any, dim: tuple[int, ...], cells: int, inputs: list[Any], *, device: Any, launch: Launch | None, ordered: bool) -> None:
+    """Launch a kernel whose first argument begins with the range of tasks that a thread takes, or record it.
+
+    Args:
+        kernel: with as many coordinates of a thread as `dim` has.
+        dim: of the launch where there is no such range.
+        cells: what a task costs, in cells of a usual pass.
+        inputs: arguments.
+        device: where.
+        launch: of a program; None: now.
+        ordered: whether tasks write what others read or write.
+    """
+    tasks = math.prod(dim)
+    if device.is_cuda or team() is None or (launch is None and tasks * cells < 2 * CELLS):
+        (launch or wp.launch)(kernel, dim, inputs, device=device)
+    elif tasks:
+        made = wp.launch(kernel, (1,) * len(dim), inputs, device=device, record_cmd=True)
+        stage = Stage(Entry(made), arguments_of(made), inputs, tasks // dim[0], dim[0])
+        perform(ranges(stage, cells, ordered=ordered), launch or wp.launch)
 
 
 class Program:

@@ -18,7 +18,7 @@ import warp as wp
 from warp_lcp.rows.layout import BoundFields, Known, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
 from warp_lcp.rows.native import HEADERS, shared, text
 from warp_lcp.rows.program import Launch, perform
-from warp_lcp.rows.team import GAPS, SLABS, TASKS, Entry, Operation, Stage, get_threads, team
+from warp_lcp.rows.team import CELLS, GAPS, SLABS, Entry, Operation, Stage, get_threads, ranges, team
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
@@ -27,8 +27,6 @@ INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
 NO_BOUNDS, SIDES = BoundFields(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
-CELLS = 8192  # of a piece of a pass, at least: some microseconds, many times what it costs to take one
-PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
 SLAB_PIECES, SLAB_PLANES = 2, 8  # of waves: their pieces beside each other have work to finish together
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
@@ -374,19 +372,16 @@ class Bound(NamedTuple):
         """Where the rows are, for a pass that sums or one that does not."""
         return self.rows.summed if self.form.declared.sums else self.rows.single
 
-    def launch(self, launch: Launch = wp.launch) -> None:
+    def launch(self, launch: Launch | None = None) -> None:
         """Launch the pass, or record it."""
         if self.rows.device.is_cuda or team() is None:
-            launch(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
+            (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
         elif 0 not in threads(self.layout):
             perform(self._operation(), launch)
 
     def _operation(self) -> Operation:
         """Return the pass for the team, cut into ranges of tasks."""
-        stage = self.stage()
-        each = max(-(-stage.tasks // (PIECES * get_threads())), -(-CELLS // (self.layout.grain * self.rows.weight)))
-        pieces = 1 if self.form.declared.ordered or get_threads() == 1 else -(-stage.tasks // each)
-        return Operation(TASKS, [stage], pieces, stage.tasks if pieces == 1 else each, stage.tasks)
+        return ranges(self.stage(), self.layout.grain * self.rows.weight, ordered=self.form.declared.ordered)
 
     def stage(self, lag: int = 0, **members: int) -> Stage:
         """Return the pass for the team, as a stage of a wave whose layout has these members."""

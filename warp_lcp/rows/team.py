@@ -24,6 +24,8 @@ VARIABLE = "WARP_LCP_THREADS"
 RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")  # where launchers of ranks tell how many are on this machine
 MOST_THREADS = 1024
 PATIENCE = 50_000_000  # nanoseconds in native code after which the interpreter is asked whether there is a signal
+CELLS = 8192  # of a usual pass that a piece has at least: some microseconds, many times what it costs to take one
+PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
 ALONE, TASKS, SLABS, GAPS = range(4)
@@ -112,6 +114,20 @@ class Operation:
         self.words = kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks
 
 
+def ranges(stage: Stage, cells: int, *, ordered: bool = False) -> Operation:
+    """Return a stage cut into ranges of its tasks.
+
+    Args:
+        stage: what is launched.
+        cells: what a task costs, in cells of a usual pass.
+        ordered: whether tasks write what others read or write: then it is not cut.
+    """
+    each = max(-(-stage.tasks // (PIECES * get_threads())), -(-CELLS // cells))
+    if ordered or get_threads() == 1:
+        each = stage.tasks
+    return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
+
+
 class Table:
     """Operations one after another, as C works through them."""
 
@@ -194,8 +210,12 @@ class Team:
 def arguments_of(launch: Any) -> Any:
     """Return the memory of a recorded launch's arguments, as C has them."""
     params = launch.params[1:]
-    made = type("LaunchArguments", (ctypes.Structure,), {"_fields_": [(f"p{i}", type(p)) for i, p in enumerate(params)]})
-    return made(*params)
+    return _arguments(*map(type, params))(*params)
+
+
+@functools.cache
+def _arguments(*types: Any) -> Any:
+    return type("LaunchArguments", (ctypes.Structure,), {"_fields_": [(f"p{i}", kind) for i, kind in enumerate(types)]})
 
 
 def launched_alone(launch: Any) -> Operation:
