@@ -12,6 +12,7 @@ from warp_lcp.problem.solve import ConvexSetProblem, Precision, Step
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.recommend import Budget, Recommendation, recommend
 from warp_lcp.rows.kernel_messages import hear_kernels
+from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
 from warp_lcp.solvers.coupled_problem import CoupledBlock, CoupledResult, StaggeredRound, solve_coupled
@@ -91,7 +92,9 @@ __all__ = [
     "advised_omega",
     "default_method",
     "enumerate_batch",
+    "get_threads",
     "recommend",
+    "set_threads",
     "solve",
     "solve_coupled",
 ]

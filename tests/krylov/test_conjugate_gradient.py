@@ -56,7 +56,7 @@ def krylov(request, cells, device, monkeypatch):
     """The three ways to loop; a CPU graph stands for the GPU's where there is none."""
     if request.param == "device loop":
         monkeypatch.setattr(program, "loops_on_device", lambda _: True)
-        monkeypatch.setattr(team, "_team", None)
+        monkeypatch.setattr(team.STATE, "team", None)
         monkeypatch.setattr(team, "_entry", lambda: None)
     A = GridPoisson(cells, device=device, dtype=wp.float64)
     preconditioner = Jacobi(A, recorded=request.param != "launches")
@@ -135,7 +135,7 @@ def test_every_reason_to_stop(norm, best, iterations, going, device):
 
 def test_a_device_loop_is_captured_once(cells, device, monkeypatch):
     monkeypatch.setattr(program, "loops_on_device", lambda _: True)
-    monkeypatch.setattr(team, "_team", None)
+    monkeypatch.setattr(team.STATE, "team", None)
     monkeypatch.setattr(team, "_entry", lambda: None)
     A = GridPoisson(cells, device=device, dtype=wp.float64)
     preconditioner = Jacobi(A, recorded=True)

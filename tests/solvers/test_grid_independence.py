@@ -109,7 +109,7 @@ def test_every_way_to_launch_gives_the_same_iterates(bounds, monkeypatch):
     monkeypatch.setitem(layout.PLANES_A_THREAD, "cpu", 5)
     _, slabs = solve(24, bounds, "multigrid")
     monkeypatch.undo()
-    monkeypatch.setattr(team, "_team", None)
+    monkeypatch.setattr(team.STATE, "team", None)
     monkeypatch.setattr(team, "_entry", lambda: None)
     _, alone = solve(24, bounds, "multigrid")
     np.testing.assert_array_equal(alone.x.numpy(), plain.x.numpy())

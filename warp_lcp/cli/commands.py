@@ -22,6 +22,7 @@ from warp_lcp.render.film import check_rate
 from warp_lcp.render.recording import Color, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
 from warp_lcp.render.viewer import view_run
+from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.run.check import check_memory, check_scene, start
 from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
 from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
@@ -73,6 +74,12 @@ ColorOption = Annotated[
 CameraOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; may be repeated.")
 ]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N", help="CPU threads; results do not depend on them. All cores, or WARP_LCP_THREADS, unless given.", show_default=False
+    ),
+]
 ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
 
 
@@ -104,11 +111,13 @@ def run(
         Path | None, typer.Option(metavar="DIR", help="Write each step's pressure problem into DIR.", show_default=False)
     ] = None,
     engine: EngineOption = Engine.SINGLE,
+    threads: ThreadsOption = None,
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene into a folder that ParaView opens."""
     given = {"--out": out, "--device": device, "--frames": frames, "--resume": resume, "--force": force, "--force-memory": force_memory}
     with _wrong_input(), launcher_of(engine) as launcher:
+        _use_threads(threads)
         if resume and force:
             raise OutputError("--resume continues a run and --force deletes it: choose one")
         loaded = launcher.load(scene, overrides or (), given)
@@ -341,12 +350,14 @@ def bench(
         tuple[Path, Path] | None,
         typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
     ] = None,
+    threads: ThreadsOption = None,
 ) -> None:
     """Measure this machine, or compare two results; says how long a suite takes on two cores, and what it needs, before it begins."""
     installed = benchmarks()
     if suite not in installed:
         _end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
     with _wrong_input():
+        _use_threads(threads)
         chosen = device if engine is Engine.PETSC else choose_device(device)  # ranks choose for themselves
         if scene:
             load_scene(scene)
@@ -374,10 +385,20 @@ def info() -> None:
     """Print versions, devices and simulators."""
     lines = list(versions().items())
     lines += [(f"device {alias}", text) for alias, text in devices().items()]
+    with _wrong_input():
+        _use_threads(None)
+        lines.append(("CPU threads", f"{get_threads()}; --threads or WARP_LCP_THREADS chooses"))
     lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
     _print_pairs(lines)
     with _wrong_input():
         _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
+
+
+def _use_threads(count: int | None) -> None:
+    try:
+        get_threads() if count is None else set_threads(count)
+    except ValueError as error:
+        raise InputError(str(error).replace("count:", "--threads:")) from None
 
 
 def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:

@@ -106,7 +106,8 @@ def scatter(passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], tou
     if grid.device.is_cuda:
         rows = Rows.listed(count, grid.device)
     else:
-        rows = Rows.listed(planes, grid.device, planes if touched is None else max(4, -(-planes // (SHARES * get_threads()))), weight=1 << 20)
+        each = planes if touched is None else max(4, -(-planes // (SHARES * get_threads())))
+        rows = Rows.listed(planes, grid.device, each, weight=1 << 20)  # a share is a piece
     passed.bind(rows, **on_grid(grid), position=position, touched=touched, count=count, chunk=CPU_GRAIN, **given).launch()
 
 

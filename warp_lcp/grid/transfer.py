@@ -4,9 +4,9 @@ APIC [Jiang et al. 2015] carries the gradient of each component. With multilinea
 m_i v_i = sum_p w_ip m_p (v_p + c_p . (x_i - x_p)) and the gradient on the way back is that of the interpolated field, c_p = sum_i
 grad w_ip v_i, so that linear and angular momentum survive the round trip.
 
-The sum over particles has two forms. Particles *scatter* to the faces around them: the faster form on a CPU, where each thread adds to
-planes of its own, always in the same order. Or each face *gathers* from the particles of the cells around it, which takes sorted particles and
-the first particle of each cell: no two threads write one face, so that a GPU too gives the same bits on every run.
+The sum over particles has two forms. Particles *scatter* to the faces around them: the faster form on a CPU, where each task adds to
+planes of its own, always in the same order. Or each face *gathers* from the particles of the cells around it, which takes sorted
+particles and the first particle of each cell: no two threads write one face, so that a GPU too gives the same bits on every run.
 
 Node (k, j, i) of component `axis` lies at the grid coordinates (i, j + 1/2, k + 1/2) with the axis' own 1/2 left out, plus the origin of a
 part of a grid. In 2-D the nodes of one plane are used: the coordinate along z is that of the plane, and the plane above is the same one.
@@ -55,7 +55,12 @@ def transfer_passes(real: Any) -> SimpleNamespace:
     scattered = {**particles, "momentum": real, "weight": real}
     return SimpleNamespace(
         scatter=scatter_pass(
-            f"grid.transfer_{real.__name__}.scatter", scattered, real=real, numbers={"axis": int}, constants=constants, optional=("gradient",)
+            f"grid.transfer_{real.__name__}.scatter",
+            scattered,
+            real=real,
+            numbers={"axis": int},
+            constants=constants,
+            optional=("gradient",),
         ),
         interpolate=made("interpolate", particles, {"field": real, "saved": real}, {"flip": real}),
         gather_weights=made("gather_weights", {"field": real, "weight": real}, {"offsets": wp.int32, **particles}, {}),

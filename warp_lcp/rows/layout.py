@@ -264,9 +264,7 @@ class Rows:
         return Rows.strided(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
 
     @staticmethod
-    def strided(
-        size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: Any = None, slab: Any = None
-    ) -> "Rows":
+    def strided(size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: Any = None, slab: Any = None) -> "Rows":
         """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells.
 
         Raises:

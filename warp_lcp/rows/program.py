@@ -1,4 +1,4 @@
-"""Launches that are recorded once and run again: on the CPU 2 us each instead of 20, and nothing at all once they are a graph."""
+"""Launches that are recorded once and run again: on the CPU by a team of threads in native code, on CUDA as a graph."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.rows.team import CELLS, Entry, Operation, Stage, Table, arguments_of, launched_alone, ranges, team
+
 
 def loops_on_device(device: wp.Device) -> bool:
     """Return whether loops run on the device, without the host: on CUDA, from driver 12.4.
@@ -58,7 +59,9 @@ def run_table(table: Table) -> None:
     at_work.run(table)
 
 
-def launch_ranges(kernel: Any, dim: tuple[int, ...], cells: int, inputs: list[Any], *, device: Any, launch: Launch | None, ordered: bool) -> None:
+def launch_ranges(
+    kernel: Any, dim: tuple[int, ...], cells: int, inputs: list[Any], *, device: Any, launch: Launch | None, ordered: bool
+) -> None:
     """Launch a kernel whose first argument begins with the range of tasks that a thread takes, or record it.
 
     Args:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from warp_lcp.rows.layout import BoundFields, Known, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
-from warp_lcp.rows.native import HEADERS, shared, text
+from warp_lcp.rows.native import shared, text
 from warp_lcp.rows.program import Launch, perform
 from warp_lcp.rows.team import CELLS, GAPS, SLABS, Entry, Operation, Stage, get_threads, ranges, team
 
@@ -32,7 +32,8 @@ NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "co
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
 
 
-OWN = frozenset(("self", "rows", "stencil", "bounds", "given", "P", "n", "p", "ym", "yp", "zm", "zp", "down", "up", "c_", "_ctype"))  # names
+# names of the layer's own
+OWN = frozenset(("self", "rows", "stencil", "bounds", "given", "P", "n", "p", "ym", "yp", "zm", "zp", "down", "up", "c_", "_ctype"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -451,7 +452,7 @@ class Wave:
         each = max(-(-planes // (SLAB_PIECES * get_threads())), least)
         each += each % 2  # coarser planes stand for two
         slabs = max(planes // each, 1)
-        if get_threads() == 1 or any(L.turn or L.lift for L in layouts) or planes * max(L.rows * L.nx for L in layouts) < 4 * CELLS:
+        if get_threads() == 1 or any(L.turn or L.lift for L in layouts) or planes * max(L.rows * L.nx for L in layouts) < 8 * CELLS:
             slabs = 1
         members = {}
         if slabs > 1:

@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """A team of threads that runs tables of CPU launches in native code: all cores of a machine in one process, with the bits of one.
 
-A pass is cut into ranges of tasks, a wave of passes into slabs of planes, and whoever is free takes the next: `headers/team.h` says how. What
-is computed depends neither on who does it nor on how it is cut.
+A pass is cut into ranges of tasks, a wave of passes into slabs of planes, and whoever is free takes the next: `headers/team.h` says how.
+What is computed depends neither on who does it nor on how it is cut.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import ctypes
 import functools
 import os
 import threading
+import time
 import warnings
 from collections.abc import Iterable
 from typing import Any
@@ -24,7 +25,7 @@ VARIABLE = "WARP_LCP_THREADS"
 RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")  # where launchers of ranks tell how many are on this machine
 MOST_THREADS = 1024
 PATIENCE = 50_000_000  # nanoseconds in native code after which the interpreter is asked whether there is a signal
-CELLS = 8192  # of a usual pass that a piece has at least: some microseconds, many times what it costs to take one
+CELLS = 16384  # of a usual pass that a piece has at least: some microseconds, many times what it costs to take one
 PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
@@ -32,9 +33,8 @@ ALONE, TASKS, SLABS, GAPS = range(4)
 DONE_ALONE, SHARED, RESUMED = range(3)
 TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS = 1, 56, 64, 24, 8
 COUNT, TOTAL, OPERATIONS, LATE, SHARED_TIME, UNFINISHED = range(16, 22)
-SYSTEM = (
-    "sched_yield", "clock_gettime", "nanosleep", "pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast",
-)  # fmt: skip
+LOCKS = ("pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast")
+SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
 
 
 @wp.func_native("\n".join(["", shared("team.h"), ""]))
@@ -65,7 +65,8 @@ class Entry:
     """
 
     def __init__(self, launch: Any) -> None:
-        self._launch, self.function = launch, launch.hooks.forward  # which keeps the module loaded
+        self.kernel, self.function = launch.kernel, launch.hooks.forward
+        self._kept = launch.module_exec, launch.bounds  # the module stays loaded; the launch would keep arrays
         self.call = ctypes.cast(self.function, ctypes.c_void_p).value
         self.bounds = ctypes.addressof(launch.bounds)
 
@@ -85,8 +86,9 @@ class Stage:
     """
 
     def __init__(
-        self, entry: Entry, memory: Any, kept: Any, plane_tasks: int = 1, planes: int = 1, lag: int = 0, finer: int = 1, finer_planes: int = 0
-    ) -> None:
+        self, entry: Entry, memory: Any, kept: Any, plane_tasks: int = 1, planes: int = 1, lag: int = 0, finer: int = 1,
+        finer_planes: int = 0,
+    ) -> None:  # fmt: skip
         self.kept, self.tasks, self.planes = (entry, memory, kept), plane_tasks * planes, planes
         size = ctypes.sizeof(memory)
         if size > ROOM:
@@ -228,15 +230,10 @@ def _system() -> list[int]:
     """Return the addresses of what the team needs of the system, and the number of its clock; [] where there is no such thing."""
     try:
         library = ctypes.CDLL(None)
-        return [*(ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in SYSTEM), _clock()]
+        addresses = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in SYSTEM]
+        return [*addresses, getattr(time, "CLOCK_MONOTONIC", 1)]
     except (OSError, TypeError, AttributeError):
         return []
-
-
-def _clock() -> int:
-    import time
-
-    return getattr(time, "CLOCK_MONOTONIC", 1)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.team")
@@ -286,9 +283,16 @@ def _checked(value: Any, name: str) -> int:
     return count
 
 
-_lock = threading.Lock()
-_threads: int | None = None
-_team: Team | None = None
+class State:
+    """How many threads there are to be, and the team once it is needed."""
+
+    def __init__(self) -> None:
+        self.threads: int | None = None
+        self.team: Team | None = None
+        self.lock = threading.Lock()
+
+
+STATE = State()
 
 
 def get_threads() -> int:
@@ -297,10 +301,9 @@ def get_threads() -> int:
     Raises:
         ValueError: WARP_LCP_THREADS is no such number.
     """
-    global _threads
-    if _threads is None:
-        _threads = _asked_threads()
-    return _threads if _system() else 1
+    if STATE.threads is None:
+        STATE.threads = _asked_threads()
+    return STATE.threads if _system() else 1
 
 
 def set_threads(count: int | None) -> None:
@@ -312,38 +315,40 @@ def set_threads(count: int | None) -> None:
     Raises:
         ValueError: it is no such number.
     """
-    global _threads, _team
     asked = _asked_threads() if count is None else _checked(count, "count")
-    with _lock:
-        if asked != _threads:
-            _threads, old, _team = asked, _team, None
+    with STATE.lock:
+        if asked != STATE.threads:
+            STATE.threads, old, STATE.team = asked, STATE.team, None
             if old is not None:
                 old.stop()
 
 
 def team() -> Team | None:
     """Return the team, made at its first use; None where launches must go through Warp."""
-    global _team
-    if _team is None:
+    if STATE.team is None:
         entry = _entry()
         if entry is None:
             return None
-        with _lock:
-            if _team is None:
-                _team = Team(get_threads(), entry)
-    return _team
+        with STATE.lock:
+            if STATE.team is None:
+                STATE.team = Team(get_threads(), entry)
+    return STATE.team
+
+
+def shared_seconds() -> float:
+    """Return how long callers have worked together with the rest of the team, since it was made."""
+    return 0.0 if STATE.team is None else STATE.team.shared_time
 
 
 def _forget() -> None:
     """Have no team in a forked child: its threads are the parent's."""
-    global _team, _lock
-    _team, _lock = None, threading.Lock()
+    STATE.team, STATE.lock = None, threading.Lock()
 
 
 def _leave() -> None:
     """Send the threads home before the interpreter goes."""
-    if _team is not None:
-        _team.stop()
+    if STATE.team is not None:
+        STATE.team.stop()
 
 
 atexit.register(_leave)

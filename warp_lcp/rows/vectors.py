@@ -12,8 +12,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.program import Launch, perform
 from warp_lcp.rows.native import HEADERS, text
+from warp_lcp.rows.program import Launch, perform
 
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many

@@ -13,6 +13,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.files.atomic import write_text
+from warp_lcp.rows.team import get_threads, shared_seconds
 from warp_lcp.run.terminal import table_lines
 
 PROFILE = "profile.json"
@@ -30,6 +31,7 @@ class Stage:
         seconds: in all.
         first_seconds: of the first call, which may allocate.
         bytes: what it had to read or write at least: its arrays, each counted once a call, or its files.
+        shared: seconds of it that all CPU threads worked on.
     """
 
     beside: bool = False
@@ -37,6 +39,7 @@ class Stage:
     seconds: float = 0.0
     first_seconds: float = 0.0
     bytes: int = 0
+    shared: float = 0.0
 
     def add(self, seconds: float) -> None:
         """Count a call of so many seconds."""
@@ -105,13 +108,14 @@ class Profile:
     def stage(self, name: str, *arrays: wp.array | None) -> Iterator[None]:
         """Measure a stage of the run's own thread."""
         self._wait()
-        loading, begun = self._loads.seconds, time.perf_counter()
+        loading, begun, shared = self._loads.seconds, time.perf_counter(), shared_seconds()
         try:
             yield
         finally:
             self._wait()
             stage = self.stages.setdefault(name, Stage())
             stage.add(time.perf_counter() - begun - (self._loads.seconds - loading))
+            stage.shared += shared_seconds() - shared
             stage.bytes += sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays if array is not None)
 
     @contextmanager
@@ -136,10 +140,12 @@ class Profile:
         """
         rows = []
         for name, stage in self.stages.items():
-            rows.append((f"({name})" if stage.beside else name, *_figures(stage.seconds, stage.bytes, steps, seconds)))
+            share = f"{stage.shared / stage.seconds:.0%}" if stage.seconds > 0.0 and get_threads() > 1 and not stage.beside else ""
+            rows.append((f"({name})" if stage.beside else name, *_figures(stage.seconds, stage.bytes, steps, seconds), share))
         rest = seconds - sum(stage.seconds for stage in self.stages.values() if not stage.beside)
-        rows += [("rest", *_figures(rest, 0, steps, seconds)), ("all", *_figures(seconds, 0, steps, seconds))]
-        return table_lines(("stage", "seconds", "share", "ms a step", "MB a step", "GB/s"), rows)
+        rows += [("rest", *_figures(rest, 0, steps, seconds), ""), ("all", *_figures(seconds, 0, steps, seconds), "")]
+        heads = ("stage", "seconds", "share", "ms a step", "MB a step", "GB/s", f"on {get_threads()} threads")
+        return table_lines(heads, rows) if get_threads() > 1 else table_lines(heads[:-1], [row[:-1] for row in rows])
 
     def write(self, folder: Path, steps: int, seconds: float) -> None:
         """Write profile.json.
@@ -153,7 +159,7 @@ class Profile:
             OSError: the file cannot be written.
         """
         stages = [{"stage": name, **vars(stage)} for name, stage in self.stages.items()]
-        data = {"device": self._device.alias, "steps": steps, "seconds": seconds, "stages": stages}
+        data = {"device": self._device.alias, "threads": get_threads(), "steps": steps, "seconds": seconds, "stages": stages}
         write_text(folder / PROFILE, json.dumps(data, indent=2) + "\n")
 
     def _wait(self) -> None:

@@ -12,7 +12,7 @@ enum { YIELD, CLOCK, NAP, LOCK, UNLOCK, WAIT, WAKE, CLOCK_NUMBER };             
 enum { NEXT = 0, DONE = 8, COUNT = 16, TOTAL = 17, OPERATIONS = 18, LATE = 19, SHARED = 20, UNFINISHED = 21 };  // words of a table
 enum { END = 0, KIND = 1, STAGES = 2, STAGE_COUNT = 3, EACH = 4, ALL = 5, MARGIN = 6, PIECES = 7, WORDS = 8 };  // of an operation
 enum { FUNCTION, BOUNDS, ARGUMENTS, BYTES, PLANE_TASKS, PLANES, LAG, FINER, FINER_PLANES, STAGE_WORDS = 10 };  // of a stage
-enum { MOST = 4, ROOM = 4096, SPINS = 2000, YIELDS = 100, IDLE_YIELDS = 4000 };
+enum { MOST = 4, ROOM = 4096, SPINS = 2000, YIELDS = 1000, IDLE_YIELDS = 4000 };
 Word* T = (Word*)team_; Word* H = (Word*)table_;
 const auto get = [](const Word* w) { return __atomic_load_n(w, __ATOMIC_SEQ_CST); };
 const auto set = [](Word* w, Word v) { __atomic_store_n(w, v, __ATOMIC_SEQ_CST); };

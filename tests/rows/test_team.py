@@ -1,0 +1,230 @@
+"""A team of threads: the bits of one, whoever calls, forks, interrupts or leaves; and the same without it."""
+
+import os
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+import weakref
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.gallery import splash
+from warp_lcp.rows import RowPass, Rows, Wave, team
+from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.program import Program
+from warp_lcp.rows.vectors import ADD, Reduction, rows_of
+
+CPU = wp.get_device("cpu")
+COUNTS = (1, 2, 3, 7)
+
+
+@pytest.fixture(autouse=True)
+def threads_as_before():
+    """Leave as many threads as there were."""
+    before = wl.get_threads()
+    yield
+    wl.set_threads(before)
+
+
+@pytest.fixture
+def small_pieces(monkeypatch):
+    """Cut what is small, too."""
+    monkeypatch.setattr(team, "CELLS", 64)
+    monkeypatch.setattr("warp_lcp.rows.row_pass.CELLS", 64)
+    monkeypatch.setattr("warp_lcp.rows.program.CELLS", 64)
+
+
+def solved(n: int, bounds: str, method: object = None) -> tuple[bytes, int]:
+    scene = splash(n)
+    problem = wl.LCP(wl.GridPoisson(scene.cells, device="cpu"), scene.b, scene.lower(bounds))
+    result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6))
+    return result.x.numpy().tobytes(), result.iterations
+
+
+@pytest.mark.parametrize("bounds", ["linear", "everywhere"])
+@pytest.mark.parametrize("method", [wl.ProjectedMultigrid(), wl.InteriorPoint(), wl.MPRGP(), wl.MinimumMapNewton()])
+def test_bits_do_not_depend_on_the_number_of_threads(method, bounds, small_pieces):
+    found = []
+    for count in COUNTS:
+        wl.set_threads(count)
+        found.append(solved(24, bounds, method))
+    assert found == found[:1] * len(COUNTS)
+
+
+def passes(folder) -> tuple[RowPass, RowPass, RowPass]:
+    """What a wave must get right: x moves in place, t is what is beside x then, in a ring of planes, x what is beside t."""
+    (folder / "move.h").write_text("for (int k = 0; k < n; ++k) x[k] += 1 + P.k;\n")
+    (folder / "into.h").write_text("for (int k = 0; k < n; ++k) t[k] = x[k] + x[k + zm] - 2*x[k + zp];\n")
+    (folder / "out.h").write_text("T s = 0;\nfor (int k = 0; k < n; ++k) { x[k] = t[k] + 3*t[k + down] - t[k + up]; s += x[k]; }\n")
+    f32 = wp.float32
+    move = RowPass("test_team.move", folder / "move.h", f32, writes={"x": f32})
+    into = RowPass("test_team.into", folder / "into.h", f32, reads={"x": f32}, writes={"t": f32}, ring=("t",))
+    return move, into, RowPass("test_team.out", folder / "out.h", f32, reads={"t": f32}, writes={"x": f32}, ring=("t",), sums=("s",))
+
+
+@pytest.mark.parametrize("planes", [3, 22, 23, 47, 64])
+def test_slabs_of_a_wave_are_one_stream(planes, tmp_path, small_pieces):
+    """Whole numbers, so that a plane that is missed, done twice or done too early shows."""
+    move, into, out = passes(tmp_path)
+    padding = Padding((planes, 5, 9))
+    rows = Rows.of(padding, CPU)
+    host = np.zeros(padding.shape, dtype=np.float32)
+    host[1:-1, 1:-1, 1:-1] = np.random.default_rng(planes).integers(-3, 4, (planes, 5, 9))
+    expected = host.copy()
+    expected[1:-1, 1:-1, 1:-1] += np.arange(1, planes + 1)[:, None, None]
+    t = np.zeros_like(host)
+    t[1:-1, 1:-1, 1:-1] = (expected[1:-1] + expected[:-2] - 2 * expected[2:])[:, 1:-1, 1:-1]
+    expected[1:-1, 1:-1, 1:-1] = (t[1:-1] + 3 * t[:-2] - t[2:])[:, 1:-1, 1:-1]
+    for count in COUNTS:
+        wl.set_threads(count)
+        x, ring = (wp.array(a, dtype=wp.float32, device=CPU) for a in (host.ravel(), 0 * host.ravel()))
+        scalars = wp.zeros(1, dtype=wp.float64, device=CPU)
+        sums, program = Reduction(rows.size, CPU, scalars, threads=rows.places), Program(CPU)
+        stages = [move.bind(rows, x=x), into.bind(rows, x=x, t=ring), out.bind(rows, t=ring, x=x, out=sums.partials)]
+        Wave("test_team.wave", (move, 0), (into, 1), (out, 2)).launch(*stages, launch=program.launch)
+        sums.add_up(0, launch=program.launch)
+        program.run()
+        np.testing.assert_array_equal(x.numpy().reshape(host.shape)[1:-1], expected[1:-1])
+        assert scalars.numpy()[0] == expected[1:-1].sum(dtype=np.float64)
+
+
+def test_two_python_threads_solve_at_once():
+    wl.set_threads(2)
+    expected = {n: solved(n, "everywhere") for n in (20, 28)}
+    wrong = []
+
+    def work(n: int) -> None:
+        wrong.extend(n for _ in range(12) if solved(n, "everywhere") != expected[n])
+
+    workers = [threading.Thread(target=work, args=(n,)) for n in expected for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert not wrong
+
+
+@pytest.mark.slow
+def test_many_python_threads_for_ten_minutes():
+    wl.set_threads(3)
+    sizes = (12, 20, 28, 40)
+    expected, wrong, until = {n: solved(n, "everywhere") for n in sizes}, [], time.monotonic() + 600
+
+    def work(seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        while time.monotonic() < until and not wrong:
+            n = int(rng.choice(sizes))
+            wrong.extend([n] * (solved(n, "everywhere") != expected[n]))
+
+    workers = [threading.Thread(target=work, args=(seed,)) for seed in range(5)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert not wrong
+
+
+def run_python(code: str, **variables: str) -> subprocess.CompletedProcess:
+    environment = {**os.environ, "WARP_LCP_THREADS": "2", **variables}
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    return subprocess.run(command, check=False, capture_output=True, text=True, env=environment, timeout=300)
+
+
+SOLVE = """
+import os, sys, time, hashlib
+import warp_lcp as wl
+from warp_lcp.gallery import splash
+scene = splash(48)
+problem = wl.LCP(wl.GridPoisson(scene.cells, device="cpu"), scene.b, scene.lower("everywhere"))
+def digest(): return hashlib.md5(wl.solve(problem).x.numpy().tobytes()).hexdigest()
+first = digest()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_child_has_a_team_of_its_own():
+    done = run_python(
+        SOLVE
+        + """
+child = os.fork()
+if child == 0:
+    os._exit(0 if digest() == first else 3)
+assert digest() == first
+print(os.waitpid(child, 0)[1])
+"""
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, "0"), done.stderr
+
+
+def test_the_interpreter_ends_with_the_team():
+    begun = time.monotonic()
+    done = run_python(SOLVE + "print(wl.get_threads())")
+    assert (done.returncode, done.stdout.strip()) == (0, "2"), done.stderr
+    assert time.monotonic() - begun < 120
+
+
+def test_an_interruption_is_heard_between_pieces():
+    """A table that would take minutes ends soon after Ctrl-C, and the next solve is right."""
+    done = run_python(
+        SOLVE
+        + """
+import signal, threading
+from warp_lcp.rows.program import Program
+from warp_lcp.rows.vectors import ADD, rows_of
+import warp as wp
+x = wp.zeros(1 << 22, dtype=wp.float32, device="cpu")
+program = Program(x.device)
+for _ in range(100_000):
+    ADD.bind(rows_of(x), z=x, x=x).launch(program.launch) if _ == 0 else program.record(program._commands[0])
+sent = []
+def interrupt():
+    time.sleep(1.0); sent.append(time.monotonic()); signal.raise_signal(signal.SIGINT)
+threading.Thread(target=interrupt, daemon=True).start()
+try:
+    program.run()
+except KeyboardInterrupt:
+    print(time.monotonic() - sent[0] < 0.25, digest() == first)
+"""
+    )
+    assert done.stdout.strip() == "True True", done.stderr
+
+
+@pytest.mark.parametrize("count", [0, -1, 1025, 1.5, "many"])
+def test_wrong_numbers_of_threads(count):
+    with pytest.raises(ValueError, match=rf"count: {count!r}: expected a number of threads from 1 to 1024"):
+        wl.set_threads(count)
+    if not isinstance(count, float):
+        done = run_python("import warp_lcp as wl; wl.get_threads()", WARP_LCP_THREADS=str(count))
+        assert f"WARP_LCP_THREADS: '{count}': expected a number of threads from 1 to 1024" in done.stderr
+
+
+def test_ranks_share_the_cores(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(12)), raising=False)
+    assert team.available_threads() == 12
+    monkeypatch.setenv("OMPI_COMM_WORLD_LOCAL_SIZE", "4")
+    assert team.available_threads() == 3
+    monkeypatch.setenv("OMPI_COMM_WORLD_LOCAL_SIZE", "40")
+    assert team.available_threads() == 1
+
+
+def test_another_warp_means_one_thread_and_a_notice(monkeypatch):
+    expected = solved(16, "everywhere")
+    monkeypatch.setattr(team.STATE, "team", None)
+    monkeypatch.setattr(team, "_entry", team._entry.__wrapped__)
+    monkeypatch.setattr(team, "arguments_of", lambda launch: launch.parameters)
+    with pytest.warns(UserWarning, match=r"one CPU thread: Warp \S+ records launches in another way than expected"):
+        assert solved(16, "everywhere") == expected
+
+
+def test_a_table_keeps_no_arrays_once_it_is_gone():
+    wl.set_threads(2)
+    x = wp.zeros(1 << 20, dtype=wp.float32, device=CPU)
+    kept = weakref.ref(x)
+    ADD.bind(rows_of(x), z=x, x=x).launch()
+    del x
+    assert kept() is None
