@@ -1,0 +1,41 @@
+"""Every built-in scene, small, has the same bits on any number of threads, however small the pieces are."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+import warp_lcp as wl
+from warp_lcp.rows import team
+from warp_lcp.scene.scene_file import built_in_scenes, load_scene
+from warp_lcp.scene.simulator import simulators
+
+CELLS = {"mesh-obstacle": 15, "retracting-wall": 25, "stirred-tank": 24, "water-labyrinth": 24, "wave-maker": 30}  # whose sizes need others
+
+
+def digests(name: str, count: int, steps: int) -> list[str]:
+    """Digests of the state after each step."""
+    wl.set_threads(count)
+    scene = load_scene(name, [f"domain.resolution={CELLS.get(name, 16)}"])
+    simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+    found = []
+    for _ in range(steps):
+        simulation.step(min(simulation.stable_dt(), 0.01))
+        state = simulation.state()
+        found.append(hashlib.sha256(b"".join(name.encode() + state[name].tobytes() for name in sorted(state))).hexdigest())
+    simulation.frame()
+    return found
+
+
+@pytest.mark.parametrize("name", built_in_scenes())
+def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):
+    for module in ("team", "program", "row_pass"):
+        monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 100)
+    before = wl.get_threads()
+    try:
+        expected = digests(name, 1, 3)
+        for count in (2, 3, 7):
+            assert digests(name, count, 3) == expected, f"{count} threads"
+            assert team.shared_seconds() > 0
+    finally:
+        wl.set_threads(before)
