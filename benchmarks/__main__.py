@@ -10,7 +10,9 @@ from pathlib import Path
 
 from warp_lcp.benchmarks.harness.timing import Options
 
-SUITES = ("kernels", "solvers", "scaling", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff", "validation", "extremes")
+SUITES = (
+    "kernels", "solvers", "scaling", "threads", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff", "validation", "extremes",
+)  # fmt: skip
 
 
 def main() -> None:

@@ -14,7 +14,13 @@ from warp_lcp.distributed import launch
 WRONG_INPUT = 2  # exit code of a suite that says what is wrong with its input
 RANKS = "ranks"  # module and files of `scaling --engine petsc`
 # before NumPy is imported: PyAMG's set-up takes 20 times as long when two BLAS threads fight over two cores
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+ONE_THREAD = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "WARP_LCP_THREADS": "1",
+}
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,7 @@ class Suite:
         scene: str = "",
         seed: int | None = None,
         shared: bool = False,
+        threads: int | None = None,
     ) -> list[Path]:
         """Measure in a process of its own, as `warp_lcp.cli.suites.Benchmark.run` says; a failed check leaves the files and is an error."""
         if sizes and not self.resizable:
@@ -58,7 +65,8 @@ class Suite:
         arguments += ["--seed", str(seed)] if seed is not None else []
         for size in sizes:
             arguments += ["--size", str(size)]
-        process = subprocess.run([sys.executable, "-m", "warp_lcp.benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
+        environment = {**os.environ, **ONE_THREAD, **({"WARP_LCP_THREADS": str(threads)} if threads else {})}
+        process = subprocess.run([sys.executable, "-m", "warp_lcp.benchmarks", *arguments], env=environment, check=False)
         if shared and launch.rank_here():  # the first of several ranks speaks for all
             raise SystemExit(process.returncode)
         if process.returncode == WRONG_INPUT:
@@ -90,6 +98,11 @@ SCALING = Suite(
     "scaling",
     "linear and LCP solves from 32^3 up to what memory holds: seconds to three tolerances, bytes a cell, exponents, floors",
     "3 minutes; with --engine petsc MPI and PETSc",
+)
+THREADS = Suite(
+    "threads",
+    "kernels, cycles, solves and steps of scenes on 1, 2, 4, ... threads up to all cores, against what memory allows",
+    "4 minutes",
 )
 PEERS = Suite(
     "peers",

@@ -1,12 +1,14 @@
 """A team of threads: the bits of one, whoever calls, forks, interrupts or leaves; and the same without it."""
 
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
 import threading
 import time
 import weakref
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ import warp_lcp as wl
 from warp_lcp.gallery import splash
 from warp_lcp.rows import RowPass, Rows, Wave, team
 from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.native import HEADERS
 from warp_lcp.rows.program import Program
 from warp_lcp.rows.vectors import ADD, Reduction, rows_of
 
@@ -228,3 +231,22 @@ def test_a_table_keeps_no_arrays_once_it_is_gone():
     ADD.bind(rows_of(x), z=x, x=x).launch()
     del x
     assert kept() is None
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("control", [False, True])
+def test_threads_race_for_nothing(control, tmp_path):
+    """ThreadSanitizer finds no race in the team, and finds the one that slabs without gaps between them would be."""
+    source, program = Path(__file__).parent / "native" / "team.cpp", tmp_path / "team"
+    text = source.read_text().replace("stage(next, &none, 1)", f"stage(next, &none, {0 if control else 1})")
+    (tmp_path / "team.cpp").write_text(text)
+    command = ["g++", "-std=c++17", "-O1", "-g", "-fsanitize=thread", "-pthread", f"-I{HEADERS}", str(tmp_path / "team.cpp")]
+    built = subprocess.run([*command, "-o", str(program)], check=False, capture_output=True, text=True)
+    if "tsan" in built.stderr:
+        pytest.skip("this compiler has no ThreadSanitizer")
+    assert built.returncode == 0, built.stderr
+    done = subprocess.run([str(program)], check=False, capture_output=True, text=True, timeout=300)
+    if "unexpected memory mapping" in done.stderr:
+        pytest.skip("ThreadSanitizer cannot run here")
+    assert ("data race" in done.stderr) == control, done.stderr
+    assert control or done.returncode == 0

@@ -330,7 +330,7 @@ def bench(
     suite: Annotated[
         str,
         typer.Argument(
-            metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, models, tradeoff, validation or extremes."
+            metavar="SUITE", help="kernels, solvers, scaling, threads, peers, run, sand, contacts, models, tradeoff, validation, extremes."
         ),
     ],
     scene: Annotated[
@@ -371,7 +371,9 @@ def bench(
         asked: dict[str, Any] = ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
         if not shared:  # every rank is here
             tell(f"{suite}: {installed[suite].takes}", error=True)
-        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, shared=shared, **asked)
+        files = installed[suite].run(
+            device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, shared=shared, threads=threads, **asked
+        )
     except ValueError as error:
         _end(str(error), WRONG_INPUT)
     except RuntimeError as error:

@@ -26,6 +26,7 @@ class Benchmark(Protocol):
         scene: str = "",
         seed: int | None = None,
         shared: bool = False,
+        threads: int | None = None,
     ) -> list[Path]:
         """Measure, and return the files written to `out`: NAME.json, NAME.md and plots.
 
@@ -37,6 +38,7 @@ class Benchmark(Protocol):
             scene: the only one to measure, of a suite that runs scenes; a name or a file.
             seed: first one of the random problems, of a suite that draws them; new ones without.
             shared: measure on several ranks, of a suite that can.
+            threads: of the CPU; one without, and of the suite threads all.
 
         Raises:
             ValueError: an option is out of range.

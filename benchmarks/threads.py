@@ -1,0 +1,127 @@
+"""All cores in one process: kernels, cycles, solves and steps of scenes on 1, 2, ... threads, in turns; what else the machine allows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Record, Results, Table, Target, table_of_targets
+from warp_lcp.benchmarks.harness.timing import Options, in_turns, ratios
+from warp_lcp.benchmarks.problems import splash
+from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.team import available_threads
+from warp_lcp.rows.vectors import ADD, rows_of
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.simulator import simulators
+
+TITLE = "All cores in one process"
+SIZES = (128, 256)
+SCENES = {"dam-break": (96, 1.7), "floating-bodies": (96, 1.6), "column-collapse": (64, 1.7)}  # cells along the longest side; target
+STEPS, LONGEST = 8, 0.005  # of a scene before it is measured; the longest one [s]
+STOPPING = wl.StoppingCriteria(rtol=1e-6)
+TARGETS = {"product": 1.85, "sweep": 1.85, "restriction": 1.85, "steps of a solve": 1.85, "solve, cold": 1.7}
+Work = dict[str, Callable[[], object]]
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Measure everything on 1, 2, 4, ... threads, up to all cores."""
+    if wp.get_device(options.device).is_cuda:
+        raise ValueError(f"--device {options.device}: the suite threads measures the CPU")
+    counts = [1 << k for k in range(available_threads().bit_length())]
+    before, records = wl.get_threads(), [machine(options.device, elements=1 << 22, repeat=options.repeat)]
+    try:
+        for label, group in _groups(options.sizes or SIZES):
+            options.say(label)
+            made = {count: group(count) for count in counts}
+            for name in made[1]:
+                work = {str(count): _on(count, made[count][name]) for count in counts}
+                times = in_turns(work, options.repeat)
+                figures = {f"speed_{count}": ratios(times["1"], times[str(count)]) for count in counts[1:]}
+                records.append(Record(f"{label}: {name}", figures, {"what": name, "group": label, "seconds": min(times["1"])}))
+    finally:
+        wl.set_threads(before)
+    rows = [
+        [r.name, f"{1e3 * float(r.facts['seconds']):.3g}", *(f"{f.value:.2f} ({f.low:.2f} to {f.high:.2f})" for f in r.figures.values())]
+        for r in records[1:]
+    ]
+    remark = f"Medians of {options.repeat} ratios of samples taken in turns, and their range. Cores: {os.cpu_count()}."
+    heads = ["what", "1 thread [ms]", *(f"{count} threads" for count in counts[1:])]
+    return Results(records, [Table("Speed against one thread", heads, rows, remark), table_of_targets("on 2 threads", _targets(records))])
+
+
+def _on(count: int, work: Callable[[], object]) -> Callable[[], object]:
+    def run() -> None:
+        wl.set_threads(count)
+        work()
+
+    return run
+
+
+def _groups(sizes: tuple[int, ...]) -> Iterator[tuple[str, Callable[[int], Work]]]:
+    for n in sizes:
+        yield f"{n}^3", _Grid(n).work
+    for name, (resolution, _) in SCENES.items():
+        yield f"{name}, {resolution} cells", partial(_scene, name, resolution)
+
+
+class _Grid:
+    """Kernels, a step and solves of the splash, as they are recorded for so many threads."""
+
+    def __init__(self, n: int) -> None:
+        scene = splash(n)
+        self.box = wl.GridPoisson(np.full((n,) * 3, wl.FLUID, np.int8), device="cpu")
+        self.problem = wl.LCP(wl.GridPoisson(scene.cells, device="cpu"), scene.b, scene.lower("everywhere"))
+        self.x, self.y = (wp.ones(self.box.layout.size, dtype=wp.float32, device="cpu") for _ in range(2))
+
+    def work(self, count: int) -> Work:
+        """Return what is measured."""
+        wl.set_threads(count)
+        kept: Any = wl.ProjectedMultigrid().init(self.problem)
+        wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept)
+        hierarchy: Hierarchy = kept.hierarchy
+        fine, coarse = hierarchy.levels[:2]
+        sweep = fine.sweeping(fine.t, fine.x, 0.5, projected=False)
+        return {
+            "x += z (what memory allows)": _program(ADD.bind(rows_of(self.x), z=self.x, x=self.y).launch),
+            "product": _program(lambda launch: self.box.stencil.product(self.x, self.y, launch=launch)),
+            "sweep": _program(sweep.launch),
+            "restriction": _program(fine.restricting(coarse).launch),
+            "cycle": hierarchy.cycle.run,
+            "steps of a solve": lambda: wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept),
+            "solve, cold": lambda: wl.solve(self.problem, wl.ProjectedMultigrid(), stopping=STOPPING),
+        }
+
+
+def _program(build: Callable[[Launch], object]) -> Callable[[], object]:
+    program = Program(wp.get_device("cpu"))
+    build(program.launch)
+    return program.run
+
+
+def _scene(name: str, resolution: int, count: int) -> Work:
+    """Return the steps of a scene: the same ones for each number of threads, whose bits do not differ."""
+    wl.set_threads(count)
+    scene = load_scene(name, [f"domain.resolution={resolution}"])
+    simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+
+    def step() -> None:
+        simulation.step(min(simulation.stable_dt(), LONGEST))
+
+    for _ in range(STEPS):
+        step()
+    return {"whole step": step}
+
+
+def _targets(records: list[Record]) -> list[Target]:
+    limits = {f"{name}, {resolution} cells: whole step": limit for name, (resolution, limit) in SCENES.items()}
+    found = [(r, limits.get(r.name, TARGETS.get(str(r.facts.get("what"))))) for r in records[1:]]
+    return [Target(r.name, limit, r.figures.get("speed_2"), " x", at_least=True) for r, limit in found if limit is not None]

@@ -1,0 +1,73 @@
+// The team compiled by itself, for ThreadSanitizer: tables of cut and whole operations, run, resumed and cancelled, threads that come late.
+#include <cstdio>
+#include <cstring>
+#include <pthread.h>
+#include <sched.h>
+#include <thread>
+#include <time.h>
+#include <vector>
+
+typedef unsigned long long U;
+static void work_through(U team_, U table_, int mode, int me, int share, long long limit_) {
+#include "team.h"
+}
+
+enum { TASKS_ = 1, CELLS_ = 512 };
+struct Arguments { int begin, end; long long base; int* cells; int value; int other; };
+static void add(void*, void* given) {  // tasks of their own
+    Arguments* a = (Arguments*)given;
+    for (int t = a->begin; t < a->end; ++t) a->cells[t] += a->value;
+}
+static void next(void*, void* given) {  // planes that read what the stage before wrote around them
+    Arguments* a = (Arguments*)given;
+    for (int t = a->begin; t < a->end; ++t) {
+        const int below = t > 0 ? a->cells[t - 1] : 0, above = t + 1 < CELLS_ ? a->cells[t + 1] : 0;
+        a->cells[CELLS_ + t] = a->cells[t] + below + above; }
+}
+static void all(void*, void* given) { Arguments* a = (Arguments*)given; for (int t = 0; t < CELLS_; ++t) a->cells[t] -= a->value; }
+
+int main() {
+    enum { SIZE = 4, ROUNDS = 3000 };
+    std::vector<U> team(64 + 8*SIZE, 0);
+    void* calls[] = {(void*)sched_yield, (void*)clock_gettime, (void*)nanosleep, (void*)pthread_mutex_lock, (void*)pthread_mutex_unlock,
+        (void*)pthread_cond_wait, (void*)pthread_cond_broadcast, (void*)(U)CLOCK_MONOTONIC};
+    for (int i = 0; i < 8; ++i) team[56 + i] = (U)calls[i];
+    pthread_mutex_init((pthread_mutex_t*)&team[24], nullptr);
+    pthread_cond_init((pthread_cond_t*)&team[40], nullptr);
+    std::vector<std::thread> others;
+    for (int me = 1; me < SIZE; ++me) others.emplace_back([&, me] { work_through((U)team.data(), 0, 1, me, 0, 0); });
+
+    std::vector<int> cells(2*CELLS_, 0), expected(2*CELLS_, 0);
+    Arguments plus{0, 0, 0, cells.data(), 3, 0}, twice{0, 0, 0, cells.data(), 2, 0}, none{0, 0, 0, cells.data(), 1, 0};
+    auto stage = [](void (*f)(void*, void*), Arguments* a, U lag) {
+        return std::vector<U>{(U)f, 0, (U)a, sizeof(Arguments), 1, CELLS_, lag, 1, 0, 0}; };
+    std::vector<U> first = stage(add, &plus, 0), wave = stage(add, &twice, 0), last = stage(all, &none, 0), after = stage(next, &none, 1);
+    wave.insert(wave.end(), after.begin(), after.end());
+    const U slabs = 8, each = CELLS_/slabs, pieces = 16;
+    std::vector<U> table(24 + 4*8, 0);
+    U words[4][8] = {{pieces, 1, (U)first.data(), 1, CELLS_/pieces, CELLS_, 0, pieces}, {0, 2, (U)wave.data(), 2, each, CELLS_, 1, slabs},
+        {0, 3, (U)wave.data(), 2, each, CELLS_, 1, slabs - 1}, {0, 0, (U)last.data(), 1, 0, 0, 0, 1}};
+    for (int i = 1; i < 4; ++i) words[i][0] = words[i - 1][0] + words[i][7];
+    memcpy(&table[24], words, sizeof(words));
+    table[16] = 4; table[17] = words[3][0]; table[18] = (U)&table[24];
+    int wrong = 0, resumed = 0;
+    for (int round = 0; round < ROUNDS; ++round) {
+        const int share = round % 5 ? 1 : 0; const long long limit = round % 7 ? 1LL << 40 : 0;
+        work_through((U)team.data(), (U)table.data(), 0, 0, share, limit);
+        while (table[21]) { ++resumed; work_through((U)team.data(), (U)table.data(), 0, 0, 2, 2000); }
+        for (int t = 0; t < CELLS_; ++t) expected[t] += 5;
+        for (int t = 0; t < CELLS_; ++t) {
+            expected[CELLS_ + t] = expected[t] + (t > 0 ? expected[t - 1] : 0) + (t + 1 < CELLS_ ? expected[t + 1] : 0); }
+        for (int t = 0; t < CELLS_; ++t) expected[t] -= 1;
+        wrong += memcmp(cells.data(), expected.data(), sizeof(int)*2*CELLS_) != 0;
+        if (round % 100 == 50) {  // a run that is broken off; then all is as it was set
+            work_through((U)team.data(), (U)table.data(), 0, 0, 1, 0);
+            work_through((U)team.data(), (U)table.data(), 2, 0, 0, 0);
+            std::copy(expected.begin(), expected.end(), cells.begin()); }
+        if (round % 500 == 7) { timespec t{0, 20000000}; nanosleep(&t, nullptr); }  // the others fall asleep
+    }
+    work_through((U)team.data(), 0, 3, 0, 0, 0);
+    for (auto& other : others) other.join();
+    printf("%d rounds, %d wrong, %d resumed\n", (int)ROUNDS, wrong, resumed > 0);
+    return wrong != 0;
+}
