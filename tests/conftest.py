@@ -10,6 +10,8 @@ from hypothesis import HealthCheck, settings
 from dots import dots, scene_file  # noqa: F401  # fixtures of whatever runs scenes
 
 wp.config.log_level = wp.LOG_ERROR
+if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):  # processes that test beside each other share the cores, as ranks do
+    os.environ.setdefault("WARP_LCP_THREADS", str(max((os.cpu_count() or 1) // int(workers), 1)))
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells have both for what they start in the background; tests send them
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGQUIT, signal.SIG_DFL)

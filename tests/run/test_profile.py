@@ -43,7 +43,8 @@ def test_files_and_other_threads(tmp_path):
     assert profile.stages["written"].beside
 
 
-def test_the_table_accounts_for_all_of_the_time():
+def test_the_table_accounts_for_all_of_the_time(monkeypatch):
+    monkeypatch.setattr("warp_lcp.run.profile.get_threads", lambda: 1)
     profile = Profile("cpu")
     for name, seconds, moved in (("a", 1.0, 4e9), ("b", 2.0, 0)):
         with profile.stage(name):
@@ -60,6 +61,11 @@ def test_the_table_accounts_for_all_of_the_time():
     assert lines[4] == ["rest", "1.000", "25.0%", "10.000"]
     assert lines[5][:2] == ["all", "4.000"]
     assert profile.table(0, 0.0).splitlines()[1].split()[:2] == ["a", "1.000"]
+    monkeypatch.setattr("warp_lcp.run.profile.get_threads", lambda: 3)
+    profile.stages["b"].shared = 1.5
+    lines = [line.split() for line in profile.table(100, 4.0).splitlines()]
+    assert lines[0][-3:] == ["on", "3", "threads"]
+    assert [line[-1] for line in lines[1:3]] == ["0%", "75%"]
 
 
 def test_the_file_has_every_stage(tmp_path):
@@ -70,7 +76,7 @@ def test_the_file_has_every_stage(tmp_path):
     data = json.loads((tmp_path / "profile.json").read_text())
     assert (data["device"], data["steps"], data["seconds"]) == ("cpu", 7, 1.5)
     assert [stage["stage"] for stage in data["stages"]] == ["a"]
-    assert data["stages"][0].keys() == {"stage", "beside", "calls", "seconds", "first_seconds", "bytes"}
+    assert data["stages"][0].keys() == {"stage", "beside", "calls", "seconds", "first_seconds", "bytes", "shared"}
 
 
 def test_kernels_that_load_are_a_stage_of_their_own():
