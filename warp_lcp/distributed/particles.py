@@ -18,6 +18,7 @@ import warp as wp
 from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid import particles_kernels as kernels
+from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import launch, particle_pass
 from warp_lcp.grid.particles import SORT_EVERY, Particles, ParticleTotals
 
@@ -237,7 +238,7 @@ class SharedParticles(Particles):
         if count:
             numbers = wp.array(order.astype(np.int32, copy=False), dtype=wp.int32, device=device, copy=device.is_cuda)
             for name, column in self._columns.items():
-                wp.launch(kernels.reorder_kernel, count, [numbers, column.view, self._spare.view], device=device)
+                launch_list(kernels.reorder_kernel, count, [numbers, column.view, self._spare.view], device=device, cost=4)
                 self._columns[name], self._spare = self._spare, column
         self._resize(count)
         self.place = places

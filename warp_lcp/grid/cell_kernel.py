@@ -5,10 +5,12 @@ import ast
 import inspect
 import textwrap
 from collections.abc import Callable
+from typing import Any
 
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
+from warp_lcp.rows.program import Launch, launch_ranges
 
 F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))  # fields
 I16, I32 = wp.array3d(dtype=wp.int16), wp.array3d(dtype=wp.int32)
@@ -28,6 +30,11 @@ first = cells.i + chunk * cells.grain
 end = wp.min(first + cells.grain, cells.end)
 """
 LOOP = "for i in range(first, end): pass"
+ELEMENTS = """
+own = wp.tid()
+for i in range(tasks[0] + own, wp.max(tasks[1], tasks[0] + own + 1)):
+    pass
+"""
 
 
 @wp.func
@@ -73,20 +80,50 @@ def cell_kernel(module: str, *, ordered: bool = False) -> Callable[[Callable], w
     return made
 
 
+def list_kernel(module: str) -> Callable:
+    """Return a decorator that makes a kernel(tasks, ...) for `launch_list`, in a Warp module, of what is done to an element `i` of lists.
+
+    The function's parameter without a type is `i`. It cannot return early, and writes nothing that others read or write.
+    """
+    return lambda function: _made(function, module, ("tasks", wp.vec2i), ELEMENTS, "")
+
+
+def launch_list(kernel: wp.Kernel, count: int, inputs: list, *, device: wp.Device, cost: int = 1, launch: Launch | None = None) -> None:
+    """Launch a kernel of `list_kernel`, or record it.
+
+    Args:
+        kernel: what is launched.
+        count: elements.
+        inputs: its arguments but for the first.
+        device: where.
+        cost: of an element, in cells of a usual pass.
+        launch: of a program.
+    """
+    inputs = [wp.vec2i(0, 0), *inputs]
+    launch_ranges(kernel, (count,), cost, inputs, device=wp.get_device(device), launch=launch, ordered=False)
+
+
 def _kernel(function: Callable, module: str) -> wp.Kernel:
-    """Put the function's body behind what opens a piece. Warp is given the text that results, which it hashes."""
+    parameters = inspect.signature(function).parameters.values()
+    of_a_cell = any(p.name == "i" and p.annotation is p.empty for p in parameters)
+    return _made(function, module, ("cells", CellRange), PIECE, TASK + LOOP if of_a_cell else TASK)
+
+
+def _made(function: Callable, module: str, first: tuple[str, Any], loop: str, before: str) -> wp.Kernel:
+    """Put the function's body, behind what opens a task, into the loop over tasks. Warp is given the text that results, which it hashes."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    made, parameters = tree.body[0], inspect.signature(function).parameters.values()
-    typed = [p for p in parameters if p.annotation is not p.empty]
-    if "i" in function.__code__.co_varnames[: len(parameters) - len(typed)]:
-        task = ast.parse(TASK + LOOP).body
+    made = tree.body[0]
+    typed = [p for p in inspect.signature(function).parameters.values() if p.annotation is not p.empty]
+    task = ast.parse(before).body
+    if task and isinstance(task[-1], ast.For):
         task[-1].body = made.body
     else:
-        task = ast.parse(TASK).body + made.body
-    opened = ast.parse(PIECE).body
+        task += made.body
+    opened = ast.parse(loop).body
     opened[-1].body = task
-    made.body, made.decorator_list, made.args.args = opened, [], [ast.arg("cells"), *(ast.arg(p.name) for p in typed)]
-    function.__signature__ = inspect.Signature([inspect.Parameter("cells", inspect.Parameter.POSITIONAL_OR_KEYWORD), *typed])
-    function.__annotations__ = {"cells": CellRange} | {p.name: p.annotation for p in typed}
+    name, kind = first
+    made.body, made.decorator_list, made.args.args = opened, [], [ast.arg(name), *(ast.arg(p.name) for p in typed)]
+    function.__signature__ = inspect.Signature([inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD), *typed])
+    function.__annotations__ = {name: kind} | {p.name: p.annotation for p in typed}
     key = function.__qualname__.replace("<locals>.", "").replace(".", "__")
     return wp.Kernel(function, key, wp.get_module(module), {"enable_backward": False}, source=ast.unparse(tree))

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
+from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import MARGIN, launch, on_grid
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
@@ -238,7 +239,7 @@ class Particles:
         wp.launch(kernels.count_up_kernel, self.count, [self._order], device=grid.device)
         wp.utils.radix_sort_pairs(self.key, self._order, self.count, end_bit=grid.size.bit_length())
         for name, column in self._columns.items():
-            wp.launch(kernels.reorder_kernel, self.count, [self._order, column.view, self._spare.view], device=grid.device)
+            launch_list(kernels.reorder_kernel, self.count, [self._order, column.view, self._spare.view], device=grid.device, cost=4)
             self._columns[name], self._spare = self._spare, column
         if self.offsets is not None:
             wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)

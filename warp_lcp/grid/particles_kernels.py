@@ -3,6 +3,7 @@
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import list_kernel
 from warp_lcp.grid.particle_loops import particle_pass
 
 COLUMNS = 16  # of a partial result, see `total.h`
@@ -29,11 +30,10 @@ def offset_kernel(key: wp.array(dtype=wp.int32), count: int, offsets: wp.array(d
         offsets[cell] = wp.lower_bound(key, 0, count, cell)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
-def reorder_kernel(order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)):
+@list_kernel("warp_lcp.grid.particles")
+def reorder_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)):
     """Take the particles in a new order."""
-    p = wp.tid()
-    target[p] = source[order[p]]
+    target[i] = source[order[i]]
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")

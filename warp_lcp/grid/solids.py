@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.motion import Pose, Vector, checked_vector, in_space, keep_checked, unit
 from warp_lcp.grid.solids_kernels import (
     ShapeFrame,
@@ -129,6 +130,7 @@ class _Shape(ABC):
     invert: bool = False
 
     kernel: ClassVar[Any]
+    cost: ClassVar[int] = 8  # of a point, in cells of a usual pass
 
     def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
         """Write the Euclidean distance to the surface, negative inside (outside when inverted).
@@ -149,7 +151,8 @@ class _Shape(ABC):
         translation = placement.translation + placement.scale * placement.rotation @ self._origin()
         frame.inverse_rotation, frame.translation = wp.mat33(placement.rotation.T), wp.vec3(*translation)
         frame.scale, frame.sign = placement.scale * self._unit(), -1.0 if self.invert else 1.0
-        wp.launch(kernel, points.shape[0], [points, frame, *self._parameters(device), out], device=device)
+        inputs = [points, frame, *self._parameters(device), out]
+        launch_list(kernel, points.shape[0], inputs, device=device, cost=self.cost)
 
     def bounds(self) -> np.ndarray | None:
         """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""
@@ -363,6 +366,7 @@ class TriangleMesh(_Shape):
     surface: ClosedSurface
 
     kernel: ClassVar[Any] = mesh_distance
+    cost: ClassVar[int] = 500
 
     @classmethod
     def from_file(cls, file: str, *, folder: Path | None = None, placement: Placement | None = None, invert: bool = False) -> TriangleMesh:

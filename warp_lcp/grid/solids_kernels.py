@@ -5,6 +5,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import list_kernel
+
 MODULE = "warp_lcp.solids"
 Points, Distances = wp.array(dtype=wp.vec3), wp.array(dtype=wp.float32)
 FAR = 1.0e10  # a mesh query's reach, in half diagonals of the mesh; its square is still finite in float32
@@ -26,10 +28,9 @@ def to_shape(p: wp.vec3, frame: ShapeFrame) -> wp.vec3:
     return frame.inverse_rotation * (p - frame.translation) / frame.scale
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
-def box_distance(points: Points, frame: ShapeFrame, half: wp.vec3, out: Distances):
+@list_kernel(MODULE)
+def box_distance(i, points: Points, frame: ShapeFrame, half: wp.vec3, out: Distances):
     """Measure a box of half extents `half` (infinite in z in 2-D) about the origin."""
-    i = wp.tid()
     q = to_shape(points[i], frame)
     x = wp.abs(q[0]) - half[0]
     y = wp.abs(q[1]) - half[1]
@@ -38,35 +39,31 @@ def box_distance(points: Points, frame: ShapeFrame, half: wp.vec3, out: Distance
     out[i] = frame.sign * frame.scale * (outside + wp.min(wp.max(x, wp.max(y, z)), 0.0))
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
-def sphere_distance(points: Points, frame: ShapeFrame, radius: float, out: Distances):
+@list_kernel(MODULE)
+def sphere_distance(i, points: Points, frame: ShapeFrame, radius: float, out: Distances):
     """Measure a sphere about the origin."""
-    i = wp.tid()
     q = to_shape(points[i], frame)
     out[i] = frame.sign * frame.scale * (wp.length(q) - radius)
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
-def capsule_distance(points: Points, frame: ShapeFrame, axis: wp.vec3, radius: float, out: Distances):
+@list_kernel(MODULE)
+def capsule_distance(i, points: Points, frame: ShapeFrame, axis: wp.vec3, radius: float, out: Distances):
     """Measure all within `radius` of the segment from the origin along `axis`."""
-    i = wp.tid()
     q = to_shape(points[i], frame)
     along = wp.clamp(wp.dot(q, axis) / wp.dot(axis, axis), 0.0, 1.0)
     out[i] = frame.sign * frame.scale * (wp.length(q - along * axis) - radius)
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
-def plane_distance(points: Points, frame: ShapeFrame, normal: wp.vec3, out: Distances):
+@list_kernel(MODULE)
+def plane_distance(i, points: Points, frame: ShapeFrame, normal: wp.vec3, out: Distances):
     """Measure the half-space below the plane through the origin with a unit `normal`."""
-    i = wp.tid()
     q = to_shape(points[i], frame)
     out[i] = frame.sign * frame.scale * wp.dot(q, normal)
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
-def mesh_distance(points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
+@list_kernel(MODULE)
+def mesh_distance(i, points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
     """Measure the inside of a closed mesh: distance to the closest triangle, sign from the winding number."""
-    i = wp.tid()
     q = to_shape(points[i], frame)
     # 2: groups of triangles farther than twice their radius count as one dipole; a closed surface has whole numbers, so 0.5 has room.
     query = wp.mesh_query_point_sign_winding_number(mesh, q, FAR, 2.0, 0.5)
@@ -76,10 +73,9 @@ def mesh_distance(points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Dista
     out[i] = frame.sign * frame.scale * query.sign * distance
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
-def mesh_surface_distance(points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
+@list_kernel(MODULE)
+def mesh_surface_distance(i, points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
     """Measure the distance to the closest triangle, without the sign, which takes most of the time."""
-    i = wp.tid()
     q = to_shape(points[i], frame)
     query = wp.mesh_query_point_no_sign(mesh, q, FAR)
     distance = FAR
