@@ -18,7 +18,7 @@ import warp as wp
 from warp_lcp.rows.layout import BoundFields, Known, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
 from warp_lcp.rows.native import shared, text
 from warp_lcp.rows.program import Launch, perform
-from warp_lcp.rows.team import CELLS, GAPS, SLABS, Entry, Operation, Stage, get_threads, ranges, team
+from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Stage, get_threads, ranges, team
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
@@ -27,7 +27,7 @@ INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
 NO_BOUNDS, SIDES = BoundFields(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
-SLAB_PIECES, SLAB_PLANES = 2, 8  # of waves: their pieces beside each other have work to finish together
+SLAB_PIECES, SLAB_PLANES = 4, 8  # of waves: their pieces beside each other have work to finish together
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
 
@@ -430,8 +430,7 @@ class Wave:
         if team() is None:
             self._launch_planes(given, launch)
             return
-        for operation in self._operations(given):
-            perform(operation, launch)
+        perform(self._operation(given), launch)
 
     def _launch_planes(self, given: list[tuple[Bound, int]], launch: Launch) -> None:
         """Launch the wave plane after plane, as `team.h` works through a slab."""
@@ -444,20 +443,20 @@ class Wave:
                     there = put(copy_of(L), {"begin": k * L.rows, "end": (k + 1) * L.rows})
                     launch(bound.form.kernel, (1, 1, 1), [there, bound.fields], device=bound.rows.device)
 
-    def _operations(self, given: list[tuple[Bound, int]]) -> list[Operation]:
-        """Return the wave for the team: slabs of planes, and the gaps beside the cuts between them."""
+    def _operation(self, given: list[tuple[Bound, int]]) -> Operation:
+        """Return the wave for the team, cut into slabs of planes."""
         layouts = [b.layout for b, _ in given]
         planes, most = max(L.planes for L in layouts), max(lag for _, lag in given)
-        least = max(SLAB_PLANES, 2 * most + 5)  # so that the gaps lie apart, and three planes between those that are kept
-        each = max(-(-planes // (SLAB_PIECES * get_threads())), least)
-        each += each % 2  # coarser planes stand for two
-        slabs = max(planes // each, 1)
-        if get_threads() == 1 or any(L.turn or L.lift for L in layouts) or planes * max(L.rows * L.nx for L in layouts) < 8 * CELLS:
-            slabs = 1
+        least = 2 * (max(SLAB_PLANES, 2 * most + 5) // 2 + 1)  # so that the gaps lie apart, and three planes between those that are kept
+        slabs, each = 1, planes
+        alone = get_threads() == 1 or any(L.turn or L.lift for L in layouts) or planes * max(L.rows * L.nx for L in layouts) < 2 * CELLS
+        if not alone and planes >= 2 * least:
+            slabs = max(p * get_threads() for p in range(SLAB_PIECES + 1) if p == 0 or planes // (p * get_threads()) >= least)
+            slabs = slabs or planes // least
+            each = planes // slabs // 2 * 2  # coarser planes stand for two
         members = {}
         if slabs > 1:
             apart = max([lag for b, lag in given if b.form.declared.ring], default=0) + 1
             members = {"cut": each, "slabs": slabs, "apart": apart}
         stages = [b.stage(lag, **(members if b.form.declared.ring else {})) for b, lag in given]
-        made = [Operation(SLABS, stages, slabs, each, planes, most)]
-        return made if slabs == 1 else [*made, Operation(GAPS, stages, slabs - 1, each, planes, most)]
+        return Operation(SLABS, stages, slabs, each, planes, most)

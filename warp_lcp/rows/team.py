@@ -29,10 +29,10 @@ CELLS = 16384  # of a usual pass that a piece has at least: some microseconds, m
 PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
-ALONE, TASKS, SLABS, GAPS = range(4)
+ALONE, TASKS, SLABS = range(3)
 DONE_ALONE, SHARED, RESUMED = range(3)
-TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS = 1, 56, 64, 24, 8
-COUNT, TOTAL, OPERATIONS, LATE, SHARED_TIME, UNFINISHED = range(16, 22)
+TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 56, 64, 24, 11, 8
+COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED = range(16, 21)
 LOCKS = ("pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast")
 SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
 
@@ -100,7 +100,7 @@ class Operation:
     """Stages that are done together: a launch, or a wave of them.
 
     Args:
-        kind: ALONE for a launch as it is; TASKS, SLABS, GAPS for what is cut.
+        kind: ALONE for a launch as it is; TASKS, SLABS for what is cut.
         stages: what is launched.
         chunks: into how many pieces it is cut.
         each: tasks, or planes, of a piece.
@@ -134,12 +134,18 @@ class Table:
     """Operations one after another, as C works through them."""
 
     def __init__(self, operations: Iterable[Operation]) -> None:
-        self._kept, total, words = tuple(operations), 0, []
-        for operation in self._kept:
-            total += operation.chunks
-            words += (total, *operation.words)
-        self.words = (ctypes.c_uint64 * (TABLE_WORDS + len(words)))(*(0,) * TABLE_WORDS, *words)
+        self._kept = tuple(operations)
+        lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
+        sizes = [LANE_WORDS * n + operation.chunks for n, operation in zip(lanes, self._kept, strict=True)]  # what is left, and the cuts
+        at = TABLE_WORDS + OPERATION_WORDS * len(self._kept)
+        self.words = (ctypes.c_uint64 * (at + sum(sizes)))()
         self.address = ctypes.addressof(self.words)
+        total, made = 0, []
+        for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
+            total += operation.chunks
+            made += [total, *operation.words, count, self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)]
+            at += size
+        self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = made
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
         self.cut = total > len(self._kept)
 

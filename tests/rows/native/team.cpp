@@ -43,18 +43,20 @@ int main() {
         return std::vector<U>{(U)f, 0, (U)a, sizeof(Arguments), 1, CELLS_, lag, 1, 0, 0}; };
     std::vector<U> first = stage(add, &plus, 0), wave = stage(add, &twice, 0), last = stage(all, &none, 0), after = stage(next, &none, 1);
     wave.insert(wave.end(), after.begin(), after.end());
-    const U slabs = 8, each = CELLS_/slabs, pieces = 16;
-    std::vector<U> table(24 + 4*8, 0);
-    U words[4][8] = {{pieces, 1, (U)first.data(), 1, CELLS_/pieces, CELLS_, 0, pieces}, {0, 2, (U)wave.data(), 2, each, CELLS_, 1, slabs},
-        {0, 3, (U)wave.data(), 2, each, CELLS_, 1, slabs - 1}, {0, 0, (U)last.data(), 1, 0, 0, 0, 1}};
-    for (int i = 1; i < 4; ++i) words[i][0] = words[i - 1][0] + words[i][7];
-    memcpy(&table[24], words, sizeof(words));
-    table[16] = 4; table[17] = words[3][0]; table[18] = (U)&table[24];
+    enum { SLABS_ = 8, PIECES_ = 16, LANES_ = 3, WORDS_ = 11, LANE_ = 8 };
+    const U each = CELLS_/SLABS_;
+    std::vector<U> table(24 + 3*WORDS_ + 3*LANE_*LANES_ + SLABS_);
+    U *words = &table[24], *taken = words + 3*WORDS_, *cuts = taken + 3*LANE_*LANES_;
+    const U made[3][WORDS_] = {{PIECES_, 1, (U)first.data(), 1, CELLS_/PIECES_, CELLS_, 0, PIECES_, LANES_, (U)taken, 0},
+        {PIECES_ + SLABS_, 2, (U)wave.data(), 2, each, CELLS_, 1, SLABS_, LANES_, (U)(taken + LANE_*LANES_), (U)cuts},
+        {PIECES_ + SLABS_ + 1, 0, (U)last.data(), 1, 0, 0, 0, 1, 1, (U)(taken + 2*LANE_*LANES_), 0}};
+    memcpy(words, made, sizeof(made));
+    table[16] = 3; table[17] = made[2][0]; table[18] = (U)words;
     int wrong = 0, resumed = 0;
     for (int round = 0; round < ROUNDS; ++round) {
         const int share = round % 5 ? 1 : 0; const long long limit = round % 7 ? 1LL << 40 : 0;
         work_through((U)team.data(), (U)table.data(), 0, 0, share, limit);
-        while (table[21]) { ++resumed; work_through((U)team.data(), (U)table.data(), 0, 0, 2, 2000); }
+        while (table[20]) { ++resumed; work_through((U)team.data(), (U)table.data(), 0, 0, 2, 2000); }
         for (int t = 0; t < CELLS_; ++t) expected[t] += 5;
         for (int t = 0; t < CELLS_; ++t) {
             expected[CELLS_ + t] = expected[t] + (t > 0 ? expected[t - 1] : 0) + (t + 1 < CELLS_ ? expected[t + 1] : 0); }

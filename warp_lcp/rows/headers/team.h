@@ -1,18 +1,19 @@
 // A team of threads works through a table of operations. The caller is thread 0; the others wait in here, and are asleep when idle.
 //
-// Operations are cut into chunks, which whoever is free takes, in order: one number counts those taken, another those done. An operation
-// begins when all chunks before it are done, so nobody waits for a thread that holds none, as one whose core another process has. Who takes
-// a chunk changes no result. A table's number of runs stands above the count, so that a thread that comes late takes nothing.
+// Operations are cut into chunks, which lie in lanes: a thread takes those of its own lane from the front, so that it meets again what its
+// core has at hand, then those of others from the back. An operation begins when all chunks before it are done, so nobody waits for a
+// thread that holds none, as one whose core another process has. Who takes a chunk changes no result. What is taken of a lane is said with
+// the table's number of runs, so that a thread that comes late takes nothing, and nothing is set back.
 #ifndef __CUDA_ARCH__
 typedef unsigned long long Word; typedef long long Long; typedef void (*Call)(void*, void*);
 enum { RUN, SERVE, CANCEL, QUIT };                                                                    // what is asked for
-enum { ALONE, TASKS, SLABS, GAPS };                                                                   // operations
+enum { ALONE, TASKS, SLABS };                                                                         // operations
 enum { POSTED = 0, TABLE = 1, QUITS = 8, SLEEPERS = 16, MUTEX = 24, CONDITION = 40, CALLS = 56, THREADS = 64 };  // words of a team
 enum { YIELD, CLOCK, NAP, LOCK, UNLOCK, WAIT, WAKE, CLOCK_NUMBER };                                   // functions of the system, from CALLS on
-enum { NEXT = 0, DONE = 8, COUNT = 16, TOTAL = 17, OPERATIONS = 18, LATE = 19, SHARED = 20, UNFINISHED = 21 };  // words of a table
-enum { END = 0, KIND = 1, STAGES = 2, STAGE_COUNT = 3, EACH = 4, ALL = 5, MARGIN = 6, PIECES = 7, WORDS = 8 };  // of an operation
+enum { RUNS = 0, DONE = 8, COUNT = 16, TOTAL = 17, OPERATIONS = 18, SHARED = 19, UNFINISHED = 20 };     // words of a table
+enum { END, KIND, STAGES, STAGE_COUNT, EACH, ALL, MARGIN, CHUNKS, LANES, TAKEN, CUTS, WORDS };         // of an operation
 enum { FUNCTION, BOUNDS, ARGUMENTS, BYTES, PLANE_TASKS, PLANES, LAG, FINER, FINER_PLANES, STAGE_WORDS = 10 };  // of a stage
-enum { MOST = 4, ROOM = 4096, SPINS = 2000, YIELDS = 1000, IDLE_YIELDS = 4000 };
+enum { LANE_WORDS = 8, MOST = 4, ROOM = 4096, SPINS = 2000, YIELDS = 1000, IDLE_YIELDS = 4000 };
 Word* T = (Word*)team_; Word* H = (Word*)table_;
 const auto get = [](const Word* w) { return __atomic_load_n(w, __ATOMIC_SEQ_CST); };
 const auto set = [](Word* w, Word v) { __atomic_store_n(w, v, __ATOMIC_SEQ_CST); };
@@ -46,63 +47,91 @@ const auto plane = [=](const Word* made, char* arguments, Long i, Long least, Lo
     const Long tasks = (Long)made[PLANE_TASKS];
     run(made, arguments, k*tasks, (k + 1)*tasks); };
 
-// A wave streams through memory once: each stage follows some planes behind the one before. Slabs leave out, beside a cut, as many planes
-// as a stage lags: what they would need is the neighbor's. When all are done, the gaps are filled, stage after stage.
-const auto work = [=](const Word* op, Long c) {
+const auto start_of = [](const Word* op, Word lane) { return lane*op[CHUNKS] / op[LANES]; };
+const auto take_of = [=](const Word* op, Word lane, Word runs, bool back, Long wanted) -> Long {  // a chunk, if it is wanted; else -1
+    Word* word = (Word*)op[TAKEN] + lane*LANE_WORDS; const Word start = start_of(op, lane), all = start_of(op, lane + 1) - start;
+    for (;;) {
+        Word w = get(word);
+        if ((int)(unsigned)((w >> 32) - runs) > 0) return -1;
+        const Word front = w >> 32 == runs ? w & 0xffff : 0, behind = w >> 32 == runs ? w >> 16 & 0xffff : 0;
+        const Long chunk = (Long)(back ? start + all - 1 - behind : start + front);
+        if (front + behind >= all || (wanted >= 0 && chunk != wanted)) return -1;
+        const Word more = runs << 32 | (behind + back) << 16 | (front + !back);
+        if (__atomic_compare_exchange_n(word, &w, more, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) return chunk; } };
+const auto take_any = [=](const Word* op, Word runs) -> Long {
+    for (Word l = 0; l < op[LANES]; ++l) {
+        const Long chunk = take_of(op, (me + l) % op[LANES], runs, l > 0, -1);
+        if (chunk >= 0) return chunk; }
+    return -1; };
+const auto take_next = [=](const Word* op, Word runs, Word chunk) {  // whether the chunk is ours
+    for (Word l = 0; l < op[LANES]; ++l) if (chunk < start_of(op, l + 1)) return take_of(op, l, runs, false, (Long)chunk) >= 0;
+    return false; };
+
+// A wave streams through memory once: each stage follows some planes behind the one before. Who takes slab after slab goes on; else there
+// is a gap beside the cut, as wide as a stage lags: what it would need is the neighbor's. Who is done last with the two beside it fills it.
+const auto stream = [=](const Word* op, Word runs, Long c, const Word** stages, char (*room)[ROOM]) -> Word {
+    const int count = (int)op[STAGE_COUNT];
+    const Long each = (Long)op[EACH], slabs = (Long)op[CHUNKS], everything = (Long)1 << 40, from = c;
+    for (Long i = c*each;; ++c) {
+        const Long last = c == slabs - 1 ? (Long)(op[ALL] + op[MARGIN]) : (c + 1)*each;
+        for (; i < last; ++i) for (int s = 0; s < count; ++s) {
+            const Long lag = (Long)stages[s][LAG];
+            plane(stages[s], room[s], i - lag, from ? from*each + lag : 0, everything); }
+        if (c == slabs - 1 || !take_next(op, runs, (Word)(c + 1))) break; }
+    for (int side = 0; side < 2; ++side) {
+        const Long beside = side ? c + 1 : from;
+        if (!beside || beside == slabs || __atomic_exchange_n((Word*)op[CUTS] + beside, runs, __ATOMIC_SEQ_CST) != runs) continue;
+        for (int s = 0; s < count; ++s) {
+            const Long cut = beside*each, lag = (Long)stages[s][LAG], finer = (Long)stages[s][FINER];
+            const Long low = finer > 1 ? 0 : cut - lag, high = cut + lag;
+            for (Long i = cut - lag; i < high + (finer > 1 ? finer - 1 : 0); ++i) plane(stages[s], room[s], i, low, high); } }
+    return (Word)(c + 1 - from); };
+
+const auto work = [=](const Word* op, Word runs, Long c) -> Word {  // on a chunk and those that follow; how many
     char room[MOST][ROOM] __attribute__((aligned(16)));
-    const Word* stages[MOST]; const int count = (int)op[STAGE_COUNT]; const Long everything = (Long)1 << 40;
-    for (int s = 0; s < count; ++s) {
+    const Word* stages[MOST];
+    for (int s = 0; s < (int)op[STAGE_COUNT]; ++s) {
         stages[s] = (const Word*)op[STAGES] + s*STAGE_WORDS;
         if (op[KIND] != ALONE) take(stages[s], room[s]); }
-    const Long each = (Long)op[EACH], all = (Long)op[ALL], slabs = op[KIND] == SLABS ? (Long)op[PIECES] : 0;
+    const Long each = (Long)op[EACH], all = (Long)op[ALL];
+    if (op[KIND] == SLABS) return stream(op, runs, c, stages, room);
     if (op[KIND] == ALONE) ((Call)stages[0][FUNCTION])((void*)stages[0][BOUNDS], (void*)stages[0][ARGUMENTS]);
-    else if (op[KIND] == TASKS) run(stages[0], room[0], c*each, (c + 1)*each < all ? (c + 1)*each : all);
-    else if (op[KIND] == SLABS) {
-        const Long first = c*each, last = c == slabs - 1 ? all + (Long)op[MARGIN] : first + each;
-        for (Long i = first; i < last; ++i) for (int s = 0; s < count; ++s) {
-            const Long lag = (Long)stages[s][LAG];
-            plane(stages[s], room[s], i - lag, c ? first + lag : 0, everything); } }
-    else {
-        const Long cut = (c + 1)*each;
-        for (int s = 0; s < count; ++s) {
-            const Long lag = (Long)stages[s][LAG], finer = (Long)stages[s][FINER];
-            const Long low = finer > 1 ? 0 : cut - lag, high = cut + lag;
-            for (Long i = cut - lag; i < high + (finer > 1 ? finer - 1 : 0); ++i) plane(stages[s], room[s], i, low, high); } } };
+    else run(stages[0], room[0], c*each, (c + 1)*each < all ? (c + 1)*each : all);
+    return 1; };
 
 const auto help = [=](Word* H, Word runs, Long limit) -> int {  // work through a table; 1: the caller's time is over first
     const Word* op = (const Word*)H[OPERATIONS]; const Word* last = op + WORDS*H[COUNT];
-    const Long began = me ? 0 : now(); Long since = began; Word start = 0; int spins = 0;
+    const Long began = me ? 0 : now(); Long since = began; int spins = 0;
     for (;;) {
-        Word next = get(H + NEXT);
-        if (next >> 32 != runs) return 0;
-        const Word ticket = next & 0xffffffff;
-        while (op < last && ticket >= op[END]) {
-            if (!me && op[END] - start > 1) { const Long t = now(); H[SHARED] += t - since; since = t; }
+        if (get(H + RUNS) != runs) return 0;
+        const Word done = get(H + DONE);
+        while (op < last && done >= op[END]) {
+            if (!me && op[CHUNKS] > 1) { const Long t = now(); H[SHARED] += t - since; since = t; }
             else if (!me) since = now();
-            start = op[END]; op += WORDS; }
-        const bool waits = op == last ? (!me && get(H + DONE) < H[TOTAL]) : get(H + DONE) < start || (me && op[KIND] == ALONE);
-        if (op == last && !waits) return 0;
-        if (waits) {
-            if (!me && ++spins == SPINS + YIELDS) ++H[LATE];
-            relax(me ? ++spins : spins, YIELDS);
-            continue; }
+            op += WORDS; }
+        if (op == last) return 0;
         if (!me && now() - began > limit) return 1;
-        if (!__atomic_compare_exchange_n(H + NEXT, &next, next + 1, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) continue;
-        spins = 0;
-        work(op, (Long)(ticket - start));
-        __atomic_fetch_add(H + DONE, 1, __ATOMIC_SEQ_CST); } };
+        const bool theirs = me && (op[KIND] == ALONE || (op[CHUNKS] == 1 && spins < SPINS));  // what is small is left to the caller
+        const Long chunk = theirs ? -1 : take_any(op, runs);
+        if (chunk >= 0) { __atomic_fetch_add(H + DONE, work(op, runs, chunk), __ATOMIC_SEQ_CST); spins = 0; }
+        else if (me && !theirs && op + WORDS == last) return 0;
+        else relax(++spins, YIELDS); } };
 
 if (mode == QUIT) { set(T + QUITS, 1); wake(); }
 else if (mode == CANCEL) {  // nobody takes any more; wait for those who have
-    Word next = get(H + NEXT);
-    while (!__atomic_compare_exchange_n(H + NEXT, &next, ((next >> 32) + 1) << 32 | 0xffffffff, false, __ATOMIC_SEQ_CST, __ATOMIC_SEQ_CST)) {}
-    for (int spins = 0; get(H + DONE) < (next & 0xffffffff); ++spins) relax(spins, YIELDS);
+    const Word runs = get(H + RUNS); Word left = 0; int spins = 0;
+    for (Word o = 0; o < H[COUNT]; ++o) for (Word l = 0; l < ((Word*)H[OPERATIONS] + o*WORDS)[LANES]; ++l) {
+        const Word* op = (const Word*)H[OPERATIONS] + o*WORDS; const Word all = start_of(op, l + 1) - start_of(op, l);
+        const Word w = __atomic_exchange_n((Word*)op[TAKEN] + l*LANE_WORDS, runs << 32 | all, __ATOMIC_SEQ_CST);
+        left += all - (w >> 32 == runs ? (w & 0xffff) + (w >> 16 & 0xffff) : 0); }
+    while (get(H + DONE) + left < H[TOTAL]) relax(++spins, YIELDS);
+    set(H + RUNS, (runs + 1) & 0xffffffff);
 } else if (mode == RUN) {  // share: 0: alone, 1: with the team, 2: go on
-    if (share < 2) { H[LATE] = H[SHARED] = 0; set(H + DONE, 0); set(H + NEXT, ((get(H + NEXT) >> 32) + 1) << 32); }
+    if (share < 2) { H[SHARED] = 0; set(H + DONE, 0); set(H + RUNS, (get(H + RUNS) + 1) & 0xffffffff); }
     if (share == 1) {
         set(T + TABLE, table_); set(T + POSTED, T[POSTED] + 1);
         if (get(T + SLEEPERS)) wake(); }
-    H[UNFINISHED] = help(H, get(H + NEXT) >> 32, limit_);
+    H[UNFINISHED] = help(H, get(H + RUNS), limit_);
 } else {
     Word* ours = T + THREADS + 8*me; Word seen = 0;
     for (int spins = 0;;) {
@@ -112,7 +141,7 @@ else if (mode == CANCEL) {  // nobody takes any more; wait for those who have
             const Word table = get(T + TABLE);
             set(ours, table);  // from here on nobody frees it
             if (table && get(T + POSTED) == posted) {
-                help((Word*)table, get((Word*)table + NEXT) >> 32, 0);
+                help((Word*)table, get((Word*)table + RUNS), 0);
                 seen = posted; spins = 0; }
             else if (!table && get(T + POSTED) == posted) seen = posted;
             set(ours, 0);
