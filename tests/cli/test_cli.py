@@ -36,7 +36,7 @@ def test_a_profile_is_shown_and_written(scene_file, out):
     assert result.exit_code == 0
     shown = [line.split()[0] for line in result.stdout.splitlines()]
     assert shown[0] == "stage"
-    assert {"frames", "(frames,", "checkpoints", "rest", "all", "finished:"} == set(shown[1:]) - {"kernels,"}
+    assert {"frames", "(frames,", "checkpoints", "(checkpoints,", "rest", "all", "finished:"} == set(shown[1:]) - {"kernels,"}
     assert json.loads((out / "profile.json").read_text())["steps"] == json.loads((out / "run.json").read_text())["steps"]
     assert call("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--force").exit_code == 0
     assert not (out / "profile.json").exists()

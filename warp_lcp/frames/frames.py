@@ -144,10 +144,10 @@ class Frames(Protocol):
 
 
 class FrameWriter:
-    """Write frames on a thread of its own while the simulation goes on; at most WAITING frames are in memory.
+    """Write frames, and what comes after them, on a thread of its own while the simulation goes on; at most WAITING are in memory.
 
-    What goes wrong there is raised by every later call of `put`, `check` or `flush`, and no later frame is written. Leaving the `with`
-    block waits for the frames that were put, whatever ended the block, and raises only if nothing else did.
+    What goes wrong there is raised by every later call of `put`, `then`, `check` or `flush`, and nothing later is written. Leaving the
+    `with` block waits for what was put, whatever ended the block, and raises only if nothing else did.
     """
 
     def __init__(self, folder: Frames, watch: Stopwatch | None = None) -> None:
@@ -164,9 +164,27 @@ class FrameWriter:
         Raises:
             OSError: an earlier frame could not be written.
         """
+
+        def write() -> list[Path]:
+            files = self._folder.write(index, time, frame)
+            self.newest = index
+            return files
+
+        self.then("frames, written", write)
+
+    def then(self, name: str, write: Callable[[], list[Path]]) -> None:
+        """Call a function, which returns its files, when all that was put is on disk; wait if there is too much already.
+
+        Args:
+            name: of what it writes, for the profile.
+            write: the function.
+
+        Raises:
+            OSError: something earlier could not be written.
+        """
         while len(self._pending) >= WAITING:
             self._finish()
-        self._pending.append(self._thread.submit(self._write, index, time, frame))
+        self._pending.append(self._thread.submit(self._write, name, write))
 
     def check(self) -> None:
         """Raise what went wrong so far, without waiting.
@@ -203,14 +221,14 @@ class FrameWriter:
         self._pending[0].result()
         self._pending.popleft()
 
-    def _write(self, index: int, time: float, frame: list[Part]) -> None:
-        if self._failed:  # a run that ends at this frame must not leave a later one
+    def _write(self, name: str, write: Callable[[], list[Path]]) -> None:
+        if self._failed:  # a run that ends here must not leave anything later
             return
         self._failed = True
-        with self._watch.beside("frames, written"):
-            files = self._folder.write(index, time, frame)
-        self._watch.wrote("frames, written", *files)
-        self._failed, self.newest = False, index
+        with self._watch.beside(name):
+            files = write()
+        self._watch.wrote(name, *files)
+        self._failed = False
 
 
 def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> int:

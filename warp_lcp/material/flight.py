@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import flight_kernels as kernels
@@ -65,7 +66,7 @@ class Flights:
             change: of the velocity by gravity in this step [m/s], shape (3,).
         """
         trees, device = [self._parent, self._held, self._several], self.grid.device
-        wp.launch(kernels.alone_kernel, self.grid.size, trees, device=device)
+        launch_list(kernels.alone_kernel, self.grid.size, trees, device=device)
         window.run(kernels.UNITE, **dict(zip("uvw", [*weights, None], strict=False)), parent=self._parent)
         named = dict(zip(("parent", "held", "several"), trees, strict=True))
         window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, **named)

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated
+from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated, list_kernel
 from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import TOUCHES
@@ -68,13 +68,12 @@ def root_of(parent: Integers, cell: int):
     return c
 
 
-@wp.kernel(**options)
-def alone_kernel(parent: Integers, held: Bytes, several: Bytes):
+@list_kernel("warp_lcp.material.flight")
+def alone_kernel(i, parent: Integers, held: Bytes, several: Bytes):
     """Every cell is a tree of its own."""
-    c = wp.tid()
-    parent[c] = c
-    held[c] = wp.uint8(0)
-    several[c] = wp.uint8(0)
+    parent[i] = i
+    held[i] = wp.uint8(0)
+    several[i] = wp.uint8(0)
 
 
 @wp.kernel(**options)

@@ -7,11 +7,14 @@ import time as clock
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
 from warp_lcp.distributed.collective import Collective
-from warp_lcp.frames.frames import frame_bytes
+from warp_lcp.frames.frames import FrameWriter, frame_bytes
 from warp_lcp.run.check import check_memory, check_ranks, start
 from warp_lcp.run.checkpoint import PIECES, Checkpoint
 from warp_lcp.run.devices import Engine
@@ -299,7 +302,7 @@ class Run:
                 self._write_frame(frame, last, self._frame())
                 frame += 1
             if self._checkpoint_is_due():
-                self._write_checkpoint(log)
+                self._write_checkpoint(log, beside=True)
             asked = stop()
             if self._somewhere(bool(asked)) and frame <= last:
                 return f"interrupted by {asked}" if isinstance(asked, str) and asked else "interrupted"  # "": another rank was asked
@@ -354,19 +357,33 @@ class Run:
             return True
         return minutes is not None and self._somewhere(clock.monotonic() - self._checkpoint_time >= 60.0 * minutes)
 
-    def _write_checkpoint(self, log: Log | None = None) -> None:
-        """Write a checkpoint unless there is one of this step; what a run that continues from it expects is on the disk before."""
+    def _write_checkpoint(self, log: Log | None = None, *, beside: bool = False) -> None:
+        """Write a checkpoint unless there is one of this step; what a run that continues from it expects is on the disk before.
+
+        Args:
+            log: of the run.
+            beside: the run goes on meanwhile.
+        """
         step = self.simulation.step_count
         if self._checkpointed == step:
             return
+        files: list[Path] = []
         with self.watch.stage("checkpoints"):
-            self.writer.flush()
             if log:
                 log.sync()
-            file = self.folder.checkpoints.write(Checkpoint(step, self.simulation.time, self.simulation.state()))
-            self.folder.checkpoints.prune(self.output.checkpoints_kept)
-        self.watch.wrote("checkpoints", file)
+            if beside and isinstance(self.writer, FrameWriter):  # ranks write together
+                state = {name: np.array(array) for name, array in self.simulation.state().items()}
+                self.writer.then("checkpoints, written", partial(self._store, Checkpoint(step, self.simulation.time, state)))
+            else:
+                self.writer.flush()
+                files = self._store(Checkpoint(step, self.simulation.time, self.simulation.state()))
+        self.watch.wrote("checkpoints", *files)
         self._checkpointed, self._checkpoint_time = step, clock.monotonic()
+
+    def _store(self, checkpoint: Checkpoint) -> list[Path]:
+        file = self.folder.checkpoints.write(checkpoint)
+        self.folder.checkpoints.prune(self.output.checkpoints_kept)
+        return [file]
 
     def _write_profile(self) -> None:
         assert self.profile is not None
