@@ -34,6 +34,7 @@ from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
+from warp_lcp.rows.team import VARIABLE
 from warp_lcp.run.devices import devices, free_memory
 
 TITLE = "Solves on several ranks"
@@ -131,8 +132,8 @@ class Shared:
         self.counts["resident"] = self.ranks.max(peak) / MEGA
         self.counts["resident_more"] = self.ranks.max(peak - before) / MEGA
 
-    def record(self, plain: Growing | None) -> Record:
-        """Return the figures; `plain` is the same solve by one process."""
+    def record(self, plain: Growing | None, team: Growing | None) -> Record:
+        """Return the figures; `plain` is the same solve by one process, `team` by one with a thread for each rank."""
         figures = {name: Figure.of(taken, "s") for name, taken in self.samples.items() if taken}
         units = {"bytes_per_cell": "B", "resident": "MiB", "resident_more": "MiB"}
         figures |= {name: Figure(value, units.get(name, "")) for name, value in self.counts.items()}
@@ -142,6 +143,11 @@ class Shared:
                 if theirs and len(ours) == len(theirs):
                     figures |= {f"single_{name}": Figure.of(theirs, "s"), f"{name}_over_single": ratios(ours, theirs)}
             figures["single_iterations"] = Figure(plain.counts["iterations_to_1e-06"])
+        if team is not None and len(team.samples[TOLD]) == len(self.samples[TOLD]):
+            figures |= {
+                f"team_{TOLD}": Figure.of(team.samples[TOLD], "s"),
+                f"{TOLD}_over_team": ratios(self.samples[TOLD], team.samples[TOLD]),
+            }
         n, boxes = self.decomposition.counts[0], " x ".join(map(str, self.decomposition.processes))
         facts = {"n": n, "bounds": self.bounds, "ranks": self.ranks.size, "boxes": boxes}
         return Record(f"{n}^3 {self.bounds}, ranks: {self.ranks.size}", figures, facts)
@@ -183,7 +189,8 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
             "--out",
             folder,
         ]
-        waiting = {"OMPI_MCA_mpi_yield_when_idle": str(int(count > (os.cpu_count() or 1)))}  # to give cores away costs microseconds
+        idle = str(int(count > (os.cpu_count() or 1)))  # to give cores away costs microseconds
+        waiting = {VARIABLE: "1", "OMPI_MCA_mpi_yield_when_idle": idle}
         process = subprocess.run(launch.command(count, *arguments), env=launch.environment() | waiting, check=False)
         if process.returncode != 0:
             options.say(f"ranks: {count}: ended with exit code {process.returncode}")
@@ -210,7 +217,8 @@ def _together(sizes: Sequence[int], options: Options) -> list[Record]:
 def on_ranks(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[str], object]) -> list[Record]:
     """Measure the sizes that fit on all ranks, one sample of each in every round; collective.
 
-    The first rank also solves each problem alone, in the same rounds, as far as it fits on its machine.
+    The first rank also solves each problem alone, on one thread and on as many as there are ranks, in the same rounds, as far as it fits on
+    its machine.
 
     Raises:
         MemoryError: no size fits.
@@ -222,7 +230,7 @@ def on_ranks(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, sa
     here = device_of_rank(ranks, device)
     for case in shared_cases(min(sizes), ranks, here):
         case.sample(keep=False)  # loads kernels
-    records, cases = list[Record](), list[tuple[Shared, Growing | None]]()
+    records, cases, threads = list[Record](), list[tuple[Shared, Growing | None, Growing | None]](), wl.get_threads()
     for n in sizes:
         if ranks.any(not _fits(Decomposition((n, n, n), ranks).box.cells, here)):
             say(f"rank {ranks.rank}: {n}^3 does not fit into memory")
@@ -236,21 +244,25 @@ def on_ranks(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, sa
             case.sample(keep=False)
             case.counts |= {name: shared[WALLS].counts[name] for name in MEMORY}
         scene = splash(n) if ranks.is_root and _fits(n**3, here) else None
-        cases += [(case, None if scene is None else Growing(scene, case.bounds, here)) for case in shared]
+        alone = [None if scene is None else Growing(scene, bounds, here) for bounds in BOUNDS for _ in range(2)]
+        cases += zip(shared, alone[::2], alone[1::2] if here == "cpu" and ranks.size > 1 else [None] * len(shared), strict=True)
     if not cases:
         raise MemoryError(f"none of the sizes {', '.join(map(str, sizes))} fits")
     for turn in range(repeat + 1):
         if ranks.is_root:
             say(f"ranks: {ranks.size}, round {turn} of {repeat}")
-        for case, plain in cases:
+        for case, *others in cases:
             if turn:
                 case.sample(keep=True)
-            if plain is not None:
-                plain.sample(keep=turn > 0)
+            for plain, count in zip(others, (1, ranks.size), strict=True):
+                if plain is not None:
+                    wl.set_threads(count)
+                    plain.sample(keep=turn > 0)
+            wl.set_threads(threads)
             request = ranks.comm.Ibarrier()  # for the first rank
             while not request.Test():
                 time.sleep(PAUSE)
-    return [*records, *(case.record(plain) for case, plain in cases)]
+    return [*records, *(case.record(*others) for case, *others in cases)]
 
 
 def shared_cases(n: int, ranks: Ranks, device: str) -> list[Shared]:
@@ -281,11 +293,13 @@ def targets(found: Found, sizes: Sequence[int]) -> Table:
         one, two = found.get((n, "walls", 1)), found.get((n, "walls", 2))
         spread_ = Figure(max(counts) - min(counts)) if len(counts) == len(RANKS) else None
         single = one.figures.get(f"{TOLD}_over_single") if one else None
+        team = two.figures.get(f"{TOLD}_over_team") if two else None
         gain = _ratio(one, two, TOLD) if (os.cpu_count() or 1) >= 2 else None  # without a core for each rank it tells nothing
         rows += [
             Target(f"{n}^3 walls: iterations to 1e-6, the most of any number of ranks less the least", 1, spread_),
             Target(f"{n}^3 walls: seconds to 1e-6 on 1 rank over those on 2", 1.6, gain, at_least=True),
             Target(f"{n}^3 walls: seconds to 1e-6 on 1 rank over one process's", 1.5, single),
+            Target(f"{n}^3 walls: seconds to 1e-6 on 2 ranks over one process's on 2 threads", 1, team, at_least=True),
             Target(f"{n}^3 walls: memory of a rank of 2 over that of 1", 0.6, _ratio(two, one, "resident_more")),
         ]
     return table_of_targets("figure", rows)
@@ -293,18 +307,22 @@ def targets(found: Found, sizes: Sequence[int]) -> Table:
 
 def _table(found: Found) -> Table:
     columns = ["cells", "problem", "ranks", "boxes", "set-up [ms]", *(f"to {t:g} [ms]" for t in TOLERANCES), "range of 1e-6", "gain"]
-    columns += ["over one process", "iterations", "residual", "bytes a cell", "MiB a rank", "of them for the problem"]
+    columns += ["over one process", "over its threads", "iterations", "residual", "bytes a cell", "MiB a rank", "of them for the problem"]
     rows = []
     for (n, bounds, count), r in sorted(found.items(), key=lambda item: (item[0][0], BOUNDS.index(item[0][1]), item[0][2])):
         gain = _ratio(found.get((n, bounds, 1)), r, TOLD)
         row = [f"{n}^3", bounds, str(count), r.facts["boxes"], *shown(r, ("setup", *FIGURES), ".1f", 1e3)]
         row += [spread(r.figures.get(TOLD, Figure(0.0)), 1e3), "" if gain is None else f"{gain.value:.2f}"]
-        row += [*shown(r, [f"{TOLD}_over_single"], ".2f"), " / ".join(shown(r, [f"iterations_{name}" for name in FIGURES], ".0f"))]
+        row += [
+            *shown(r, [f"{TOLD}_over_single", f"{TOLD}_over_team"], ".2f"),
+            " / ".join(shown(r, [f"iterations_{name}" for name in FIGURES], ".0f")),
+        ]
         rows.append([*row, *shown(r, ["residual"], ".1e"), *shown(r, MEMORY, ".0f")])
     remark = (
         f"On {os.cpu_count()} cores: more ranks than cores tell of counts, not of time. Cold, from each rank's arrays, seconds "
         "of the slowest rank. Gain: seconds of 1 rank over those of these; over one process: seconds over those of one process that solves "
-        "alone, without MPI, in the same rounds. The residual is computed from x by NumPy in float64. Bytes: of all arrays. MiB: the "
+        "alone, without MPI, on one thread, in the same rounds; over its threads: on as many as there are ranks. The residual is "
+        "computed from x by NumPy in float64. Bytes: of all arrays. MiB: the "
         "most that a rank's process holds in a solve with walls, the scene included."
     )
     return Table("Ranks and sizes", columns, rows, remark)
