@@ -86,6 +86,6 @@ def test_figures_to_reach(monkeypatch):
     monkeypatch.setattr(ranks.os, "cpu_count", lambda: 2)
     kept = [measured(128, 1, 0.2, 8, 100.0, 1.2), measured(128, 2, 0.1, 9, 55.0, 0.7), measured(128, 4, 0.3, 10, 30.0, 2.0)]
     table = ranks.targets(found(kept), [64, 128])
-    assert [row[2:] for row in table.rows] == [["2", "no"], ["2", "yes"], ["1.2", "yes"], ["0.55", "yes"]]
+    assert [row[2:] for row in table.rows] == [["2", "no"], ["2", "yes"], ["1.2", "yes"], ["not measured here", ""], ["0.55", "yes"]]
     monkeypatch.setattr(ranks.os, "cpu_count", lambda: 1)
     assert ranks.targets(found(kept), [128]).rows[1][2:] == ["not measured here", ""]
