@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ TITLE = "All cores in one process"
 SIZES = (128, 256)
 SCENES = {"dam-break": (96, 1.7), "floating-bodies": (96, 1.6), "column-collapse": (64, 1.7)}  # cells along the longest side; target
 STEPS, LONGEST = 8, 0.005  # of a scene before it is measured; the longest one [s]
+KERNELS, TURNS = ("x += z (what memory allows)", "product", "sweep", "restriction", "cycle"), 20
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
 TARGETS = {"product": 1.85, "sweep": 1.85, "restriction": 1.85, "steps of a solve": 1.85, "solve, cold": 1.7}
 Work = dict[str, Callable[[], object]]
@@ -42,10 +44,15 @@ def measure(options: Options, out: Path) -> Results:
         for label, group in _groups(options.sizes or SIZES):
             options.say(label)
             made = {count: group(count) for count in counts}
+            others = [made[1], *(group(1) for _ in range(counts[-1] - 1))] if label.endswith("^3") else []
             for name in made[1]:
                 work = {str(count): _on(count, made[count][name]) for count in counts}
+                if others and name in KERNELS:
+                    work["apart"] = _on(1, partial(_at_once, [other[name] for other in others]))
                 times = in_turns(work, options.repeat)
                 figures = {f"speed_{count}": ratios(times["1"], times[str(count)]) for count in counts[1:]}
+                if "apart" in times:
+                    figures["apart"] = ratios([len(others) * TURNS * t for t in times["1"]], times["apart"])
                 records.append(Record(f"{label}: {name}", figures, {"what": name, "group": label, "seconds": min(times["1"])}))
     finally:
         wl.set_threads(before)
@@ -53,8 +60,13 @@ def measure(options: Options, out: Path) -> Results:
         [r.name, f"{1e3 * float(r.facts['seconds']):.3g}", *(f"{f.value:.2f} ({f.low:.2f} to {f.high:.2f})" for f in r.figures.values())]
         for r in records[1:]
     ]
-    remark = f"Medians of {options.repeat} ratios of samples taken in turns, and their range. Cores: {os.cpu_count()}."
-    heads = ["what", "1 thread [ms]", *(f"{count} threads" for count in counts[1:])]
+    rows = [row + [""] * (len(counts) + 2 - len(row)) for row in rows]
+    remark = (
+        f"Medians of {options.repeat} ratios of samples taken in turns, and their range. Cores: {os.cpu_count()}. Apart: as many copies of "
+        "the work as there are cores, each on one thread that waits for no other: what they get done together over what one gets done, "
+        "which is what this machine had to give."
+    )
+    heads = ["what", "1 thread [ms]", *(f"{count} threads" for count in counts[1:]), "apart"]
     return Results(records, [Table("Speed against one thread", heads, rows, remark), table_of_targets("on 2 threads", _targets(records))])
 
 
@@ -64,6 +76,17 @@ def _on(count: int, work: Callable[[], object]) -> Callable[[], object]:
         work()
 
     return run
+
+
+def _at_once(copies: list[Callable[[], object]]) -> None:
+    """Run each of the copies some times, all of them at once."""
+    with ThreadPoolExecutor(len(copies)) as pool:
+        list(pool.map(_several, copies))
+
+
+def _several(run: Callable[[], object]) -> None:
+    for _ in range(TURNS):
+        run()
 
 
 def _groups(sizes: tuple[int, ...]) -> Iterator[tuple[str, Callable[[int], Work]]]:
