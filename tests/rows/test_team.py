@@ -16,7 +16,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.gallery import splash
-from warp_lcp.rows import RowPass, Rows, Wave, team
+from warp_lcp.rows import RowPass, Rows, Wave, row_pass, team
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.native import HEADERS
 from warp_lcp.rows.program import Program
@@ -94,6 +94,18 @@ def test_slabs_of_a_wave_are_one_stream(planes, tmp_path, small_pieces):
         program.run()
         np.testing.assert_array_equal(x.numpy().reshape(host.shape)[1:-1], expected[1:-1])
         assert scalars.numpy()[0] == expected[1:-1].sum(dtype=np.float64)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8, 64])
+@pytest.mark.parametrize("planes", [20, 22, 47, 100, 128, 129, 256, 700])
+def test_slabs_fill_their_threads(planes, threads):
+    slabs, each = row_pass.slabs_of(planes, 10, threads)
+    last = planes - (slabs - 1) * each
+    assert slabs >= 2
+    assert each % 2 == 0
+    assert last >= each >= 10
+    share = -(-slabs // threads) * each + last - each
+    assert share <= 1.3 * max(planes / threads, 14) or planes < 128
 
 
 def test_two_python_threads_solve_at_once():

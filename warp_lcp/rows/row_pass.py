@@ -392,6 +392,19 @@ class Bound(NamedTuple):
         return Stage(entry, memory, self, L.rows * L.chunks, threads(L)[0], lag, max(L.fz, 1), L.n1)
 
 
+def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:
+    """Return into how many slabs planes are cut, and how many planes each has but the last: an even number, coarser planes stand for two.
+
+    Args:
+        planes: to cut, at least twice `least`.
+        least: planes that a slab has at least.
+        threads: that take them.
+    """
+    cuts = [(count, planes // count // 2 * 2) for count in range(2, min(planes // least, SLAB_PIECES * threads) + 1)]
+    shares = [-(-count // threads) * each + planes - count * each for count, each in cuts]  # of the thread that has the last slab, and most
+    return max(cut for cut, share in zip(cuts, shares, strict=True) if share <= 1.1 * min(shares))
+
+
 class Wave:
     """Passes each of which follows some planes behind the one before: a CPU streams through memory once; on CUDA, launches.
 
@@ -448,12 +461,8 @@ class Wave:
         layouts = [b.layout for b, _ in given]
         planes, most = max(L.planes for L in layouts), max(lag for _, lag in given)
         least = 2 * (max(SLAB_PLANES, 2 * most + 5) // 2 + 1)  # so that the gaps lie apart, and three planes between those that are kept
-        slabs, each = 1, planes
         alone = get_threads() == 1 or any(L.turn or L.lift for L in layouts) or planes * max(L.rows * L.nx for L in layouts) < 2 * CELLS
-        if not alone and planes >= 2 * least:
-            slabs = max(p * get_threads() for p in range(SLAB_PIECES + 1) if p == 0 or planes // (p * get_threads()) >= least)
-            slabs = slabs or planes // least
-            each = planes // slabs // 2 * 2  # coarser planes stand for two
+        slabs, each = (1, planes) if alone or planes < 2 * least else slabs_of(planes, least, get_threads())
         members = {}
         if slabs > 1:
             apart = max([lag for b, lag in given if b.form.declared.ring], default=0) + 1
