@@ -45,6 +45,9 @@ class DistributedPressure(PressureProjection):
         if settings["tolerance"] == "auto":
             self.automatic = TimeErrorTolerance(self._rhs.size, part.grid.device, part.ranks)
 
+    def _look(self, window: Window | None) -> None:
+        """Solve for the cells of the box, whatever the window."""
+
     def project(
         self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
     ) -> Projection:

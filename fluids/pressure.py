@@ -16,7 +16,7 @@ import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
@@ -142,7 +142,7 @@ class PressureProjection:
         self._least: Any = -np.inf if self._lower is None else self._lower
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
-        self._solved, self._rhs, self._guess = grid.domain, self._b, self._start  # what is solved for
+        self._trail, self._solved, self._rhs, self._guess = Trail(grid.domain), grid.domain, self._b, self._start  # what is solved for
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
 
@@ -150,14 +150,16 @@ class PressureProjection:
         """Show `kind` in frames though nothing has been projected yet."""
         wp.copy(self.cells, self.kind)
 
-    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
+    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> int:
         """Set up the problem of the marked cells and return the number of unknowns. The first guess is the last pressure.
 
         Args:
             velocity: u* of each component [m/s].
             dt: time step [s].
             kick_dt: how long forces have acted on u* [s].
+            window: cells that hold all FLUID cells; None: all cells.
         """
+        self._look(window)
         unknowns = self.unknowns()
         if self._problem is None and unknowns > 0:
             self._make_problem()
@@ -168,6 +170,10 @@ class PressureProjection:
         self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, ratio=self._ratio)
         self._update()
         return unknowns
+
+    def _look(self, window: Window | None) -> None:
+        """Solve for the cells of a window, and undo what is left of the last one."""
+        self._solved = self._trail.through(window)
 
     def leave(self) -> Projection:
         """Take a step without liquid cells: all is spray."""
@@ -314,6 +320,7 @@ class PressureProjection:
         self.pressure.assign(state["pressure"])
         self.cells.assign(state["cells"])
         self.contact.assign(state["contact"])
+        self._trail.forget()
         self._last = float(state["pressure_dt"])
         if self.automatic is not None:
             self.automatic.restore(state["time_error"])

@@ -149,7 +149,7 @@ class LiquidSimulation(ParticleSimulation):
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
-        row = self.move(dt) | self.solve_row(projected.result)
+        row = self.move(dt, window) | self.solve_row(projected.result)
         automatic = self.projection.automatic
         if automatic is not None and projected.result is not None:
             row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
@@ -230,7 +230,7 @@ class LiquidSimulation(ParticleSimulation):
             self.boundary.begin_step(self.time, dt)
             if self.sources is not None:
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, projection.kind)
-            unknowns = projection.prepare(self.velocity, dt, self.kick_dt)
+            unknowns = projection.prepare(self.velocity, dt, self.kick_dt, window)
         if unknowns == 0:
             return self._held(projection.leave())
         if self.record is not None:

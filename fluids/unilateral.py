@@ -79,7 +79,7 @@ class UnilateralPressure(PressureProjection):
         setting.cells, setting.base = self._unknown, boundary.base
         self._setting = setting
 
-    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
+    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> int:
         """Set up the problem of all cells that are not SOLID and return their number; arguments as of the base class."""
         self._begin(kick_dt)
         self._setting.rate = wp.float64(self.grid.spacing / dt)

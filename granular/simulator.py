@@ -139,7 +139,7 @@ class SandSimulation(ParticleSimulation):
         self._extend(window)
         self.bring_to_particles(window, self.packing.kind, dt)
         below, most = self._mass_below(), self._most()
-        row = self.move(dt)
+        row = self.move(dt, window)
         self._place_solids()
         runout, height = self._front()
         rate = self._flow_rate(below, row, dt)

@@ -67,7 +67,7 @@ class Dust(ParticleSimulation):
             marks.assign((weight.numpy() > TINY_WEIGHT).astype(np.int8))
         self.extend(window, self.known, self.kind, self.contact)
         self.bring_to_particles(window, self.kind, dt)
-        return self.logged(self.move(dt) | self.solve_row(None) | {"grains": 7, "unasked": 1})
+        return self.logged(self.move(dt, window) | self.solve_row(None) | {"grains": 7, "unasked": 1})
 
 
 def make(resolution: int = 16, **tables: Any) -> Dust:

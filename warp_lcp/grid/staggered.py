@@ -132,6 +132,29 @@ class Window:
         launch_ranges(kernel, dim, cells.grain, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
 
 
+class Trail:
+    """Where a pass must run to leave fields as if it had run everywhere: outside its windows it writes what never changes.
+
+    Args:
+        all: the cells of all windows.
+    """
+
+    def __init__(self, all: Window) -> None:
+        self.all = all
+        self.forget()
+
+    def forget(self) -> None:
+        """Know no more what the last run left."""
+        self._last = self.all
+
+    def through(self, window: Window | None) -> Window:
+        """Return a box around the last window and this one, which becomes the last; None: all cells."""
+        now = (window and window.common(self.all)) or self.all
+        low, high = np.minimum(now.low, self._last.low), np.maximum(now.high, self._last.high)
+        self._last = now
+        return Window.of(low.tolist(), high.tolist(), now.device)
+
+
 @dataclass(frozen=True)
 class StaggeredGrid:
     """Say how many cells of which size there are, and make fields for them.

@@ -13,7 +13,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
@@ -70,6 +70,7 @@ class Crowding:
         self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
         self._sums = wp.zeros((*grid.shape[:2], COLUMNS), dtype=wp.float64, device=grid.device)
         self._density: wp.array | None = None
+        self._trail = Trail(grid.domain)
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> tuple[float, float]:
         """Return which share of the material is beyond what cells may hold, and the largest density, that at rest being 1.
@@ -84,7 +85,7 @@ class Crowding:
             particle_density(self.grid, particles, window, self.particles_a_cell, density)
         b = self.boundary
         filled = {"base": b.base, "density": density, "capacity": b.capacity}
-        self.grid.domain.run(CROWD, whole=True, **filled, most=self.max_density, sums=self._sums)
+        self._trail.through(window).run(CROWD, whole=True, **filled, most=self.max_density, sums=self._sums)
         sums = self.grid.domain.rows_of(self._sums)
         held = float(sums[..., 2].sum())
         return (float(sums[..., 0].sum()) / held if held > 0.0 else 0.0), float(sums[..., 1].max())

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import flight_kernels as kernels
@@ -65,13 +64,12 @@ class Flights:
             dt: time step [s].
             change: of the velocity by gravity in this step [m/s], shape (3,).
         """
-        trees, device = [self._parent, self._held, self._several], self.grid.device
-        launch_list(kernels.alone_kernel, self.grid.size, trees, device=device)
+        named, device = {"parent": self._parent, "held": self._held, "several": self._several}, self.grid.device
+        window.run(kernels.ALONE, kind=kind, **named)
         window.run(kernels.UNITE, **dict(zip("uvw", [*weights, None], strict=False)), parent=self._parent)
-        named = dict(zip(("parent", "held", "several"), trees, strict=True))
         window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, **named)
         self._count.zero_()
-        wp.launch(kernels.number_kernel, self.grid.size, [*trees, self._number, self._count], device=device)
+        window.run(kernels.NUMBER, kind=kind, **named, number=self._number, count=self._count)
         bodies = int(self._count.numpy()[0])
         self._before = np.zeros((bodies, kernels.COLUMNS))
         if bodies == 0:

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated, list_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated
 from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import TOUCHES
@@ -53,9 +53,12 @@ _MORE: dict[str, Any] = {
     "constants": {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT},
 }
 UNITE = cell_pass("warp_lcp.material.flight.unite", "u v w", whole={"parent": wp.int32}, optional=("w",), ordered=True, **_MORE)
+_TREES = {"parent": wp.int32, "held": wp.uint8, "several": wp.uint8}
+ALONE = cell_pass("warp_lcp.material.flight.alone", "", {"kind": wp.int8}, whole=_TREES, **_MORE)
+_NUMBERED = {**_TREES, "number": wp.int32, "count": wp.int32}
+NUMBER = cell_pass("warp_lcp.material.flight.number", "", {"kind": wp.int8}, whole=_NUMBERED, ordered=True, **_MORE)
 HOLD = cell_pass(
-    "warp_lcp.material.flight.hold", "", {"kind": wp.int8, "touch": wp.uint8},
-    whole={"parent": wp.int32, "held": wp.uint8, "several": wp.uint8}, **_MORE,
+    "warp_lcp.material.flight.hold", "", {"kind": wp.int8, "touch": wp.uint8}, whole=_TREES, **_MORE,
 )  # fmt: skip
 
 
@@ -66,24 +69,6 @@ def root_of(parent: Integers, cell: int):
     while parent[c] != c:
         c = parent[c]
     return c
-
-
-@list_kernel("warp_lcp.material.flight")
-def alone_kernel(i, parent: Integers, held: Bytes, several: Bytes):
-    """Every cell is a tree of its own."""
-    parent[i] = i
-    held[i] = wp.uint8(0)
-    several[i] = wp.uint8(0)
-
-
-@wp.kernel(**options)
-def number_kernel(parent: Integers, held: Bytes, several: Bytes, number: Integers, count: Integers):
-    """Number the trees that nothing holds; other cells get -1."""
-    c = wp.tid()
-    n = int(-1)
-    if parent[c] == c and held[c] == wp.uint8(0) and several[c] != wp.uint8(0):
-        n = wp.atomic_add(count, 0, 1)
-    number[c] = n
 
 
 @wp.func

@@ -55,17 +55,18 @@ class Rearrangement:
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
         self._crowded: tuple[float, float] | None = None  # share and largest density at the start of the step
 
-    def look(self, step: int, density: wp.array | None, particles: Particles) -> None:
+    def look(self, step: int, density: wp.array | None, particles: Particles, window: Window) -> None:
         """Measure the crowding at the start of a step, before anything moves, if that is what decides.
 
         Args:
             step: its number.
             density: of the particles, in units of that at rest, float32; None: nobody has found it yet.
             particles: the material.
+            window: cells that hold all of it, with two to spare on each side.
         """
         self._crowded = None
         if self.crowding is not None and step % self._every == 0:
-            self._crowded = self.crowding.measure(density, particles, self._grid.everywhere)
+            self._crowded = self.crowding.measure(density, particles, window)
 
     @property
     def max_density(self) -> float | None:

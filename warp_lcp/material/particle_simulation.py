@@ -256,8 +256,12 @@ class ParticleSimulation(ABC):
                 self.grid, self.velocity, particles.position, particles.velocity, particles.affine, saved=self._saved, flip=flip
             )
 
-    def move(self, dt: float) -> Row:
+    def move(self, dt: float, window: Window) -> Row:
         """Move particles and solids by dt [s], exchange particles with sources and outlets, even them out, and advance the clock.
+
+        Args:
+            dt: time step [s].
+            window: of the step.
 
         Returns:
             What the log says of it and of the particles.
@@ -266,7 +270,7 @@ class ParticleSimulation(ABC):
             SimulationFailed: something is not finite, or a particle has left the domain.
         """
         with self.watch.stage("crowding", self.particles.position):
-            self.rearrangement.look(self.step_count, self.known_density(), self.particles)
+            self.rearrangement.look(self.step_count, self.known_density(), self.particles, window)
         with self.watch.stage("advection", self.particles.position, *self.velocity):
             stopped, pushed, stuck = self.carry(dt)
         if self.band is not None:
