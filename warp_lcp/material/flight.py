@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.particle_loops import PARTICLE
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import flight_kernels as kernels
@@ -102,7 +104,9 @@ class Flights:
         end = wp.empty_like(self._start)
         fields, wall = [*velocity, None][:3], self.boundary
         motion = self._motion(drift * dx / dt, spin / dt, center * dx)
-        self._launch(kernels.fly_kernel, [*fields, motion, wall.base, wall.touch, self._start, end])
+        came = [wp.empty_like(end), wp.empty(len(end), dtype=wp.uint8, device=self.grid.device)]
+        self._carry(kernels.fly_kernel, [*fields, motion, wall.base, wall.touch, self._start, end, *came])
+        self._launch(kernels.arrive_kernel, came)
         after = self._sums()
         has, missing = _about_center(after), drift - after[:, 4:7] / number
         rigid, turn = _turning(after, had, had - has)
@@ -115,7 +119,7 @@ class Flights:
         share[after[:, kernels.LEAVES] > 0.0] = -1.0  # it meets a wall in this step
         shift, center = center + drift - after[:, 1:4] / number, center + drift
         motion = self._motion(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
-        self._launch(kernels.land_kernel, [motion, end, particles.position])
+        self._carry(kernels.land_kernel, [motion, end, particles.position])
 
     def _take(self, particles: Particles) -> None:
         """Point the kernels at the particles, and at sums of nothing."""
@@ -138,6 +142,9 @@ class Flights:
 
     def _launch(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
         wp.launch(kernel, len(self._flight.body), [self._flight, *inputs], device=self.grid.device)
+
+    def _carry(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
+        launch_list(kernel, len(self._flight.body), [self._flight, *inputs], device=self.grid.device, cost=PARTICLE)
 
 
 def _about_center(sums: Sums) -> np.ndarray:

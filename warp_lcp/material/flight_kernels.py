@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated
+from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated, list_kernel
 from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import TOUCHES
@@ -155,52 +155,61 @@ def is_near(base: Kinds, touch: U8, planes: int, x: wp.vec3):
     return near
 
 
-@wp.kernel(**options)
-def fly_kernel(flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8, start: Vectors, end: Vectors):
-    """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, and add them up.
+@list_kernel("warp_lcp.material.flight")
+def fly_kernel(
+    i, flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8, start: Vectors, end: Vectors, x: Vectors,
+    near: Bytes,
+):  # fmt: skip
+    """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, to x [cells].
 
     What they have of the body's spin turns with it. A motion is the body's [0] velocity, [1] spin, [2] center.
     """
-    n = wp.tid()
-    p = flight.who[n]
-    b = flight.body[n]
+    p = flight.who[i]
+    b = flight.body[i]
     h = flight.rate
-    x = start[n] * flight.inverse_dx
+    x0 = start[i] * flight.inverse_dx
     mean = motion[b, 0]
     spin = motion[b, 1]
-    k1 = velocity_at(u, v, w, flight.planes, x)
-    k2 = velocity_at(u, v, w, flight.planes, x + 0.5 * h * (k1 - mean))
-    k3 = velocity_at(u, v, w, flight.planes, x + 0.75 * h * (k2 - mean))
+    k1 = velocity_at(u, v, w, flight.planes, x0)
+    k2 = velocity_at(u, v, w, flight.planes, x0 + 0.5 * h * (k1 - mean))
+    k3 = velocity_at(u, v, w, flight.planes, x0 + 0.75 * h * (k2 - mean))
     way = h / 9.0 * (2.0 * k1 + 3.0 * k2 + 4.0 * k3)
     if flight.straight:
         way = h * k1
-    x += way
-    end[n] = start[n] + way / flight.inverse_dx
-    rigid = wp.cross(spin, start[n] - motion[b, 2])
+    x1 = x0 + way
+    end[i] = start[i] + way / flight.inverse_dx
+    rigid = wp.cross(spin, start[i] - motion[b, 2])
     flight.velocity[p] = flight.velocity[p] + turned(spin * (h / flight.inverse_dx), rigid) - rigid
-    add_up(flight, n, x)
     longest = wp.max(wp.max(wp.abs(way[0]), wp.abs(way[1])), wp.abs(way[2]))
     strides = wp.clamp(int(wp.ceil(longest)), 1, MOST_STRIDES)
-    near = int(0)
+    met = wp.uint8(0)
     for stride in range(strides):
-        if is_near(base, touch, flight.planes, x - (float(stride) / float(strides)) * way):
-            near = 1
-    if near == 1:
-        wp.atomic_add(flight.sums, b, LEAVES, wp.int64(1))
+        if is_near(base, touch, flight.planes, x1 - (float(stride) / float(strides)) * way):
+            met = wp.uint8(1)
+    x[i] = x1
+    near[i] = met
 
 
 @wp.kernel(**options)
-def land_kernel(flight: Flight, motion: Motions, end: Vectors, position: Vectors):
+def arrive_kernel(flight: Flight, x: Vectors, near: Bytes):
+    """Add up the particles where they have come to [cells], and those that came near a wall or an open side."""
+    n = wp.tid()
+    add_up(flight, n, x[n])
+    if near[n] != wp.uint8(0):
+        wp.atomic_add(flight.sums, flight.body[n], LEAVES, wp.int64(1))
+
+
+@list_kernel("warp_lcp.material.flight")
+def land_kernel(i, flight: Flight, motion: Motions, end: Vectors, position: Vectors):
     """Give particles their places, a share of their velocity and a rigid motion; bodies without a share stay as they are.
 
     A motion is [0] the shift, [1] the velocity, [2] the spin, [3] the center, [4] the share, three times.
     """
-    n = wp.tid()
-    p = flight.who[n]
-    b = flight.body[n]
+    p = flight.who[i]
+    b = flight.body[i]
     s = motion[b, 4][0]
     if s >= 0.0:
-        x = end[n] + motion[b, 0]
+        x = end[i] + motion[b, 0]
         w = motion[b, 2]
         position[p] = x
         flight.velocity[p] = s * flight.velocity[p] + motion[b, 1] + wp.cross(w, x - motion[b, 3])
