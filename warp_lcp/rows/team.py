@@ -33,6 +33,7 @@ ALONE, TASKS, SLABS = range(3)
 DONE_ALONE, SHARED, RESUMED = range(3)
 TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 56, 64, 24, 11, 8
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED = range(16, 21)
+MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
 LOCKS = ("pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast")
 SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
 
@@ -164,6 +165,8 @@ class Team:
         self.address = ctypes.addressof(self.words)
         for i, function in enumerate(_system()):
             self.words[CALLS + i] = function
+        for name, word in MADE.items() if _system() else ():
+            getattr(ctypes.CDLL(None), name)(ctypes.c_void_p(self.address + 8 * word), None)
         self._lock, self._inside = threading.Lock(), 0
         self._posted, self._retired = None, []
         self.shared_time = 0.0  # seconds that callers have spent in what the team shared
