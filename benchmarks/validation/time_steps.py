@@ -90,8 +90,8 @@ def _push_liquid_apart(simulation: Any) -> None:
     projection = simulation.projection
     prepare = projection.prepare
 
-    def pushed(velocity: Any, dt: float, kick_dt: float) -> int:
-        unknowns: int = prepare(velocity, dt, kick_dt)
+    def pushed(velocity: Any, dt: float, *given: Any) -> int:
+        unknowns: int = prepare(velocity, dt, *given)
         excess = np.maximum(simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0)
         inside = projection._unknown.numpy() == FLUID
         projection._b.assign(projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt)
