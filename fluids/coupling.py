@@ -46,7 +46,7 @@ class BodyCoupling:
         body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
         body[bodies.numbers] = np.arange(len(bodies.bodies))
         cut, S = boundary.cut, kernels.Solids()
-        S.planes, S.bodies, S.spacing = grid.planes, len(bodies.bodies), grid.spacing
+        S.planes, S.bodies, S.spacing, S.origin = grid.planes, len(bodies.bodies), grid.spacing, wp.vec3i(*grid.origin)
         S.moving = cut.moving
         S.open_x, S.open_y, S.open_z = (*cut.open, *cut.open[:1])[:3]
         S.wall_x, S.wall_y, S.wall_z = (*cut.wall, *cut.wall[:1])[:3]

@@ -19,6 +19,7 @@ class Solids:
     planes: int
     bodies: int
     spacing: wp.float64
+    origin: wp.vec3i  # cells of a larger grid before the first one of this
     moving: Moving
     open_x: F32
     open_y: F32
@@ -109,7 +110,8 @@ def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _
                                 axis = n >> 1
                                 high = n & 1
                                 half = wp.float64(0.5)
-                                x = wp.vec3d(wp.float64(i) - half, wp.float64(j) - half, wp.float64(k) - half)
+                                o = S.origin
+                                x = wp.vec3d(wp.float64(i + o[0]) - half, wp.float64(j + o[1]) - half, wp.float64(k + o[2]) - half)
                                 x[axis] = x[axis] + wp.float64(high) - half
                                 r = x * S.spacing - S.center[least]
                                 if S.planes == 1:

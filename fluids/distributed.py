@@ -30,8 +30,8 @@ from warp_lcp.fluids.surface import FreeSurface, WholeCellSurface
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.particle_assembly import placed_solids, seed_materials, start_velocities
-from warp_lcp.material.particle_simulation import Row
+from warp_lcp.material.particle_assembly import Parts, placed_solids, seed_materials, start_velocities
+from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_state import signature
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import SimulationFailed, StepFailed
@@ -80,6 +80,7 @@ class DistributedLiquid(LiquidSimulation):
         notes: facts for the start of a run.
     """
 
+    shared = True
     particles: SharedParticles
     projection: DistributedPressure
 
@@ -90,7 +91,7 @@ class DistributedLiquid(LiquidSimulation):
         self.part = part
         self._dt = 0.0
         self._everyone = int(part.ranks.sum(particles.count))
-        super().__init__(scene, part.grid, boundary, particles, notes=notes)
+        super().__init__(scene, part.grid, Parts(boundary), particles, notes=notes)
 
     def _surface(self) -> FreeSurface:
         part = self.part

@@ -21,15 +21,19 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary, CutBoundary
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.particle_assembly import (
+    Parts,
     make_bodies,
     make_boundary,
+    make_coverage,
     make_narrow_band,
     make_outlets,
     make_particles,
     make_sources,
     placed_solids,
+    start_band,
 )
-from warp_lcp.material.particle_simulation import ParticleSimulation, Row
+from warp_lcp.material.particle_log import Row
+from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
@@ -97,10 +101,10 @@ class LiquidSimulation(ParticleSimulation):
 
     Args:
         scene: what to simulate.
-        grid: its grid.
-        boundary: its solids and the domain's walls.
+        grid: the one that it starts on.
+        parts: what of it belongs to that grid.
         particles: the liquid at the start.
-        parts: `sources`, `outlets`, `bodies`, `band` and `notes` as of `ParticleSimulation`.
+        more: as of `ParticleSimulation`.
 
     Attributes:
         surface: the free surface.
@@ -110,13 +114,17 @@ class LiquidSimulation(ParticleSimulation):
 
     scene: LiquidScene
 
-    def __init__(self, scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, particles: Particles, **parts: Any) -> None:
-        super().__init__(scene, grid, boundary, particles, **parts)
+    def __init__(self, scene: LiquidScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any) -> None:
+        super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
-        self.surface = self._surface()
-        self.projection = self._pressure()
         self.reach = max(self.layers, 2 * scene.pressure.smoothing)
         self.mark()
+
+    def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
+        """Allocate what belongs to a grid."""
+        super().lay(grid, parts)
+        self.surface = self._surface()
+        self.projection = self._pressure()
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
@@ -196,7 +204,7 @@ class LiquidSimulation(ParticleSimulation):
         }
         return [
             self.points(),
-            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, grid.whole or grid.counts),
+            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, grid.domain_counts),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -218,6 +226,8 @@ class LiquidSimulation(ParticleSimulation):
         """
         from warp_lcp.fluids.distributed_state import state_of  # what only such runs need
 
+        if self.grid.whole is not None and self._coverage is not None:
+            self.cover(self._coverage.domain)
         self.restore(state_of(pieces, self.state()))
 
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
@@ -264,7 +274,7 @@ class LiquidSimulation(ParticleSimulation):
         """
         cells = self.projection.not_finite() if result.status is wl.SolveStatus.NON_FINITE else np.zeros((0, 3))
         if len(cells):
-            where = tuple(int(c) for c in cells[0])
+            where = tuple(int(c) + before for c, before in zip(cells[0], self.grid.origin, strict=True))
             raise SimulationFailed(
                 f"step {self.step_count}: the velocity on the faces of cell (x, y, z) = {where} is not finite ({len(cells)} cells)"
             )
@@ -299,15 +309,22 @@ class FluidsSimulator:
         """
         if not isinstance(scene, LiquidScene):
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
-        grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
         solids = placed_solids(scene, folder)
         bodies = make_bodies(scene, solids)
-        boundary, warnings = make_boundary(scene, grid, folder, wall_velocity, solids=solids)
-        band, without = make_narrow_band(scene, grid, boundary, folder)
-        particles, notes = make_particles(scene, grid, boundary, folder, without)
-        sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
-        notes = [*warnings, *notes]
-        return LiquidSimulation(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, band=band, notes=notes)
+        warnings: list[str] = []
+
+        def make_parts(grid: StaggeredGrid) -> Parts:
+            boundary, warnings[:] = make_boundary(scene, grid, folder, wall_velocity, solids=solids)
+            return Parts(boundary, make_sources(scene, grid, boundary, folder), make_narrow_band(scene, grid, boundary, folder))
+
+        coverage, grid = make_coverage(scene, device)
+        parts = make_parts(grid)
+        without = start_band(scene, grid, parts.boundary, folder, parts.band)
+        particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
+        return LiquidSimulation(
+            scene, grid, parts, particles, outlets=make_outlets(scene, grid, folder), bodies=bodies, coverage=coverage, make_parts=make_parts,
+            notes=[*warnings, *notes],
+        )  # fmt: skip
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
         """Build a rank's part of a simulation of `scene`, see `fluids.distributed.create`."""

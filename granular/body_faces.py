@@ -139,7 +139,7 @@ def _faces(grid: StaggeredGrid, index: np.ndarray, axis: int, numbers: np.ndarra
 def _face_rows(grid: StaggeredGrid, flat: np.ndarray, axis: int, centers: np.ndarray) -> np.ndarray:
     """Return J of faces of one axis."""
     k, j, i = np.unravel_index(flat, grid.shape)
-    place = np.stack([i, j, k], axis=1) - 0.5
+    place = np.stack([i, j, k], axis=1) + np.array(grid.origin) - 0.5
     place[:, axis] -= 0.5
     arm = place * grid.spacing - centers
     one = np.eye(3)[axis]

@@ -136,7 +136,7 @@ class MomentumWorkspace(StressWorkspace):
         self._least, self._still = method.least, 0.0
         if stress.cold:
             self._least, self._still = method.cold, STILL * tolerance
-            stress.calm(1.0 - SWING / max(stress.packing.grid.counts))
+            stress.calm(1.0 - SWING / max(stress.packing.grid.domain_counts))
         if self.norm <= NOTHING * tolerance:
             self._least = 0
         return self._least > 0

@@ -10,7 +10,7 @@ import warp as wp
 from warp_lcp.granular.report_kernels import REPORT_COLUMNS, contact_kernel, report_pass, take_kernel
 from warp_lcp.granular.stress import Stress
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
-from warp_lcp.material.particle_simulation import Row
+from warp_lcp.material.particle_log import Row
 
 
 class SandReport:

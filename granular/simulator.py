@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -21,13 +22,20 @@ from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.particle_assembly import make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
-from warp_lcp.material.particle_simulation import ParticleSimulation, Row
-from warp_lcp.material.sources import Outlets, Sources
+from warp_lcp.material.particle_assembly import (
+    Parts,
+    make_bodies,
+    make_boundary,
+    make_coverage,
+    make_outlets,
+    make_particles,
+    make_sources,
+    placed_solids,
+)
+from warp_lcp.material.particle_log import Row
+from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
-from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
@@ -47,14 +55,10 @@ class SandSimulation(ParticleSimulation):
 
     Args:
         scene: what to simulate.
-        grid: its grid.
-        boundary: where particles may go.
-        solids: what they press and rub against.
+        grid: the one that it starts on.
+        parts: what of it belongs to that grid; `solids`: what the sand presses and rubs against.
         particles: the sand at the start.
-        sources: where sand comes in.
-        outlets: where it leaves.
-        bodies: solids that it moves.
-        notes: facts for the start of a run.
+        more: as of `ParticleSimulation`.
 
     Attributes:
         packing: how densely the sand lies.
@@ -65,33 +69,31 @@ class SandSimulation(ParticleSimulation):
 
     scene: SandScene
 
-    def __init__(
-        self,
-        scene: SandScene,
-        grid: StaggeredGrid,
-        boundary: Boundary,
-        solids: SandSolids,
-        particles: Particles,
-        *,
-        sources: Sources | None = None,
-        outlets: Outlets | None = None,
-        bodies: RigidBodies | None = None,
-        notes: tuple[str, ...] = (),
-    ) -> None:
+    def __init__(self, scene: SandScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any) -> None:
         """Allocate the fields and find the sand's cells."""
-        super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, notes=notes)
-        self.solids, self.sides = solids, boundary.sides
-        self._join = None if self.sides is None else self.sides.wrap
         self.method = METHODS[scene.solver.method]()
-        self._base, self.density = grid.field(wp.int8), grid.field()
-        self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides, cut=solids.cut)
-        self.carried = None if bodies is None else SandBodies(grid, bodies.numbers)
-        box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
-        self.stress = Stress(self.packing, solids.walls, box=box, rate=rate, bodies=self.carried)
-        self.outcome = SandReport(self.stress)
         self._at_rest = scene.particles.per_axis**grid.dimension
+        super().__init__(scene, grid, parts, particles, **more)
         self._start = self._front()[0]
         self.mark()
+
+    def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
+        """Allocate what belongs to a grid."""
+        super().lay(grid, parts)
+        scene, boundary, self.solids, self.sides = self.scene, parts.boundary, parts.solids, parts.boundary.sides
+        self._join = None if self.sides is None else self.sides.wrap
+        self._base, self.density = grid.field(wp.int8), grid.field()
+        self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides, cut=self.solids.cut)
+        self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
+        box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
+        self.stress = Stress(self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried)
+        self.outcome = SandReport(self.stress)
+
+    def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
+        """Go on on another grid of the same domain, see the base class."""
+        super().cover(grid, state)
+        self._place_solids()
+        wp.copy(self._base, self.solids.base)
 
     def mark(self) -> None:
         """Find the sand's cells, as frames show them before the first step."""
@@ -189,7 +191,7 @@ class SandSimulation(ParticleSimulation):
         shown = {name: field[at] for name, field in fields.items()}
         return [
             points,
-            Cells("grid", cells[:, ::-1] - 1, grid.spacing, grid.dimension, shown, grid.counts),
+            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, shown, grid.domain_counts),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -387,15 +389,20 @@ class GranularSimulator:
         """
         if not isinstance(scene, SandScene):
             raise ValueError("scene.simulator: granular needs a scene of sand")
-        grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
         placed = placed_solids(scene, folder)
         bodies = make_bodies(scene, placed)
-        boundary, warnings = make_boundary(scene, grid, folder, solids=placed)
-        cuts = scene.solver.method == "accelerated-projection"
-        solids = SandSolids(grid, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source), cuts=cuts)
-        particles, notes = make_particles(scene, grid, boundary, folder)
-        sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
+        cuts, warnings = scene.solver.method == "accelerated-projection", []
+
+        def make_parts(grid: StaggeredGrid) -> Parts:
+            boundary, notes = make_boundary(scene, grid, folder, solids=placed)
+            solids = SandSolids(grid, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source), cuts=cuts)
+            warnings[:] = [*notes, *solids.notes]
+            return Parts(boundary, make_sources(scene, grid, boundary, folder), solids=solids)
+
+        coverage, grid = make_coverage(scene, device)
+        parts = make_parts(grid)
+        particles, notes = make_particles(scene, grid, parts.boundary, folder)
         return SandSimulation(
-            scene, grid, boundary, solids, particles, sources=sources, outlets=outlets, bodies=bodies,
-            notes=(*warnings, *solids.notes, *notes),
+            scene, grid, parts, particles, outlets=make_outlets(scene, grid, folder), bodies=bodies, coverage=coverage, make_parts=make_parts,
+            notes=(*warnings, *notes),
         )  # fmt: skip

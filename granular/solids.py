@@ -150,7 +150,7 @@ class SandSolids:
         if self.moves and isinstance(boundary, CutBoundary):
             cut = boundary.cut
             for axis, field in enumerate(self.velocity):
-                inputs = [axis, grid.planes, grid.spacing, self.index, cut.turn, cut.shift, field]
+                inputs = [axis, grid.planes, grid.spacing, wp.vec3i(*grid.origin), self.index, cut.turn, cut.shift, field]
                 grid.everywhere.launch(kernels.wall_velocity_kernel, inputs)
         else:
             for field in self.velocity:  # a source that has stopped has left its own

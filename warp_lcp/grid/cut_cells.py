@@ -166,7 +166,7 @@ class CutCells:
             if any(a > b for a, b in zip(first, last, strict=True)):
                 continue  # only the ring is near
             window = grid.window(first, last)
-            inputs = [self.moving, grid.planes, axis, grid.spacing, open_, wall, self.turn, self.shift, field]
+            inputs = [self.moving, grid.planes, axis, grid.spacing, wp.vec3i(*grid.origin), open_, wall, self.turn, self.shift, field]
             window.launch(kernels.velocity_kernel, inputs)
         self._moved_from = self._moved_to
 

@@ -137,13 +137,14 @@ def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open:
 
 @cell_kernel("warp_lcp.grid.cut_cells")
 def velocity_kernel(
-    k, j, i, S: Moving, planes: int, axis: int, spacing: float, open: F32, wall: I16, turn: _TURNS, shift: _SHIFTS, velocity: F32
-):
+    k, j, i, S: Moving, planes: int, axis: int, spacing: float, origin: wp.vec3i, open: F32, wall: I16, turn: _TURNS, shift: _SHIFTS,
+    velocity: F32,
+):  # fmt: skip
     """Fill the mean velocity of what is not open of each face [m/s], at its center turn x + shift of a solid that moves."""
     value = float(0.0)
     solid, part = moving_part(S, axis, planes, k, j, i, open, wall)
     if solid > 0:
-        x = wp.vec3(float(i) - 0.5, float(j) - 0.5, float(k) - 0.5) * spacing
+        x = wp.vec3(float(i + origin[0]) - 0.5, float(j + origin[1]) - 0.5, float(k + origin[2]) - 0.5) * spacing
         x[axis] = x[axis] - 0.5 * spacing
         if planes == 1:
             x[2] = 0.0

@@ -143,7 +143,8 @@ def _made(name: str, box: dict[str, Any], numbers: dict[str, Any], by_row: dict[
 
 
 COUNT = _made("count", {}, {}, {"owned": _I32, "made": _I32}, table=wp.int8)
-POINTS = _made("points", {"number": _I32}, {"dx": wp.float32}, _ROWS, into=wp.vec3)
+_PLACED = {"dx": wp.float32} | dict.fromkeys(("before_x", "before_y", "before_z", "most_x", "most_y", "most_z"), int)
+POINTS = _made("points", {"number": _I32}, _PLACED, _ROWS, into=wp.vec3)
 CORNERS = _made("corners", {"number": _I32}, {}, _ROWS, table=wp.int8, into=_I32)
 
 
@@ -195,6 +196,7 @@ class MarchingCubes:
         mesh = DeviceMesh(
             wp.empty(points, dtype=wp.vec3, device=device), wp.empty((corners, grid.dimension), dtype=wp.int32, device=device)
         )
-        run(POINTS, dx=grid.spacing, number=number, counts=counts[0], ends=ends[0], into=mesh.points)
+        placed = dict(zip(_PLACED, [grid.spacing, *grid.origin, *grid.domain_counts], strict=True))
+        run(POINTS, **placed, number=number, counts=counts[0], ends=ends[0], into=mesh.points)
         run(CORNERS, table=self._table, number=number, counts=counts[1], ends=ends[1], into=mesh.corners)
         return mesh

@@ -21,7 +21,7 @@ SEE_NEIGHBORS = cell_pass("warp_lcp.grid.mesh_smoothing.see_neighbors", "", {"co
 
 @wp.kernel(**_options)
 @typing.no_type_check
-def hold_kernel(planes: int, dx: float, points: POINTS, room: F32, counts: wp.vec3, held: _BYTES):
+def hold_kernel(planes: int, dx: float, origin: wp.vec3, points: POINTS, room: F32, counts: wp.vec3, held: _BYTES):
     """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids."""
     p = wp.tid()
     x = points[p] / dx
@@ -30,7 +30,7 @@ def hold_kernel(planes: int, dx: float, points: POINTS, room: F32, counts: wp.ve
         if x[axis] < TOUCHING or x[axis] > counts[axis] - TOUCHING:
             stays = True
     if room:
-        if interpolated(room, planes, x[0] + 0.5, x[1] + 0.5, x[2] + 0.5) < NEAR:
+        if interpolated(room, planes, x[0] + 0.5 - origin[0], x[1] + 0.5 - origin[1], x[2] + 0.5 - origin[2]) < NEAR:
             stays = True
     held[p] = wp.where(stays, wp.uint8(1), wp.uint8(0))
 
@@ -69,10 +69,11 @@ def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, roun
     if not count or not rounds:
         return
     held = wp.empty(count, dtype=wp.uint8, device=device)
-    wp.launch(hold_kernel, count, [lattice.planes, lattice.spacing, mesh.points, room, wp.vec3(*lattice.counts), held], device=device)
+    ends = [wp.vec3(*numbers) for numbers in (lattice.origin, lattice.domain_counts)]
+    wp.launch(hold_kernel, count, [lattice.planes, lattice.spacing, ends[0], mesh.points, room, ends[1], held], device=device)
     start, most = wp.clone(mesh.points), MOST * lattice.spacing
     sums = wp.empty((count, 4), dtype=wp.float32, device=device)  # of the neighbors' coordinates, and how many they are
-    size = wp.vec3(*(n * lattice.spacing for n in lattice.counts))
+    size = wp.vec3(*lattice.extent)
     rows = chunks(len(mesh.corners), device)
     for share in (FORTH, BACK) * rounds:
         sums.zero_()

@@ -80,7 +80,7 @@ class NodeSampler:
 
     def __init__(self, grid: StaggeredGrid) -> None:
         self.grid = grid
-        self.snap = max(SNAP * max(grid.whole or grid.counts), 1e-6)
+        self.snap = max(SNAP * max(grid.domain_counts), 1e-6)
         size = max(min(CHUNK, grid.size), max(grid.shape) * COARSE**2)  # a row of groups fits
         self._points = wp.empty(size, dtype=wp.vec3, device=grid.device)
         self._distances = wp.empty(size, dtype=wp.float32, device=grid.device)

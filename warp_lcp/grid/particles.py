@@ -178,6 +178,12 @@ class Particles:
             self._resize(left)
         return removed
 
+    def move_to(self, grid: StaggeredGrid) -> None:
+        """Order the particles by another grid's cells from the next sort on."""
+        self.grid = grid
+        if self.offsets is not None:
+            self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
+
     def assign(self, arrays: typing.Mapping[str, np.ndarray]) -> None:
         """Take other particles, as many as there are in the arrays.
 
@@ -271,7 +277,7 @@ class Particles:
         """Return the interior cell (x, y, z), counted from 0, of positions [m], shape (n, 3); in a part of a grid it may lie outside."""
         grid = self.grid
         cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / grid.spacing)
-        return np.clip(cells, 0, np.array(grid.whole or grid.counts) - 1).astype(int) - np.array(grid.origin)
+        return np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin)
 
     def arrays(self) -> dict[str, wp.array]:
         """Return the particles' arrays by name."""
@@ -283,27 +289,34 @@ def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:
         raise ValueError(f"position {position.shape} and velocity {velocity.shape}: must both be (n, 3)")
 
 
-def lattice(grid: StaggeredGrid, per_axis: int, jitter: float, rng: np.random.Generator, plane: int) -> np.ndarray:
-    """Return per_axis^dimension points a cell of one plane of cells, each moved at random.
+def lattice(grid: StaggeredGrid, per_axis: int, jitter: float, random_seed: int, plane: int) -> np.ndarray:
+    """Return per_axis^dimension points a cell of one plane of cells, each moved at random: in a part of a grid as in all of it.
 
     Args:
-        grid: the grid.
+        grid: the grid; of a part one cell more on each side, from which points may be moved into it.
         per_axis: points along an edge of a cell.
         jitter: width of the uniform random displacement, as a fraction of the points' spacing.
-        rng: source of the displacements.
+        random_seed: of the displacements, which are one sequence over all of the grid.
         plane: which cells along z, counted from 0; 0 in 2-D.
 
     Returns:
         Points [m], shape (n, 3), z = 0 in 2-D.
     """
-    nx, ny, _ = grid.counts
-    spacing = grid.spacing / per_axis
-    x = np.arange(nx * per_axis) + 0.5
-    y = np.arange(ny * per_axis) + 0.5
-    z = np.arange(plane * per_axis, (plane + 1) * per_axis) + 0.5 if grid.dimension == 3 else np.zeros(1)
-    Z, Y, X = np.meshgrid(z, y, x, indexing="ij")
+    dimension, spacing = grid.dimension, grid.spacing / per_axis
+    whole = np.array(grid.domain_counts[:2]) * per_axis
+    low = np.maximum(np.array(grid.origin[:2]) - 1, 0) * per_axis
+    high = np.minimum((np.array(grid.origin[:2]) + grid.counts[:2] + 1) * per_axis, whole)
+    x, y = (np.arange(first, last) for first, last in zip(low, high, strict=True))
+    z = np.arange(plane * per_axis, (plane + 1) * per_axis) if dimension == 3 else np.zeros(1, dtype=int)
+    moved = np.empty((len(z), len(y), len(x), dimension))
+    for number, layer in enumerate(z):
+        drawn = np.random.PCG64(random_seed)
+        drawn.advance(int((layer * whole[1] + low[1]) * whole[0]) * dimension)  # what the points before have drawn
+        rows = np.random.Generator(drawn).random((len(y), whole[0], dimension))
+        moved[number] = rows[:, low[0] : high[0]]
+    Z, Y, X = np.meshgrid(z + 0.5 if dimension == 3 else np.zeros(1), y + 0.5, x + 0.5, indexing="ij")
     points = np.stack([X.ravel(), Y.ravel(), Z.ravel()], axis=1)
-    points[:, : grid.dimension] += jitter * (rng.random((len(points), grid.dimension)) - 0.5)
+    points[:, :dimension] += jitter * (moved.reshape(-1, dimension) - 0.5)
     return points * spacing
 
 
@@ -316,8 +329,7 @@ def seed(
     Args:
         grid: the grid.
         regions: functions that tell for points [m], shape (n, 3), which lie in the region, shape (n,).
-        open_cells: which cells may hold particles, shape (nz, ny, nx). A part of a grid is given what all of it would be given there, at
-            the cost of a plane of all of it at a time.
+        open_cells: which cells may hold particles, shape (nz, ny, nx). A part of a grid is given what all of it would be given there.
         per_axis: points along an edge of a cell, >= 1.
         jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter <= 1.
         random_seed: of the displacements; they do not depend on the regions.
@@ -332,15 +344,11 @@ def seed(
         raise ValueError(f"per_axis = {per_axis}: must be at least 1")
     if not 0.0 <= jitter <= 1.0:
         raise ValueError(f"jitter = {jitter}: must be between 0 and 1")
-    rng = np.random.default_rng(random_seed)
     axes, margin = slice(grid.dimension), MARGIN * grid.spacing
-    whole = StaggeredGrid(grid.whole or grid.counts, grid.spacing, grid.dimension, grid.device)
-    size, last = whole.extent, np.array(whole.counts) - 1
+    size, last = grid.extent, np.array(grid.domain_counts) - 1
     positions, owners = [], []
-    for plane in range(grid.origin[2] + grid.counts[2]):
-        points = lattice(whole, per_axis, jitter, rng, plane).astype(np.float32)
-        if plane < grid.origin[2]:
-            continue
+    for plane in range(grid.origin[2], grid.origin[2] + grid.counts[2]):
+        points = lattice(grid, per_axis, jitter, random_seed, plane).astype(np.float32)
         np.clip(points[:, axes], margin, size[axes] - margin, out=points[:, axes])
         cells = np.minimum((points.astype(np.float64) / grid.spacing).astype(int), last) - np.array(grid.origin)
         if grid.whole is not None:

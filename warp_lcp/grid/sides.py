@@ -35,6 +35,15 @@ def side_bits(names: Iterable[str]) -> int:
     return bits
 
 
+def open_sides_of(grid: StaggeredGrid, bits: int) -> int:
+    """Return the sides of a grid that nothing closes: open ones of the domain, and those at which a part of it ends inside."""
+    for axis in range(grid.dimension):
+        low, count = grid.origin[axis], grid.counts[axis]
+        for number, inside in ((2 * axis, low > 0), (2 * axis + 1, low + count < grid.domain_counts[axis])):
+            bits |= inside << number
+    return bits
+
+
 def open_ring(shape: tuple[int, int, int], bits: int) -> np.ndarray:
     """Return which cells of the ring lie beyond open sides only, bool in the stored shape; a corner beyond a wall as well does not.
 
@@ -103,7 +112,7 @@ def mark_gone(grid: StaggeredGrid, bits: int, position: wp.array, marks: wp.arra
         position: [m], shape (n,).
         marks: int32, shape (n,) (written): 1 for those that have left, else 0.
     """
-    high = [(count - GONE) * grid.spacing for count in grid.counts]
+    high = [(count - GONE) * grid.spacing for count in grid.domain_counts]
     inputs = [bits, grid.dimension, GONE * grid.spacing, wp.vec3(*high), position, marks]
     wp.launch(gone_kernel, len(position), inputs, device=grid.device)
 
@@ -177,7 +186,7 @@ class PeriodicSides:
         """Bring particles [m] that have gone out at a side in at the other; floor and ceiling stay what they are."""
         grid = self.grid
         endless = wp.vec3i(*(int(axis in self.axes) for axis in range(3)))
-        size = wp.vec3(*(count * grid.spacing for count in grid.counts))
+        size = wp.vec3(*(count * grid.spacing for count in grid.domain_counts))
         inputs = [endless, grid.dimension, size, grid.spacing, position]
         wp.launch(carry_kernel, len(position), inputs, device=grid.device)
 

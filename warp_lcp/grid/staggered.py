@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.layout import grain
 from warp_lcp.rows.program import Launch, launch_ranges
 
@@ -200,9 +201,14 @@ class StaggeredGrid:
         return int(np.prod(self.shape))
 
     @property
+    def domain_counts(self) -> tuple[int, int, int]:
+        """Cells of the domain (nx, ny, nz): the larger grid's if this is a part of one."""
+        return self.whole or self.counts
+
+    @property
     def extent(self) -> np.ndarray:
-        """Sides of the domain [m], the larger grid's if this is a part of one, shape (3,)."""
-        return np.array(self.whole or self.counts) * self.spacing
+        """Sides of the domain [m], shape (3,)."""
+        return np.array(self.domain_counts) * self.spacing
 
     @property
     def planes(self) -> int:
@@ -214,9 +220,23 @@ class StaggeredGrid:
         """Volume of a cell [m^3]; in 2-D the area [m^2], the volume per meter of depth."""
         return self.spacing**self.dimension
 
+    def covers(self, low: typing.Sequence[int], high: typing.Sequence[int]) -> bool:
+        """Return whether all cells from low to high (x, y, z, of the domain, counted from 0, both included) are among this grid's."""
+        begin, end = np.array(self.origin), np.array(self.origin) + self.counts
+        return bool((begin <= low).all() and (np.asarray(high) < end).all())
+
+    def refined(self, parts: int) -> "StaggeredGrid":
+        """Return the grid of the same cells cut into so many along each axis; in 2-D not along z."""
+        counts, origin, whole = (
+            None if n is None else (n[0] * parts, n[1] * parts, n[2] * (parts if self.dimension == 3 else 1))
+            for n in (self.counts, self.origin, self.whole)
+        )
+        assert counts is not None and origin is not None
+        return StaggeredGrid(counts, self.spacing / parts, self.dimension, self.device, origin, whole)
+
     def field(self, dtype: typing.Any = wp.float32) -> wp.array:
         """Return a field of zeros, one value a stored cell."""
-        return wp.zeros(self.shape, dtype=dtype, device=self.device)
+        return zeros(self.size, dtype, self.device).reshape(self.shape)
 
     def faces(self, dtype: typing.Any = wp.float32) -> list[wp.array]:
         """Return a field of zeros for each component: [u, v] in 2-D, [u, v, w] in 3-D."""

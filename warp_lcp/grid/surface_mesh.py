@@ -84,10 +84,8 @@ class SurfaceMesh:
             raise ValueError(f"per_axis = {per_axis}, resolution = {resolution}: must be at least 1")
         if not (math.isfinite(smoothing) and smoothing >= SHARPEST):
             raise ValueError(f"smoothing = {smoothing}: must be at least {SHARPEST} particle distances")
-        nx, ny, nz = grid.counts
-        counts = (nx * parts, ny * parts, nz * parts if grid.dimension == 3 else 1)
         self.grid, self.obstacles, self._parts = grid, obstacles, parts
-        self.lattice = StaggeredGrid(counts, grid.spacing / parts, grid.dimension, grid.device)
+        self.lattice = grid.refined(parts)
         distance = parts / per_axis  # of particles at rest, in lattice cells
         self._each = distance**grid.dimension
         self._thin_passes, self._passes = (max(0, round(2.0 * ((sigma * distance) ** 2 - 0.25))) for sigma in (SHARPEST, smoothing))
@@ -197,7 +195,7 @@ def sample(grid: StaggeredGrid, fields: list[wp.array], points: wp.array) -> wp.
         points: [m], shape (m,), vectors.
     """
     sampled, within = (wp.zeros(len(points), dtype=wp.vec3, device=grid.device) for _ in range(2))
-    size = wp.vec3(*((n - MARGIN) * grid.spacing for n in grid.counts))  # as near to the far sides as particles may come
+    size = wp.vec3(*((n - MARGIN) * grid.spacing for n in grid.domain_counts))  # as near to the far sides as particles may come
     wp.launch(kernels.clamp_kernel, len(points), [points, size, within], device=grid.device)
     faces_to_particles(grid, fields, within, sampled, [])
     return sampled

@@ -192,7 +192,7 @@ def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[
             f"{name} spans z = [{low[2]:.4g}, {high[2]:.4g}] m and misses the plane z = 0, which is a 2-D scene's; check its translation"
         )
     low, high = low[:dimension], high[:dimension]
-    size = spacing * np.array((grid.whole or grid.counts)[:dimension])
+    size = spacing * np.array(grid.domain_counts[:dimension])
     if (high <= 0.0).any() or (low >= size).any():
         spans = " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True))
         domain = " x ".join(f"[0, {extent:.4g}]" for extent in size)

@@ -119,7 +119,7 @@ class WholeCells:
             sides.wrap(self.capacity)
         if wall_velocity is not None:
             shift = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
-            walls = [grid.planes, grid.spacing, solids.index, wp.zeros(len(shift), dtype=wp.mat33, device=grid.device), shift]
+            walls = [grid.planes, grid.spacing, wp.vec3i(*grid.origin), solids.index, wp.zeros(len(shift), dtype=wp.mat33, device=grid.device), shift]
             for axis, field in enumerate(self.velocity):
                 grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, *walls, field])
         self._room = clearance(grid, self.base)
@@ -198,7 +198,7 @@ class CutBoundary:
 
     def top_speed(self, time: float, span: float) -> float:
         """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
-        size = np.array(self.grid.counts) * self.grid.spacing
+        size = self.grid.extent
         size[self.grid.dimension :] = 0.0
         return max((top_speed(motion, bounds, size, time, span) for motion, bounds in self._moving), default=0.0)
 
@@ -262,7 +262,7 @@ class CutBoundary:
         ]
         between = planes[0] if self.grid.dimension == 2 else (1 - z) * planes[0] + z * planes[1]
         axes = slice(self.grid.dimension)
-        side = np.minimum(coordinates - 1.0, np.array(self.grid.whole or self.grid.counts) + 1.0 - coordinates)[:, axes].min(axis=1)
+        side = np.minimum(coordinates - 1.0, np.array(self.grid.domain_counts) + 1.0 - coordinates)[:, axes].min(axis=1)
         return np.asarray(np.minimum(between, side) >= MARGIN)
 
     def _join_sides(self) -> None:

@@ -61,18 +61,18 @@ def touch_cut_kernel(k, j, i, axis: int, wall: I16, separating: wp.array(dtype=w
 
 @cell_kernel("warp_lcp.material.boundary")
 def wall_velocity_kernel(
-    k, j, i, axis: int, planes: int, spacing: float, index: I32, turn: wp.array(dtype=wp.mat33), shift: wp.array(dtype=wp.vec3), field: F32
+    k, j, i, axis: int, planes: int, spacing: float, origin: wp.vec3i, index: I32, turn: wp.array(dtype=wp.mat33), shift: wp.array(dtype=wp.vec3), field: F32
 ):
     """Velocity turn x + shift [m/s] of the wall on the faces of one component that it closes, 0 elsewhere."""
     c, b, a = cell_below(axis, k, j, i)
     wall = wp.max(index[k, j, i], index[c, b, a])
     u = float(0.0)
     if wall >= 0:
-        x = (float(i) - wp.where(axis == 0, 1.0, 0.5)) * spacing
-        y = (float(j) - wp.where(axis == 1, 1.0, 0.5)) * spacing
+        x = (float(i + origin[0]) - wp.where(axis == 0, 1.0, 0.5)) * spacing
+        y = (float(j + origin[1]) - wp.where(axis == 1, 1.0, 0.5)) * spacing
         z = float(0.0)
         if planes == 2:
-            z = (float(k) - wp.where(axis == 2, 1.0, 0.5)) * spacing
+            z = (float(k + origin[2]) - wp.where(axis == 2, 1.0, 0.5)) * spacing
         v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
         u = v[axis]
     field[k, j, i] = u

@@ -51,6 +51,7 @@ class Flights:
         self._flight = kernels.Flight()
         self._flight.straight = not coheres
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
+        self._flight.origin = wp.vec3i(*grid.origin)
         self._before: Sums = np.zeros((0, kernels.COLUMNS))
 
     def begin(
@@ -128,7 +129,7 @@ class Flights:
         flight.gradient_u, flight.gradient_v, flight.gradient_w = [*particles.affine, None, None, None][:3]
         flight.sums = wp.zeros(self._before.shape, dtype=wp.int64, device=self.grid.device)
         # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
-        flight.quanta = 2.0 ** math.floor(60.0 - math.log2(particles.count * max(self.grid.counts) ** 2))
+        flight.quanta = 2.0 ** math.floor(60.0 - math.log2(particles.count * max(self.grid.domain_counts) ** 2))
 
     def _sums(self) -> Sums:
         """Return the sums of the last launch."""

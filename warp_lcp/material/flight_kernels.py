@@ -37,6 +37,7 @@ class Flight:
     planes: int
     straight: int  # whether particles go straight on
     inverse_dx: float  # [1/m]
+    origin: wp.vec3i  # cells of a larger grid before the first one of this
     rate: float  # cells a step in one m/s
     quanta: wp.float64  # of the sums, in one cell or cell a step or product of two of them
     velocity: Vectors  # [m/s]
@@ -120,11 +121,11 @@ def lift_kernel(flight: Flight, position: Vectors, start: Vectors):
 
 
 @wp.func
-def velocity_at(u: Field, v: Field, w: Field, planes: int, x: wp.vec3):
+def velocity_at(u: Field, v: Field, w: Field, planes: int, origin: wp.vec3i, x: wp.vec3):
     """Return the velocity of the faces at x [cells]."""
-    a = x[0] + 1.0
-    b = x[1] + 1.0
-    c = x[2] + 1.0
+    a = x[0] + 1.0 - float(origin[0])
+    b = x[1] + 1.0 - float(origin[1])
+    c = x[2] + 1.0 - float(origin[2])
     at = wp.vec3(interpolated(u, planes, a, b - 0.5, c - 0.5), interpolated(v, planes, a - 0.5, b, c - 0.5), 0.0)
     if planes == 2:
         at[2] = interpolated(w, planes, a - 0.5, b - 0.5, c)
@@ -142,13 +143,13 @@ def turned(angle: wp.vec3, a: wp.vec3):
 
 
 @wp.func
-def is_near(base: Kinds, touch: U8, planes: int, x: wp.vec3):
-    """Tell whether x [cells] is in a cell that a wall touches, or near the domain's end."""
-    i = int(wp.floor(x[0])) + 1
-    j = int(wp.floor(x[1])) + 1
+def is_near(base: Kinds, touch: U8, planes: int, origin: wp.vec3i, x: wp.vec3):
+    """Tell whether x [cells] is in a cell that a wall touches, or near the grid's end."""
+    i = int(wp.floor(x[0])) + 1 - origin[0]
+    j = int(wp.floor(x[1])) + 1 - origin[1]
     k = int(1)
     if planes == 2:
-        k = int(wp.floor(x[2])) + 1
+        k = int(wp.floor(x[2])) + 1 - origin[2]
     near = bool(True)
     if i > 0 and j > 0 and k > 0 and i + 1 < base.shape[2] and j + 1 < base.shape[1] and k + 1 < base.shape[0]:
         near = base[k, j, i] == _SOLID or (touch[k, j, i] & _TOUCHES) != wp.uint8(0)
@@ -170,9 +171,9 @@ def fly_kernel(
     x0 = start[i] * flight.inverse_dx
     mean = motion[b, 0]
     spin = motion[b, 1]
-    k1 = velocity_at(u, v, w, flight.planes, x0)
-    k2 = velocity_at(u, v, w, flight.planes, x0 + 0.5 * h * (k1 - mean))
-    k3 = velocity_at(u, v, w, flight.planes, x0 + 0.75 * h * (k2 - mean))
+    k1 = velocity_at(u, v, w, flight.planes, flight.origin, x0)
+    k2 = velocity_at(u, v, w, flight.planes, flight.origin, x0 + 0.5 * h * (k1 - mean))
+    k3 = velocity_at(u, v, w, flight.planes, flight.origin, x0 + 0.75 * h * (k2 - mean))
     way = h / 9.0 * (2.0 * k1 + 3.0 * k2 + 4.0 * k3)
     if flight.straight:
         way = h * k1
@@ -184,7 +185,7 @@ def fly_kernel(
     strides = wp.clamp(int(wp.ceil(longest)), 1, MOST_STRIDES)
     met = wp.uint8(0)
     for stride in range(strides):
-        if is_near(base, touch, flight.planes, x1 - (float(stride) / float(strides)) * way):
+        if is_near(base, touch, flight.planes, flight.origin, x1 - (float(stride) / float(strides)) * way):
             met = wp.uint8(1)
     x[i] = x1
     near[i] = met

@@ -93,6 +93,8 @@ class NarrowBand:
         self._steps = np.append(PLASTIC[grid.dimension] ** -np.arange(1.0, grid.dimension + 1), 0.0)[:3]
         self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
         self.held = self.fresh = 0
+        self._numbered = kernels.Numbered()
+        self._numbered.origin, self._numbered.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
         self._window = grid.everywhere
         self.interior = self._summed(grid.everywhere)
 
@@ -192,7 +194,7 @@ class NarrowBand:
             self.held += particles.remove(marks)
         self._total.zero_()
         shift = (self._steps * step) % 1.0
-        quota = [self.width, each, self._seeds, float(shift[0]), self.boundary.base, *depths, self._total.reshape(grid.shape)]
+        quota = [self._numbered, self.width, each, self._seeds, float(shift[0]), self.boundary.base, *depths, self._total.reshape(grid.shape)]
         window.launch(kernels.quota_kernel, quota)
         wp.utils.array_scan(self._total, self._total, inclusive=True)
         self.fresh = int(self._total[-1:].numpy()[0])
@@ -293,7 +295,7 @@ class NarrowBand:
         sites = kernels.Sites()
         sites.planes, sites.per_axis, sites.jitter, sites.seed = grid.planes, self.per_axis, self.jitter, self._seeds
         sites.shift, sites.dx = wp.vec3(*shift), grid.spacing
-        window.launch(kernels.seed_kernel, [sites, first, *grid.shape[1:], self._total, particles.position])
+        window.launch(kernels.seed_kernel, [sites, self._numbered, first, *grid.shape[1:], self._total, particles.position])
         if saved:
             tail = particles.position[first:], particles.velocity[first:]
             faces_to_particles(grid, list(saved), *tail, [])
@@ -310,7 +312,7 @@ class NarrowBand:
         if cells == 0:
             return ParticleTotals()
         center, lowest, highest = rows[:, 2:5].sum(axis=0) / cells, rows[:, 6:9].min(axis=0), rows[:, 9:12].max(axis=0)
-        places = (np.stack([center, lowest, highest]) - 0.5) * dx
+        places = (np.stack([center, lowest, highest]) + np.array(self.grid.origin) - 0.5) * dx
         places[:, self.grid.dimension :] = 0.0
         squares, fastest = float(rows[:, 1].sum()) / cells, float(rows[:, 5].max())
         return ParticleTotals(cells, squares, rows[:, 12:15].sum(axis=0) / cells, places[0], places[1], places[2], math.sqrt(fastest))

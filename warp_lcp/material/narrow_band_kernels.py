@@ -99,12 +99,28 @@ def renewed(now: float, before: float, width: float):
     return now <= width and (now > width - 1.0 or (now >= 0.0 and before > width - 1.0))
 
 
+@wp.struct
+class Numbered:
+    """How cells are numbered, the same in all parts of a grid."""
+
+    origin: wp.vec3i  # cells (x, y, z) of a larger grid before the first one of this
+    across: wp.vec2i  # stored cells of the larger grid along x and y
+
+
+@wp.func
+def number_of(where: Numbered, k: int, j: int, i: int):
+    """Return the number that a stored cell has in the larger grid."""
+    return ((k + where.origin[2]) * where.across[1] + j + where.origin[1]) * where.across[0] + i + where.origin[0]
+
+
 @cell_kernel("warp_lcp.material.narrow_band")
-def quota_kernel(k, j, i, width: float, particles: float, seed: int, shift: float, base: I8, depth: F32, before: F32, quota: I32):
+def quota_kernel(
+    k, j, i, where: Numbered, width: float, particles: float, seed: int, shift: float, base: I8, depth: F32, before: F32, quota: I32
+):
     """Find how many fresh particles each cell gets: so many on average, over the cells and, as `shift` goes on, over the steps."""
     count = int(0)
     if base[k, j, i] != _SOLID and renewed(depth[k, j, i], before[k, j, i], width):
-        cell = (k * depth.shape[1] + j) * depth.shape[2] + i
+        cell = number_of(where, k, j, i)
         count = int(particles + 0.9999 * wp.frac(wp.randf(wp.rand_init(seed, cell)) + shift))
     quota[k, j, i] = count
 
@@ -131,13 +147,14 @@ class Sites:
 
 
 @cell_kernel("warp_lcp.material.narrow_band")
-def seed_kernel(k, j, i, S: Sites, behind: int, ny: int, nx: int, total: INTS, position: POINTS):
+def seed_kernel(k, j, i, S: Sites, where: Numbered, behind: int, ny: int, nx: int, total: INTS, position: POINTS):
     """Put a cell's particles on their sites; `total` counts up to and with each cell."""
     planes, per_axis, seed, shift = S.planes, S.per_axis, S.seed, S.shift
     sites = per_axis * per_axis * wp.where(planes == 2, per_axis, 1)
-    cell = (k * ny + j) * nx + i
-    start = total[cell - 1]
-    count = total[cell] - start
+    here = (k * ny + j) * nx + i
+    start = total[here - 1]
+    count = total[here] - start
+    cell = number_of(where, k, j, i)
     if count > 0:
         own = wp.rand_init(seed, cell)
         way = shift + wp.vec3(wp.randf(own), wp.randf(own), wp.randf(own))
@@ -148,7 +165,8 @@ def seed_kernel(k, j, i, S: Sites, behind: int, ny: int, nx: int, total: INTS, p
             x = wp.vec3(float(site % per_axis), float((site // per_axis) % per_axis), float(site // (per_axis * per_axis)))
             x = (x + S.jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
             x = wp.vec3(wp.frac(x[0]), wp.frac(x[1]), wp.frac(x[2])) * (1.0 - 2.0 * INSET) + wp.vec3(INSET, INSET, INSET)
-            x = (x + wp.vec3(float(i - 1), float(j - 1), float(k - 1))) * S.dx
+            at = wp.vec3i(i - 1, j - 1, k - 1) + where.origin
+            x = (x + wp.vec3(float(at[0]), float(at[1]), float(at[2]))) * S.dx
             position[behind + start + n] = wp.vec3(x[0], x[1], wp.where(planes == 2, x[2], 0.0))
 
 

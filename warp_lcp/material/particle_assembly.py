@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -11,12 +13,13 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particles import Particles, seed
-from warp_lcp.grid.sides import PeriodicSides, periodic_sides, side_bits
+from warp_lcp.grid.sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.material.coverage import Coverage, cells_between
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_scene import ParticleScene
@@ -93,17 +96,46 @@ def make_boundary(
     """
     placed = placed_solids(scene, folder) if solids is None else solids
     around = PeriodicSides(grid, scene.endless) if scene.endless else None
-    separating, sides = scene.domain.wall == "separating", side_bits(scene.domain.open)
+    separating, sides, part = scene.domain.wall == "separating", open_sides_of(grid, side_bits(scene.domain.open)), grid.whole is not None
     if scene.domain.solids == "cut-cell":
         if wall_velocity is not None:
             raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')
-        cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides)
-        if not cut.whole_cells:
+        cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not part)
+        if not cut.whole_cells or (part and placed):  # solids may cut cells elsewhere
             return CutBoundary(grid, cut, sides=around), cut.notes
-    voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | side_bits(periodic_sides(scene.endless)))
+    ends = side_bits(periodic_sides(scene.endless))
+    voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not part)
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
     return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around), voxels.notes
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What of a simulation belongs to its grid, made anew for another one.
+
+    Attributes:
+        boundary: solids and the domain's walls.
+        sources: where material comes in.
+        band: where its particles are, if not everywhere.
+        solids: as the material's own solver sees them, if it does so in another way.
+    """
+
+    boundary: Boundary
+    sources: Sources | None = None
+    band: NarrowBand | None = None
+    solids: Any = None
+
+
+def make_coverage(scene: ParticleScene, device: str) -> tuple[Coverage, StaggeredGrid]:
+    """Return what lays a scene's grids, and the first one, around its materials at the start and its sources."""
+    whole = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
+    boxes = [shape.bounds(scene.dimension) for shape in (*scene.source, *scene.materials()[1])]
+    corners = [cells_between(*box, whole.spacing, grow=1) for box in boxes if box is not None]
+    follows = scene.domain.follow and bool(corners) and len(corners) == len(boxes)
+    coverage = Coverage(whole, follows, tuple(corners[: len(scene.source)]), scene.endless)
+    low, high = zip(*corners, strict=True) if follows else ([0], [0])
+    return coverage, coverage.around(np.min(low, axis=0), np.max(high, axis=0))
 
 
 def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:
@@ -216,24 +248,28 @@ def make_outlets(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> Out
     return Outlets(grid, drains, side_bits(scene.domain.open))
 
 
-def make_narrow_band(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path
-) -> tuple[NarrowBand | None, np.ndarray | None]:
-    """Return what carries the material deeper than a band, and its cells at the start, bool of shape (nz, ny, nx); None: nothing does."""
+def make_narrow_band(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> NarrowBand | None:
+    """Return what carries the material deeper than a band; None: nothing does."""
     settings, particles = scene.particles.narrow_band, scene.particles
     if settings is None:
-        return None, None
-    regions = [_region(material.to_geometry(folder, scene.dimension), boundary, grid.device) for material in scene.materials()[1]]
-    open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
-    position, number = seed(grid, regions, open_cells, per_axis=1, jitter=0.0, random_seed=0)
-    i, j, k = (position / grid.spacing).astype(int).T
-    owner = np.full(open_cells.shape, -1)
-    owner[k, j, i] = number
-    band = NarrowBand(
+        return None
+    return NarrowBand(
         grid, boundary, width=settings.width, per_axis=particles.per_axis, jitter=particles.jitter, random_seed=particles.seed,
         keep=_exchange_cells(scene, grid, folder),
     )  # fmt: skip
-    return band, band.start(owner, start_velocities(scene))
+
+
+def start_band(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, band: NarrowBand | None) -> np.ndarray | None:
+    """Put the material that particles need not carry into a band, and return its cells, bool of shape (nz, ny, nx); None: no band."""
+    if band is None:
+        return None
+    regions = [_region(material.to_geometry(folder, scene.dimension), boundary, grid.device) for material in scene.materials()[1]]
+    open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
+    position, number = seed(grid, regions, open_cells, per_axis=1, jitter=0.0, random_seed=0)
+    i, j, k = ((position / grid.spacing).astype(int) - np.array(grid.origin)).T
+    owner = np.full(open_cells.shape, -1)
+    owner[k, j, i] = number
+    return band.start(owner, start_velocities(scene))
 
 
 def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:
@@ -243,7 +279,7 @@ def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> 
         return None
     near = np.zeros(grid.shape, dtype=bool)
     K, J, I = np.meshgrid(*(np.arange(1, n + 1) for n in grid.counts[::-1]), indexing="ij")
-    centers = grid.to_world(np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + 0.5)
+    centers = grid.to_world(np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + np.array(grid.origin) + 0.5)
     if grid.dimension == 2:
         centers[:, 2] = 0.0
     points = wp.array(centers.astype(np.float32), dtype=wp.vec3, device=grid.device)
@@ -281,10 +317,17 @@ def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary:
     )  # fmt: skip
 
 
-def make_crowding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Crowding | None:
-    """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are."""
+def make_crowding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, shared: bool = False) -> Crowding | None:
+    """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        boundary: its solids.
+        shared: whether others have parts of it, which would have to agree.
+    """
     settings = scene.correction
-    if scene.density_correction is not None or settings is None or grid.whole is not None:
+    if scene.density_correction is not None or settings is None or shared:
         return None
     count = scene.particles.per_axis
     return Crowding(grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count))

@@ -35,6 +35,7 @@ class Rearrangement:
         scene: what asks for it.
         grid: its grid.
         boundary: its solids.
+        shared: whether others have parts of the grid.
 
     Attributes:
         reseeding: what evens out; None: the scene does not ask for it.
@@ -42,10 +43,10 @@ class Rearrangement:
         correction: what moves apart; None: it has not acted yet, or never does.
     """
 
-    def __init__(self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> None:
+    def __init__(self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, shared: bool = False) -> None:
         """Make what the scene asks for."""
-        self._scene, self._grid, self._boundary = scene, grid, boundary
-        self.reseeding, self.crowding = make_reseeding(scene, grid, boundary), make_crowding(scene, grid, boundary)
+        self._scene, self._grid, self._boundary, self._shared = scene, grid, boundary, shared
+        self.reseeding, self.crowding = make_reseeding(scene, grid, boundary), make_crowding(scene, grid, boundary, shared=shared)
         self.correction: DensityCorrection | None = None
         settings = scene.correction
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
@@ -128,7 +129,7 @@ class Rearrangement:
         """Return why nothing keeps the particles apart where the scene leaves that to the program."""
         if self._scene.density_correction is not None or self.crowding is not None:
             return []
-        where = "on a periodic axis" if self._scene.endless else "on several processes" if self._grid.whole is not None else ""
+        where = "on a periodic axis" if self._scene.endless else "on several processes" if self._shared else ""
         return [f"particles that crowd are not moved apart {where}: there is no density correction"] if where else []
 
     def state(self) -> dict[str, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import warp as wp
@@ -14,35 +14,18 @@ from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
-from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.flight import Flights
-from warp_lcp.material.narrow_band import NarrowBand, without_band
-from warp_lcp.material.particle_assembly import make_particle_volume, make_surface_mesh
+from warp_lcp.material.narrow_band import without_band
+from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, travel
+from warp_lcp.material.particle_assembly import Parts, make_particle_volume, make_surface_mesh
+from warp_lcp.material.particle_log import COLUMNS, Moved, Row, solve_row, totals_row
 from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
 from warp_lcp.material.resample import resampled, resampling_notes
-from warp_lcp.material.sources import Drain, Outlets, Source, Sources
+from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, Points, SimulationFailed, Stopwatch, Surface, Volume
-
-Row = dict[str, float | int | str | None]  # of the log
-
-COLUMNS = (
-    "particles",
-    "mass",
-    "kinetic_energy",
-    "potential_energy",
-    "center_of_mass_y",
-    "max_speed",
-    "cfl",
-    "solver",
-    "solve_status",
-    "solve_iterations",
-    "linear_iterations",
-    "solve_residual",
-)
-
 
 class ParticleSimulation(ABC):
     """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
@@ -58,18 +41,18 @@ class ParticleSimulation(ABC):
     Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
     of its solve, or calls `restore_bodies` if it fails.
 
-    With `boundary`, `particles`, `sources`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's clock, time
+    With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's clock, time
     step, checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
 
     Args:
         scene: what to simulate.
-        grid: its grid.
-        boundary: its solids and the domain's walls.
+        grid: the one that it starts on.
+        parts: what of it belongs to that grid: walls and solids, sources, a narrow band.
         particles: the material at the start.
-        sources: where material comes in.
         outlets: where it leaves.
-        bodies: solids of `boundary` that the material moves.
-        band: where its particles are, if not everywhere.
+        bodies: solids of the boundary that the material moves.
+        coverage: lays other grids when the material needs one; None: this one is kept.
+        make_parts: makes what belongs to another grid.
         notes: facts for the start of a run.
 
     Attributes:
@@ -88,40 +71,47 @@ class ParticleSimulation(ABC):
         watch: what the stages of a step are measured with.
     """
 
+    shared = False  # whether others have parts of the grid
+
     def __init__(
         self,
         scene: ParticleScene,
         grid: StaggeredGrid,
-        boundary: Boundary,
+        parts: Parts,
         particles: Particles,
         *,
-        sources: Sources | None = None,
         outlets: Outlets | None = None,
         bodies: RigidBodies | None = None,
-        band: NarrowBand | None = None,
+        coverage: Coverage | None = None,
+        make_parts: Callable[[StaggeredGrid], Parts] | None = None,
         notes: Sequence[str] = (),
     ) -> None:
         """Allocate the fields, fill the sources that run at the start and sort the particles."""
-        self.scene, self.grid, self.boundary, self.particles = scene, grid, boundary, particles
-        self.sources, self.outlets, self.bodies, self.band = sources, outlets, bodies, band
+        self.scene, self.particles, self.outlets, self.bodies = scene, particles, outlets, bodies
         self.time, self.step_count, self.last_dt, self.kick_dt = 0.0, 0, 0.0, 0.0
         self._velocity_before = np.zeros(3)  # mean of the particles at the start of the step [m/s]
         self.watch: Stopwatch = NoStopwatch()
-        self._faces_know = False  # the velocity of the particles, around them
-        self._notes = list(notes)
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
+        self.layers = self.reach = math.ceil(scene.time.cfl) + 2
+        self._coverage, self._make_parts = coverage, make_parts
+        self.lay(grid, parts)
+        self._notes = [*notes, *self.rearrangement.notes()]
+        if self.sources is not None:
+            self.sources.emit(particles, None, self.time)
+        particles.sort()
+
+    def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
+        """Allocate what belongs to a grid. Subclasses add theirs."""
+        scene, self.grid, self.boundary = self.scene, grid, parts.boundary
+        self.sources, self.band = parts.sources, parts.band
+        self._faces_know = False  # the velocity of the particles, around them
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
         self.flights = self._flights()
-        self.rearrangement = Rearrangement(scene, grid, boundary)
-        self._notes += self.rearrangement.notes()
-        self.surface_mesh = make_surface_mesh(scene, grid, boundary)
-        self.particle_volume = make_particle_volume(scene, grid, boundary)
-        self.layers = self.reach = math.ceil(scene.time.cfl) + 2
-        if sources is not None:
-            sources.emit(particles, None, self.time)
-        particles.sort()
+        self.rearrangement = Rearrangement(scene, grid, self.boundary, shared=self.shared)
+        self.surface_mesh = make_surface_mesh(scene, grid, self.boundary)
+        self.particle_volume = make_particle_volume(scene, grid, self.boundary)
 
     def _flights(self) -> Flights | None:
         s = self.scene
@@ -150,6 +140,34 @@ class ParticleSimulation(ABC):
     @abstractmethod
     def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from the arrays of `own_state`, whose shapes, types and values have been checked."""
+
+    def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
+        """Go on on another grid of the same domain.
+
+        Args:
+            grid: the other one.
+            state: what to go on from; None: as it is.
+        """
+        if self._make_parts is None:
+            raise ValueError("the state's grid covers another part of the domain than this one, which cannot change")
+        before, kept = self.grid, self._fields() if state is None else state
+        self.lay(grid, self._make_parts(grid))
+        self.particles.move_to(grid)
+        self.boundary.place(self.time)
+        if state is None:
+            self.rearrangement.expect(kept)
+            self._take_fields(carry_over(kept, before, grid, self._fields()))
+
+    def _follow(self, totals: ParticleTotals, dt: float) -> None:
+        """Lay another grid if the material leaves this one in a step, or has become much smaller."""
+        if self._coverage is None:
+            return
+        way = travel(totals.max_speed, float(np.linalg.norm(self.gravity)), dt, self.grid.spacing)
+        grow = self.reach + 3 + way  # `window`, a cell off the grid's end, where the step brings the material
+        grid = self._coverage.around(*cells_between(totals.low, totals.high, self.grid.spacing, grow), self.grid)
+        if grid is not self.grid:
+            with self.watch.stage("laying the grid", *self.velocity):
+                self.cover(grid)
 
     def stable_dt(self) -> float:
         """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material, and of solids and sources in the time to come."""
@@ -181,6 +199,7 @@ class ParticleSimulation(ABC):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
         totals = self.checked_totals("at the start of")
         self.kick_dt, self._velocity_before = 0.5 * (self.last_dt + dt), totals.velocity
+        self._follow(totals, dt)
         with self.watch.stage("sort", *self.particles.arrays().values()):
             self.particles.arrange(self.step_count)
         if self.bodies is not None:
@@ -309,15 +328,7 @@ class ParticleSimulation(ABC):
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
         """Return what the log says of a step's solve; nothing if there was none."""
-        if result is None:
-            return {}
-        return {
-            "solver": self.scene.solver.method,
-            "solve_status": result.status.name,
-            "solve_iterations": result.iterations,
-            "linear_iterations": result.linear_iterations,
-            "solve_residual": result.relative_residual,
-        }
+        return {} if result is None else {"solver": self.scene.solver.method} | solve_row(result)
 
     def logged(self, row: Row) -> Row:
         """Return the entries of a row that the log has columns for, in their order."""
@@ -378,14 +389,25 @@ class ParticleSimulation(ABC):
         surface = self.bodies.surfaces()
         return [Surface("bodies", surface.points, surface.corners, surface.fields)]
 
+    def _fields(self) -> dict[str, np.ndarray]:
+        """Return copies of what of the state lies on the grid, with the numbers that belong to it."""
+        band = self.band.state() if self.band is not None else {}
+        return self.own_state() | band | self.rearrangement.state()
+
+    def _take_fields(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from the arrays of `_fields`."""
+        self.restore_own({name: np.asarray(state[name]) for name in self.own_state()})
+        self.rearrangement.restore(state)
+        if self.band is not None:
+            self.band.restore(state)
+
     def state(self) -> dict[str, np.ndarray]:
-        """Return what `restore` needs to continue bit for bit on the CPU."""
+        """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too."""
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
         scene = {"signature": signature(self.scene, self.grid)}
         bodies = self.bodies.state() if self.bodies is not None else {}
-        band = self.band.state() if self.band is not None else {}
-        return clock | scene | particles | self.own_state() | band | self.rearrangement.state() | bodies
+        return clock | scene | particles | self._fields() | bodies | box_of(self.grid)
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -393,20 +415,35 @@ class ParticleSimulation(ABC):
         Raises:
             ValueError: the arrays do not belong to this scene.
         """
+        state = self._on_this_grid(state)
         self.rearrangement.expect(state)
         expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
         varies = bool(self.sources or self.outlets or self.band)
         check_state(state, expected, changing=[*self.particles.arrays()] if varies else [], solids_move=self.boundary.moves)
         self.particles.assign(state)
         self._faces_know = False
-        self.restore_own({name: np.asarray(state[name]) for name in self.own_state()})
-        self.rearrangement.restore(state)
-        if self.band is not None:
-            self.band.restore(state)
+        self._take_fields(state)
         self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
         if self.bodies is not None:
             self.bodies.restore(state)
         self.boundary.place(self.time)
+
+    def _on_this_grid(self, state: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """Lay the grid of a state if the scene allows that, else bring the state to this one's.
+
+        Raises:
+            ValueError: its box is not in this domain.
+        """
+        if self._coverage is None or not np.array_equal(state.get("signature", np.zeros(0)), signature(self.scene, self.grid)):
+            return state
+        grid = self._coverage.at(state.get("box"))
+        if np.array_equal(box_of(grid).get("box", 0), box_of(self.grid).get("box", 0)):
+            return state
+        if self._coverage.follows or grid.whole is None:
+            self.cover(grid, state)
+            return state
+        self.rearrangement.expect(state)
+        return {name: value for name, value in carry_over(state, grid, self.grid, self._fields()).items() if name != "box"}
 
     def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
         """Continue from the state of the same scene on another grid: with other particles, and without a solution to start from.
@@ -437,9 +474,9 @@ class ParticleSimulation(ABC):
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
-        nx, ny, nz = self.grid.counts
-        cells = f"{nx} x {ny}" + (f" x {nz}" if self.grid.dimension == 3 else "")
-        return [f"{self.particles.count} particles, {cells} cells of {self.grid.spacing:.4g} m", *self.scene.notes(), *self._notes]
+        cells, covered = (" x ".join(map(str, n[: self.grid.dimension])) for n in (self.grid.domain_counts, self.grid.counts))
+        part = f", of which the grid covers {covered} around the material" if self.grid.whole is not None else ""
+        return [f"{self.particles.count} particles, {cells} cells of {self.grid.spacing:.4g} m{part}", *self.scene.notes(), *self._notes]
 
     def checked_totals(self, when: str) -> ParticleTotals:
         """Return sums over the particles.
@@ -473,29 +510,11 @@ class ParticleSimulation(ABC):
         return {"emitted": emitted, "drained": drained, "departed": departed}
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
-        mass = totals.count * self.particle_mass
-        return {
-            "particles": self.particles.count,
-            "mass": mass,
-            "kinetic_energy": mass * self._kinetic_energy(totals, dt),
-            "potential_energy": -mass * float(self.gravity @ totals.center),
-            "center_of_mass_y": float(totals.center[1]),
-            "max_speed": totals.max_speed,
-            "cfl": totals.max_speed * dt / self.grid.spacing,
-            "interior_density": self.band.mean_density if self.band is not None else None,
-        }
-
-    def _kinetic_energy(self, totals: ParticleTotals, dt: float) -> float:
-        """Return the energy of motion at the end of a step over mass [m^2/s^2]; the particles' velocities are those of its middle.
-
-        For half a step more gravity works on what moves, V, and by what it has changed V in this one: nothing where solids bear it.
-        """
-        g = self.gravity
-        gained = float(g @ (totals.velocity - self._velocity_before)) / self.kick_dt
-        work = 0.5 * dt * float(g @ totals.velocity) + 0.125 * dt**2 * min(max(gained, 0.0), float(g @ g))
-        return max(0.5 * totals.mean_square_speed + work, 0.0)
+        moved = Moved(self.particle_mass, self.gravity, self._velocity_before, dt, self.kick_dt)
+        density = self.band.mean_density if self.band is not None else None
+        return totals_row(totals, moved, self.particles.count, self.grid.spacing) | {"interior_density": density}
 
     def _admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m], shape (n, 3), a particle may be at."""
-        i, j, k = self.particles.cells_of(points).T + 1
+        i, j, k = np.clip(self.particles.cells_of(points), -1, self.grid.counts).T + 1
         return (self.boundary.base.numpy()[k, j, i] != wl.SOLID) & self.boundary.admits(points)

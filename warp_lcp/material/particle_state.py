@@ -16,7 +16,7 @@ def signature(scene: ParticleScene, grid: StaggeredGrid) -> np.ndarray:
     """Return numbers that tell a scene's arrays from another's, shape (7,): cells along x, y and z, of the whole domain, and others."""
     settings = scene.particles
     transfer = ("apic", "flip", "pic").index(settings.transfer)
-    counts = grid.whole or grid.counts
+    counts = grid.domain_counts
     return np.array([*counts, grid.dimension, grid.spacing, settings.per_axis, transfer], dtype=np.float64)
 
 

@@ -52,7 +52,7 @@ def resampled(
         offset[:, :dimension] = ((shift[parent] + number[:, None] * steps) % 1.0 - 0.5) * (spacing / per_axis)
     else:
         parent = np.minimum((np.arange(count) + rng.random(count)) / share, len(position) - 1).astype(np.int64)
-    size = np.array(grid.counts)[:dimension] * grid.spacing
+    size = grid.extent[:dimension]
     margin = 1.1 * MARGIN * grid.spacing  # more than is asked for: float32 rounds
     placed = _placed(position[parent], offset, admits, margin, size - margin)
     moved = np.linalg.norm(placed - position[parent] - offset, axis=1) > grid.spacing * MARGIN

@@ -71,6 +71,7 @@ class Reseeding:
         window.launch(kernels.count_kernel, [offsets, self._count])
         b, s = self.boundary, kernels.ReseedingSetting()
         s.planes, s.seed, s.dx, s.inverse_dx = grid.planes, step, grid.spacing, 1.0 / grid.spacing
+        s.origin, s.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
         s.least, s.at_rest, s.most = self.least, self.particles_a_cell, self.most
         window.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
         takers = int(self._numbers.numpy()[0])

@@ -19,6 +19,8 @@ class ReseedingSetting:
     """How many particles a cell should hold, and what else is the same for all cells of a step."""
 
     planes: int
+    origin: wp.vec3i  # cells of a larger grid before the first one of this
+    across: wp.vec2i  # stored cells of the larger grid along x and y
     seed: int
     dx: float
     inverse_dx: float
@@ -57,17 +59,17 @@ def find_kernel(k, j, i, s: ReseedingSetting, count: I32, capacity: F32, base: I
 
 
 @wp.func
-def emptiest(planes: int, i: int, j: int, k: int, start: int, here: int, inverse_dx: float, position: wp.array(dtype=wp.vec3)):
-    """Return which of the 2^dimension parts of a cell held the fewest of its particles `start` ... `start + here` when they were sorted."""
+def emptiest(planes: int, cell: wp.vec3i, start: int, here: int, inverse_dx: float, position: wp.array(dtype=wp.vec3)):
+    """Return which of the 2^dimension parts of a cell (x, y, z) held the fewest of its particles `start` ... `start + here` when they were sorted."""
     part = int(0)
     fewest = int(1 << 30)
     for q in range(2 << planes):
         inside = int(0)
         for p in range(start, start + here):
             x = position[p] * inverse_dx + wp.vec3(1.0, 1.0, 1.0)
-            bits = wp.where(x[0] - float(i) >= 0.5, 1, 0) + wp.where(x[1] - float(j) >= 0.5, 2, 0)
+            bits = wp.where(x[0] - float(cell[0]) >= 0.5, 1, 0) + wp.where(x[1] - float(cell[1]) >= 0.5, 2, 0)
             if planes == 2:
-                bits += wp.where(x[2] - float(k) >= 0.5, 4, 0)
+                bits += wp.where(x[2] - float(cell[2]) >= 0.5, 4, 0)
             if bits == q:
                 inside += 1
         if inside < fewest:
@@ -96,14 +98,16 @@ def exchange_kernel(way: wp.vec3i, s: ReseedingSetting, takers: INTS, offsets: I
     start = offsets[cell]
     here = offsets[cell + 1] - start
     donor = offsets[cell + (dk * count.shape[1] + dj) * count.shape[2] + di]
-    first_part = emptiest(planes, i, j, k, start, here, s.inverse_dx, position)
+    place = wp.vec3i(i, j, k) + s.origin
+    own = (place[2] * s.across[1] + place[1]) * s.across[0] + place[0]  # the same number in all parts of a grid
+    first_part = emptiest(planes, place, start, here, s.inverse_dx, position)
     taken = int(0)
     while gives > at_rest and (has < least or (has < at_rest and gives > most)):
         part = (first_part + has - here) % (2 << planes)
-        state = wp.rand_init(s.seed, cell * 64 + has)
-        x = float(i - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
-        y = float(j - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
-        z = float(k - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        state = wp.rand_init(s.seed, own * 64 + has)
+        x = float(place[0] - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        y = float(place[1] - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        z = float(place[2] - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)
         position[donor + gives - 1] = wp.vec3(x * dx, y * dx, wp.where(planes == 2, z * dx, 0.0))
         gives -= 1
         has += 1

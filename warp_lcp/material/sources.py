@@ -133,7 +133,7 @@ class Sources:
         if not running:
             return 0
         self._counts.zero_()
-        numbers = [1.0 / self.grid.spacing, *self.grid.counts]
+        numbers = [1.0 / self.grid.spacing, wp.vec3i(*self.grid.counts), wp.vec3i(*self.grid.origin)]
         wp.launch(
             kernels.occupants_kernel,
             particles.count,
@@ -164,7 +164,7 @@ class Sources:
         lattice, jitter = np.repeat(lattice, new, axis=0), np.repeat(jitter, new, axis=0)
         points = self._at(number, lattice, jitter, now).astype(np.float32)
         dx, axes = self.grid.spacing, slice(self.grid.dimension)
-        size = np.array(self.grid.counts)[axes] * dx
+        size = self.grid.extent[axes]
         np.clip(points[:, axes], 1.1 * MARGIN * dx, size - 1.1 * MARGIN * dx, out=points[:, axes])
         return points[self.boundary.admits(points)] if len(points) else points
 
@@ -193,7 +193,7 @@ class Sources:
 
     def _slot(self, points: np.ndarray, number: int) -> np.ndarray:
         """Return the slot of the source's cell that each point lies in, 0 if it lies in none."""
-        cells = np.floor(points / self.grid.spacing).astype(np.int64) + 1
+        cells = np.floor(points / self.grid.spacing).astype(np.int64) + 1 - np.array(self.grid.origin)
         if self.grid.dimension == 2:
             cells[:, 2] = 1
         np.clip(cells, 0, np.array(self.grid.shape[::-1]) - 1, out=cells)
@@ -223,7 +223,8 @@ class Sources:
 
     def _box(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the low and the high corner [m] of cells (k, j, i)."""
-        return cells.min(axis=0)[::-1] * self.grid.spacing, (cells.max(axis=0)[::-1] + 1) * self.grid.spacing
+        low, high = (corner[::-1] + np.array(self.grid.origin) for corner in (cells.min(axis=0), cells.max(axis=0) + 1))
+        return low * self.grid.spacing, high * self.grid.spacing
 
     def _impose(self, velocity: Faces, *, supply: bool, walls: Faces, known: Faces) -> None:
         for axis, field in enumerate(velocity):
@@ -235,7 +236,7 @@ def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) 
     """Return the source that each open cell belongs to, -1 for none, shape (nz, ny, nx)."""
     nz, ny, nx = (n - 2 for n in grid.shape)
     K, J, I = np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij")
-    centers = (np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + 0.5) * grid.spacing
+    centers = (np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + np.array(grid.origin) + 0.5) * grid.spacing
     if grid.dimension == 2:
         centers[:, 2] = 0.0
     owner = np.full(len(centers), -1)

@@ -63,13 +63,13 @@ def occupy_kernel(k, j, i, slots: I32, sources: wp.array(dtype=wp.int32), runnin
 
 @wp.kernel(**options)
 def occupants_kernel(
-    inverse_dx: float, nx: int, ny: int, nz: int, slots: I32, position: wp.array(dtype=wp.vec3), counts: wp.array(dtype=wp.int32)
+    inverse_dx: float, n: wp.vec3i, origin: wp.vec3i, slots: I32, position: wp.array(dtype=wp.vec3), counts: wp.array(dtype=wp.int32)
 ):
     """Count the particles in each slot."""
     x = position[wp.tid()] * inverse_dx
     k = int(1)
-    if nz > 1:
-        k = cell_index(x[2] + 1.0, nz)
-    slot = slots[k, cell_index(x[1] + 1.0, ny), cell_index(x[0] + 1.0, nx)]
+    if slots.shape[0] > 3:
+        k = cell_index(x[2] + 1.0 - float(origin[2]), n[2])
+    slot = slots[k, cell_index(x[1] + 1.0 - float(origin[1]), n[1]), cell_index(x[0] + 1.0 - float(origin[0]), n[0])]
     if slot > 0:
         wp.atomic_add(counts, slot - 1, 1)

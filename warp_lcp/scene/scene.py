@@ -96,6 +96,9 @@ class Domain(Table):
     open: list[Literal[SIDES]] = Field(
         default_factory=list, description="sides without a wall, where material leaves; y is up, x to the right, z to the front"
     )
+    follow: bool = Field(
+        default=True, description="the grid covers what the material reaches where that is much less than the domain; false: all of it"
+    )
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
 
 

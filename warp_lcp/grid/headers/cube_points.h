@@ -3,7 +3,7 @@
 // and the ring, lies on the side too, just off the sides' common edges.
 #include "cube_cases.h"
 float* to = (float*)into; int next = ends[P.row] - counts[P.row];
-const int most[3] = {(int)given.phi.shape[2] - 2, (int)given.phi.shape[1] - 2, (int)given.phi.shape[0] - 2};
+const int most[3] = {most_x, most_y, most_z};  // cells of the domain, whose numbers nodes have
 auto place = [&](int axis, int c, float inset) {
     const int n = most[axis];
     if (n == 1 || (c > 1 && c < n)) return (float)c - 0.5f;
@@ -11,7 +11,7 @@ auto place = [&](int axis, int c, float inset) {
 };
 each([&](int i, int code) {
     const int here = code & 1;
-    const int cut[3] = {here ^ (code >> 1 & 1), here ^ (code >> 2 & 1), here ^ (code >> 4 & 1)}, at_node[3] = {i, j, k};
+    const int cut[3] = {here ^ (code >> 1 & 1), here ^ (code >> 2 & 1), here ^ (code >> 4 & 1)}, at_node[3] = {i + before_x, j + before_y, k + before_z};
     const long long step[3] = {1, s2, up}, node = i;
     number[node] = next;
     for (int axis = 0; axis < 3; ++axis) {

@@ -1,12 +1,10 @@
 // Put some particles that are inside walls, or too near, outside; count those it moved and those it could not.
-#include "grid_coordinate.h"
+#include "origin.h"
 typedef T Block[3][M];
 const T margin = (T)MARGIN;
 T* position = (T*)given.position.data;
-const int nx = given.distance.shape[2] - 2, ny = given.distance.shape[1] - 2, nz = given.distance.shape[0] - 2;
-const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0, back = 0;
-const int first_cell[3] = {1, 1, 1};
-const T lx = 1, ly = 1, lz = 1;
+#define SHAPE given.distance.shape
+#include "numbered_cells.h"
 Block at; T room[M]; int inside[M], list[M];
 #include "wall_distance.h"
 #include "project.h"
@@ -18,8 +16,8 @@ for (int start = first; start < last; start += M) {
     measure_all(at, room, n);
     const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
     SIMD for (int m = 0; m < n; ++m) {
-        const T x = at[0][m], y = at[1][m], z = planes == 2 ? at[2][m] : (T)1;
-        const int outside = (int)(x < 1) | (int)(y < 1) | (int)(z < 1) | (int)(x > ex) | (int)(y > ey) | (int)(z > ez);
+        const T x = at[0][m], y = at[1][m], z = planes == 2 ? at[2][m] : lz;
+        const int outside = (int)(x < lx) | (int)(y < ly) | (int)(z < lz) | (int)(x > ex) | (int)(y > ey) | (int)(z > ez);
         inside[m] = (outside & (int)(open_sides == 0)) | (int)(room[m] < margin);
     }
     int count = 0;

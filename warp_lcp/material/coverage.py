@@ -1,0 +1,138 @@
+"""The part of a domain that a simulation's grid covers: as large as its material, not as its box."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_lcp.grid.staggered import StaggeredGrid
+
+ALIGNED = 16  # cells, of which a part's ends are multiples: its coarse levels then have the cells that those of the domain have
+LEAST_CELLS = 1 << 18  # of a domain whose grid need not cover all of it: a smaller one costs less than laying grids
+SPARE = 8  # cells that a grid has to spare on each side when it is laid, an eighth of what it covers if that is more
+MOST = 0.5  # of the domain's cells that a part may have; else the grid covers all of it
+LOOSE = 3.0  # times the cells of a grid that would be laid now: one that has more is laid anew
+
+FAR = 1 << 30  # cells: beyond any domain
+
+Corner = Sequence[int] | np.ndarray  # cell (x, y, z), counted from 0
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Lay grids around a material.
+
+    A grid that still covers what it must stays, unless it has become `LOOSE`: where grids are laid is a function of the grid there was and
+    of what it must cover.
+
+    Args:
+        domain: the grid of the whole domain.
+        follows: whether a grid may cover a part of it.
+        always: cells that are covered whatever the material does, as low and high corners (both included), shape (n, 2, 3).
+        endless: axes without an end, along which all cells are covered.
+    """
+
+    domain: StaggeredGrid
+    follows: bool = True
+    always: tuple[tuple[Corner, Corner], ...] = ()
+    endless: Sequence[int] = ()
+
+    def around(self, low: Corner, high: Corner, now: StaggeredGrid | None = None) -> StaggeredGrid:
+        """Return a grid that covers a box of cells.
+
+        Args:
+            low: first cell (x, y, z) of the domain, counted from 0; what lies outside the domain does not count.
+            high: last cell.
+            now: the grid there is, which is returned if it will do.
+        """
+        if not self.follows or self.domain.size < LEAST_CELLS:
+            return self.domain
+        corners = np.array([(low, high), *self.always])
+        last = np.array(self.domain.counts) - 1
+        first, final = np.clip(corners[:, 0].min(axis=0), 0, last), np.clip(corners[:, 1].max(axis=0), 0, last)
+        laid = self._laid(first, final)
+        if now is not None and now.covers(first, final) and now.size <= LOOSE * laid.size:
+            return now
+        return laid
+
+    def at(self, box: np.ndarray | None) -> StaggeredGrid:
+        """Return the grid of a state's `box`, the domain's if it has none.
+
+        Raises:
+            ValueError: the box is none of the domain's.
+        """
+        if box is None:
+            return self.domain
+        low, high = np.asarray(box, dtype=np.int64)
+        if not ((low >= 0) & (low < high) & (high <= np.array(self.domain.counts))).all():
+            raise ValueError(f"the state's box from cell {low.tolist()} to {high.tolist()} is not in this scene's {self.domain.counts}")
+        return self._part(low, high)
+
+    def _laid(self, first: np.ndarray, final: np.ndarray) -> StaggeredGrid:
+        counts, spare = np.array(self.domain.counts), np.maximum(SPARE, (final - first + 1) // 8)
+        low = np.maximum((first - spare) // ALIGNED * ALIGNED, 0)
+        high = np.minimum(-(-(final + 1 + spare) // ALIGNED) * ALIGNED, counts)
+        for axis in self.endless:
+            low[axis], high[axis] = 0, counts[axis]
+        part = self._part(low, high)
+        return part if part.size <= MOST * self.domain.size else self.domain
+
+    def _part(self, low: np.ndarray, high: np.ndarray) -> StaggeredGrid:
+        domain = self.domain
+        if not low.any() and tuple(high) == domain.counts:
+            return domain
+        (x, y, z), (nx, ny, nz) = low.tolist(), (high - low).tolist()
+        return StaggeredGrid((nx, ny, nz), domain.spacing, domain.dimension, domain.device, origin=(x, y, z), whole=domain.counts)
+
+
+def box_of(grid: StaggeredGrid) -> dict[str, np.ndarray]:
+    """Return `box`, int64 (2, 3), the first cell of a part of a grid and the one behind its last; nothing of a whole one."""
+    low = np.array(grid.origin)
+    return {} if grid.whole is None else {"box": np.array([low, low + grid.counts])}
+
+
+def carry_over(
+    state: Mapping[str, np.ndarray], before: StaggeredGrid, now: StaggeredGrid, fresh: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Return a state of one grid for another: fields where both cover the domain, those of `fresh` elsewhere, all else as it is.
+
+    Args:
+        state: arrays; the fields' last three axes have the stored shape.
+        before: its grid.
+        now: the other one.
+        fresh: arrays of the other grid by the same names (updated).
+    """
+    out, places = dict(state), [_common(before, now), _common(now, before)]
+    for name, values in state.items():
+        if values.shape[-3:] == before.shape and name in fresh:
+            out[name] = fresh[name]
+            out[name][(..., *places[1])] = values[(..., *places[0])]
+    return out
+
+
+def _common(grid: StaggeredGrid, other: StaggeredGrid) -> list[slice]:
+    """Return where the stored cells lie in a grid's fields that both know: their rings too where that is the domain's."""
+    places = []
+    for axis in (2, 1, 0):
+        ends = []
+        for g in (grid, other):
+            low, high = g.origin[axis], g.origin[axis] + g.counts[axis]
+            ends.append((low + (low > 0), high + 1 + (high == g.domain_counts[axis])))
+        low, high = max(end[0] for end in ends), min(end[1] for end in ends)
+        places.append(slice(low - grid.origin[axis], max(high, low) - grid.origin[axis]))
+    return places
+
+
+def cells_between(low: np.ndarray, high: np.ndarray, spacing: float, grow: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first and the last cell of a box between two corners [m], with some more on each side."""
+    first, last = (np.clip(np.nan_to_num(np.floor(np.asarray(corner) / spacing)), -FAR, FAR) for corner in (low, high))
+    return first.astype(int) - grow, last.astype(int) + grow
+
+
+def travel(speed: float, acceleration: float, dt: float, spacing: float) -> int:
+    """Return how many cells something may move in a time step [s], given its speed [m/s] and an acceleration [m/s^2]."""
+    way = (speed + abs(acceleration) * dt) * dt / spacing
+    return math.ceil(min(way, 1e6)) if math.isfinite(way) else 0
