@@ -317,13 +317,12 @@ class FluidsSimulator:
             boundary, warnings[:] = make_boundary(scene, grid, folder, wall_velocity, solids=solids)
             return Parts(boundary, make_sources(scene, grid, boundary, folder), make_narrow_band(scene, grid, boundary, folder))
 
-        coverage, grid = make_coverage(scene, device)
-        parts = make_parts(grid)
+        coverage, grid, parts = make_coverage(scene, device, make_parts)
         without = start_band(scene, grid, parts.boundary, folder, parts.band)
         particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
+        outlets = make_outlets(scene, grid, folder)
         return LiquidSimulation(
-            scene, grid, parts, particles, outlets=make_outlets(scene, grid, folder), bodies=bodies, coverage=coverage, make_parts=make_parts,
-            notes=[*warnings, *notes],
+            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, notes=[*warnings, *notes]
         )  # fmt: skip
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:

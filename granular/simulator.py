@@ -391,7 +391,8 @@ class GranularSimulator:
             raise ValueError("scene.simulator: granular needs a scene of sand")
         placed = placed_solids(scene, folder)
         bodies = make_bodies(scene, placed)
-        cuts, warnings = scene.solver.method == "accelerated-projection", []
+        cuts = scene.solver.method == "accelerated-projection"
+        warnings: list[str] = []
 
         def make_parts(grid: StaggeredGrid) -> Parts:
             boundary, notes = make_boundary(scene, grid, folder, solids=placed)
@@ -399,10 +400,9 @@ class GranularSimulator:
             warnings[:] = [*notes, *solids.notes]
             return Parts(boundary, make_sources(scene, grid, boundary, folder), solids=solids)
 
-        coverage, grid = make_coverage(scene, device)
-        parts = make_parts(grid)
+        coverage, grid, parts = make_coverage(scene, device, make_parts)
         particles, notes = make_particles(scene, grid, parts.boundary, folder)
+        outlets = make_outlets(scene, grid, folder)
         return SandSimulation(
-            scene, grid, parts, particles, outlets=make_outlets(scene, grid, folder), bodies=bodies, coverage=coverage, make_parts=make_parts,
-            notes=(*warnings, *notes),
+            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, notes=(*warnings, *notes)
         )  # fmt: skip

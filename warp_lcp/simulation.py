@@ -119,14 +119,15 @@ class Surface:
 class Volume:
     """A frame of values at the centers of a 3-D grid's cells.
 
-    `values`: float32, shape (nz, ny, nx); `spacing` of the cells [m], the first of which has its low corner at the origin; `band`: of a
-    signed distance [m], < 0 inside, how far from the surface it is known; None: a density, >= 0.
+    `values`: float32, shape (nz, ny, nx); `spacing` of the cells [m]; `band`: of a signed distance [m], < 0 inside, how far from the
+    surface it is known; None: a density, >= 0; `origin`: how many cells (x, y, z) lie between the first one and the domain's low corner.
     """
 
     name: str
     values: np.ndarray
     spacing: float
     band: float | None = None
+    origin: tuple[int, int, int] = (0, 0, 0)
 
 
 Part = Points | Cells | Surface | Volume  # of a frame

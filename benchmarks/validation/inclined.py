@@ -24,6 +24,7 @@ from warp_lcp.benchmarks.validation.scenes import CORRECTED, GRAVITY, Row, box, 
 from warp_lcp.granular.materials import MATERIALS
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.granular.solids import SandSolids
+from warp_lcp.material.particle_assembly import Parts
 
 DEPTH, LENGTH = 0.32, 0.16  # [m]: of the layer, and of the domain
 RESOLUTIONS = (16, 32)  # cells of depth
@@ -277,7 +278,7 @@ def with_stairs(simulation: SandSimulation) -> SandSimulation:
     """Return a simulation of the same, not yet begun, whose solids are whole cells for the stresses."""
     scene, boundary = simulation.scene, simulation.boundary
     solids = SandSolids(simulation.grid, boundary.cut.solids, boundary, scene.wall_frictions())  # type: ignore[attr-defined]
-    return SandSimulation(scene, simulation.grid, boundary, solids, simulation.particles, outlets=simulation.outlets)
+    return SandSimulation(scene, simulation.grid, Parts(boundary, solids=solids), simulation.particles, outlets=simulation.outlets)
 
 
 OBLIQUE = Check(

@@ -21,6 +21,7 @@ from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.solids import Plane
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.material.particle_assembly import Parts
 from warp_lcp.operators.grid_poisson import SOLID
 
 DT, DX, G = 0.01, 0.1, 9.81
@@ -206,7 +207,7 @@ def whole(simulation: SandSimulation) -> SandSimulation:
     """Return it with solids that are whole cells for the stresses, as the control."""
     scene = simulation.scene
     solids = SandSolids(simulation.grid, simulation.boundary.cut.solids, simulation.boundary, scene.wall_frictions())
-    return SandSimulation(scene, simulation.grid, simulation.boundary, solids, simulation.particles)
+    return SandSimulation(scene, simulation.grid, Parts(simulation.boundary, solids=solids), simulation.particles)
 
 
 def acceleration(simulation: SandSimulation, down: np.ndarray) -> float:

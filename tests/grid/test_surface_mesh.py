@@ -21,8 +21,7 @@ SEED = 8812
 
 def fill(grid, inside, *, per_axis=2, jitter=0.25):
     """Return particles on a jittered lattice where `inside` says so of points [cells]."""
-    rng = np.random.default_rng(SEED)
-    planes = [lattice(grid, per_axis, jitter, rng, plane) / grid.spacing for plane in range(grid.counts[2])]
+    planes = [lattice(grid, per_axis, jitter, SEED, plane) / grid.spacing for plane in range(grid.counts[2])]
     x = np.concatenate([points[inside(points)] for points in planes])
     return x * grid.spacing
 

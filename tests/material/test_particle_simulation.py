@@ -11,9 +11,10 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.particle_assembly import make_boundary, make_outlets, make_particles, make_sources
+from warp_lcp.material.particle_assembly import Parts, make_boundary, make_outlets, make_particles, make_sources
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.material.particle_simulation import ParticleSimulation, Row
+from warp_lcp.material.particle_log import Row
+from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.shapes import BoxTable, MaterialProperties
 from warp_lcp.simulation import Profiled, Recorded, Resampled, SimulationFailed
 
@@ -82,7 +83,7 @@ def make(resolution: int = 16, **tables: Any) -> Dust:
     boundary, _ = make_boundary(scene, grid, Path())
     particles, notes = make_particles(scene, grid, boundary, Path())
     sources, outlets = make_sources(scene, grid, boundary, Path()), make_outlets(scene, grid, Path())
-    return Dust(scene, grid=grid, boundary=boundary, particles=particles, sources=sources, outlets=outlets, notes=notes)
+    return Dust(scene, grid=grid, parts=Parts(boundary, sources), particles=particles, outlets=outlets, notes=notes)
 
 
 def test_it_falls_as_a_stone_does() -> None:

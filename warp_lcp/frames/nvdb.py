@@ -183,15 +183,16 @@ def _box(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _describe(grid: np.ndarray, root: np.ndarray, volume: Volume, size: int) -> None:
     """Write what the grid is, and where."""
     spacing = float(volume.spacing)
+    low = (np.array(volume.origin) + 0.5) * spacing  # of the first cell's center
     grid["magic"], grid["checksum"], grid["version"], grid["flags"] = b"NanoVDB1", NO_CHECKSUM, VERSION, HAS_BOX | BREADTH_FIRST
     grid["count"], grid["bytes"], grid["blind_data"] = 1, size, size
     grid["name"], grid["type"], grid["class"] = volume.name.encode(), FLOAT, FOG_VOLUME if volume.band is None else LEVEL_SET
     grid["float_map"] = grid["map"] = spacing * np.eye(3).ravel()
     grid["float_inverse"] = grid["inverse"] = np.eye(3).ravel() / spacing
-    grid["float_origin"] = grid["origin"] = spacing / 2
+    grid["float_origin"] = grid["origin"] = low
     grid["float_taper"] = grid["taper"] = 1.0
     grid["voxel"] = spacing
-    grid["box"] = np.concatenate([root["low"], root["high"] + 1], axis=1) * spacing + spacing / 2
+    grid["box"] = np.concatenate([root["low"], root["high"] + 1], axis=1) * spacing + np.tile(low, 2)
 
 
 def _header(grid: np.ndarray, tree: np.ndarray, root: np.ndarray) -> bytes:

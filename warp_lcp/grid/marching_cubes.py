@@ -196,7 +196,7 @@ class MarchingCubes:
         mesh = DeviceMesh(
             wp.empty(points, dtype=wp.vec3, device=device), wp.empty((corners, grid.dimension), dtype=wp.int32, device=device)
         )
-        placed = dict(zip(_PLACED, [grid.spacing, *grid.origin, *grid.domain_counts], strict=True))
+        placed: dict[str, Any] = dict(zip(_PLACED, [grid.spacing, *grid.origin, *grid.domain_counts], strict=True))
         run(POINTS, **placed, number=number, counts=counts[0], ends=ends[0], into=mesh.points)
         run(CORNERS, table=self._table, number=number, counts=counts[1], ends=ends[1], into=mesh.corners)
         return mesh

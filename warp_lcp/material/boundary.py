@@ -119,7 +119,8 @@ class WholeCells:
             sides.wrap(self.capacity)
         if wall_velocity is not None:
             shift = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
-            walls = [grid.planes, grid.spacing, wp.vec3i(*grid.origin), solids.index, wp.zeros(len(shift), dtype=wp.mat33, device=grid.device), shift]
+            turn = wp.zeros(len(shift), dtype=wp.mat33, device=grid.device)
+            walls = [grid.planes, grid.spacing, wp.vec3i(*grid.origin), solids.index, turn, shift]
             for axis, field in enumerate(self.velocity):
                 grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, *walls, field])
         self._room = clearance(grid, self.base)

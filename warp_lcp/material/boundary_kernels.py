@@ -61,8 +61,9 @@ def touch_cut_kernel(k, j, i, axis: int, wall: I16, separating: wp.array(dtype=w
 
 @cell_kernel("warp_lcp.material.boundary")
 def wall_velocity_kernel(
-    k, j, i, axis: int, planes: int, spacing: float, origin: wp.vec3i, index: I32, turn: wp.array(dtype=wp.mat33), shift: wp.array(dtype=wp.vec3), field: F32
-):
+    k, j, i, axis: int, planes: int, spacing: float, origin: wp.vec3i, index: I32, turn: wp.array(dtype=wp.mat33),
+    shift: wp.array(dtype=wp.vec3), field: F32,
+):  # fmt: skip
     """Velocity turn x + shift [m/s] of the wall on the faces of one component that it closes, 0 elsewhere."""
     c, b, a = cell_below(axis, k, j, i)
     wall = wp.max(index[k, j, i], index[c, b, a])

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,12 +31,14 @@ class Coverage:
 
     Args:
         domain: the grid of the whole domain.
+        make_parts: makes what of a simulation belongs to a grid.
         follows: whether a grid may cover a part of it.
         always: cells that are covered whatever the material does, as low and high corners (both included), shape (n, 2, 3).
         endless: axes without an end, along which all cells are covered.
     """
 
     domain: StaggeredGrid
+    make_parts: Callable[[StaggeredGrid], Any]
     follows: bool = True
     always: tuple[tuple[Corner, Corner], ...] = ()
     endless: Sequence[int] = ()
@@ -105,25 +108,26 @@ def carry_over(
         now: the other one.
         fresh: arrays of the other grid by the same names (updated).
     """
-    out, places = dict(state), [_common(before, now), _common(now, before)]
+    out, old, new = dict(state), _common(before, now), _common(now, before)
     for name, values in state.items():
         if values.shape[-3:] == before.shape and name in fresh:
             out[name] = fresh[name]
-            out[name][(..., *places[1])] = values[(..., *places[0])]
+            out[name][..., *new] = values[..., *old]
     return out
 
 
-def _common(grid: StaggeredGrid, other: StaggeredGrid) -> list[slice]:
+def _common(grid: StaggeredGrid, other: StaggeredGrid) -> tuple[slice, slice, slice]:
     """Return where the stored cells lie in a grid's fields that both know: their rings too where that is the domain's."""
-    places = []
-    for axis in (2, 1, 0):
+
+    def along(axis: int) -> slice:
         ends = []
         for g in (grid, other):
             low, high = g.origin[axis], g.origin[axis] + g.counts[axis]
             ends.append((low + (low > 0), high + 1 + (high == g.domain_counts[axis])))
         low, high = max(end[0] for end in ends), min(end[1] for end in ends)
-        places.append(slice(low - grid.origin[axis], max(high, low) - grid.origin[axis]))
-    return places
+        return slice(low - grid.origin[axis], max(high, low) - grid.origin[axis])
+
+    return along(2), along(1), along(0)
 
 
 def cells_between(low: np.ndarray, high: np.ndarray, spacing: float, grow: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -194,7 +194,16 @@ class NarrowBand:
             self.held += particles.remove(marks)
         self._total.zero_()
         shift = (self._steps * step) % 1.0
-        quota = [self._numbered, self.width, each, self._seeds, float(shift[0]), self.boundary.base, *depths, self._total.reshape(grid.shape)]
+        quota = [
+            self._numbered,
+            self.width,
+            each,
+            self._seeds,
+            float(shift[0]),
+            self.boundary.base,
+            *depths,
+            self._total.reshape(grid.shape),
+        ]
         window.launch(kernels.quota_kernel, quota)
         wp.utils.array_scan(self._total, self._total, inclusive=True)
         self.fresh = int(self._total[-1:].numpy()[0])

@@ -127,15 +127,16 @@ class Parts:
     solids: Any = None
 
 
-def make_coverage(scene: ParticleScene, device: str) -> tuple[Coverage, StaggeredGrid]:
-    """Return what lays a scene's grids, and the first one, around its materials at the start and its sources."""
+def make_coverage(scene: ParticleScene, device: str, make_parts: Callable[[StaggeredGrid], Parts]) -> tuple[Coverage, StaggeredGrid, Parts]:
+    """Return what lays a scene's grids, and the first one, around its materials at the start and its sources, with what belongs to it."""
     whole = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
     boxes = [shape.bounds(scene.dimension) for shape in (*scene.source, *scene.materials()[1])]
-    corners = [cells_between(*box, whole.spacing, grow=1) for box in boxes if box is not None]
+    corners = [cells_between(box[0], box[1], whole.spacing, 1) for box in boxes if box is not None]
     follows = scene.domain.follow and bool(corners) and len(corners) == len(boxes)
-    coverage = Coverage(whole, follows, tuple(corners[: len(scene.source)]), scene.endless)
+    coverage = Coverage(whole, make_parts, follows, tuple(corners[: len(scene.source)]), scene.endless)
     low, high = zip(*corners, strict=True) if follows else ([0], [0])
-    return coverage, coverage.around(np.min(low, axis=0), np.max(high, axis=0))
+    grid = coverage.around(np.min(low, axis=0), np.max(high, axis=0))
+    return coverage, grid, make_parts(grid)
 
 
 def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:

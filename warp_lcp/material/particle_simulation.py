@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import warp as wp
@@ -14,11 +14,11 @@ from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
+from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, travel
 from warp_lcp.material.flight import Flights
 from warp_lcp.material.narrow_band import without_band
-from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, travel
 from warp_lcp.material.particle_assembly import Parts, make_particle_volume, make_surface_mesh
-from warp_lcp.material.particle_log import COLUMNS, Moved, Row, solve_row, totals_row
+from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
 from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
@@ -26,6 +26,7 @@ from warp_lcp.material.resample import resampled, resampling_notes
 from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, Points, SimulationFailed, Stopwatch, Surface, Volume
+
 
 class ParticleSimulation(ABC):
     """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
@@ -52,7 +53,6 @@ class ParticleSimulation(ABC):
         outlets: where it leaves.
         bodies: solids of the boundary that the material moves.
         coverage: lays other grids when the material needs one; None: this one is kept.
-        make_parts: makes what belongs to another grid.
         notes: facts for the start of a run.
 
     Attributes:
@@ -83,7 +83,6 @@ class ParticleSimulation(ABC):
         outlets: Outlets | None = None,
         bodies: RigidBodies | None = None,
         coverage: Coverage | None = None,
-        make_parts: Callable[[StaggeredGrid], Parts] | None = None,
         notes: Sequence[str] = (),
     ) -> None:
         """Allocate the fields, fill the sources that run at the start and sort the particles."""
@@ -94,7 +93,7 @@ class ParticleSimulation(ABC):
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
         self.layers = self.reach = math.ceil(scene.time.cfl) + 2
-        self._coverage, self._make_parts = coverage, make_parts
+        self._coverage = coverage
         self.lay(grid, parts)
         self._notes = [*notes, *self.rearrangement.notes()]
         if self.sources is not None:
@@ -148,10 +147,9 @@ class ParticleSimulation(ABC):
             grid: the other one.
             state: what to go on from; None: as it is.
         """
-        if self._make_parts is None:
-            raise ValueError("the state's grid covers another part of the domain than this one, which cannot change")
+        assert self._coverage is not None, "a grid that is kept covers what it must"
         before, kept = self.grid, self._fields() if state is None else state
-        self.lay(grid, self._make_parts(grid))
+        self.lay(grid, self._coverage.make_parts(grid))
         self.particles.move_to(grid)
         self.boundary.place(self.time)
         if state is None:
@@ -182,7 +180,7 @@ class ParticleSimulation(ABC):
     def events(self, until: float) -> list[float]:
         """Return the times [s] later than now, up to `until`, at which a source or drain starts or stops or a solid's velocity jumps."""
         timed: list[Source | Drain] = [*(self.sources.sources if self.sources else ()), *(self.outlets.drains if self.outlets else ())]
-        times = [*self.boundary.kinks, *(time for part in timed for time in (part.start, part.stop))]
+        times = (*self.boundary.kinks, *(time for part in timed for time in (part.start, part.stop)))
         return [time for time in times if self.time < time <= until]
 
     def begin_step(self, dt: float) -> ParticleTotals:
@@ -336,29 +334,15 @@ class ParticleSimulation(ABC):
         return {name: (row | bodies).get(name) for name in self.columns()}
 
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the log's columns.
-
-        SI units; in 2-D mass and energies are per meter of depth. Energies are the particles' own; potential_energy is 0 at the origin.
-        Velocities, in frames too, are those of the step's middle, which move things through it; kinetic_energy is that of its end.
-        With a narrow band mass, energies and center count the interior, particles does not; interior_density is that of the interior, in
-        units of that at rest, if the mass is to be what it was.
-        solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may then be
-        up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept along; stuck: those inside solids that found
-        no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1, or at the
-        start of a step that none was due in; density_status and density_iterations: of that correction, empty where none was due;
-        reseeded: particles that went to a neighboring cell; emitted, drained, departed: those that sources have added in the step, that
-        drains have swallowed, and that have left through open sides. Rigid bodies, numbered from 0 in the order of the scene's solids,
-        have body0_x, body0_y, body0_z [m], the center of mass; body0_vx, body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far it
-        has turned, and body0_spin [degrees/s]; 3-D: body0_wx, body0_wy, body0_wz [degrees/s], the angular velocity. contacts: points where
-        bodies touch walls or each other, or nearly do.
-        """
-        columns = (*COLUMNS, *self.own_columns(), "stopped")
-        columns = (*columns, "pushed", "stuck") if self.boundary.moves else columns
-        columns = (*columns, "interior_density") if self.band is not None else columns
-        columns = (*columns, *self.rearrangement.columns())
-        exchanged = {"emitted": self.scene.source, "drained": self.scene.drain, "departed": self.scene.domain.open}
-        columns = (*columns, *(name for name, used in exchanged.items() if used))
-        return (*columns, *self.bodies.columns()) if self.bodies is not None else columns
+        """Return the names of the log's columns, see `warp_lcp.material.particle_log.columns`."""
+        told = {
+            **{"stopped": True, "pushed": self.boundary.moves, "stuck": self.boundary.moves, "interior_density": self.band is not None},
+            **dict.fromkeys(self.rearrangement.columns(), True),
+            "emitted": bool(self.scene.source),
+            "drained": bool(self.scene.drain),
+            "departed": bool(self.scene.domain.open),
+        }
+        return columns(self.own_columns(), told, self.bodies.columns() if self.bodies is not None else ())
 
     def points(self) -> Points:
         """Return the particles as a frame shows them, with velocity and speed [m/s]."""
@@ -404,10 +388,9 @@ class ParticleSimulation(ABC):
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too."""
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
-        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
-        scene = {"signature": signature(self.scene, self.grid)}
+        clock = {name: np.array(getattr(self, name)) for name in ("time", "step_count", "last_dt")}
         bodies = self.bodies.state() if self.bodies is not None else {}
-        return clock | scene | particles | self._fields() | bodies | box_of(self.grid)
+        return clock | {"signature": signature(self.scene, self.grid)} | particles | self._fields() | bodies | box_of(self.grid)
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -434,16 +417,15 @@ class ParticleSimulation(ABC):
         Raises:
             ValueError: its box is not in this domain.
         """
-        if self._coverage is None or not np.array_equal(state.get("signature", np.zeros(0)), signature(self.scene, self.grid)):
+        if self._coverage is None or not np.array_equal(state.get("signature", ()), signature(self.scene, self.grid)):
             return state
         grid = self._coverage.at(state.get("box"))
-        if np.array_equal(box_of(grid).get("box", 0), box_of(self.grid).get("box", 0)):
-            return state
-        if self._coverage.follows or grid.whole is None:
+        if grid != self.grid and self._coverage.follows:
             self.cover(grid, state)
+        if grid == self.grid:
             return state
         self.rearrangement.expect(state)
-        return {name: value for name, value in carry_over(state, grid, self.grid, self._fields()).items() if name != "box"}
+        return carry_over(state, grid, self.grid, self._fields())
 
     def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
         """Continue from the state of the same scene on another grid: with other particles, and without a solution to start from.

@@ -40,4 +40,4 @@ class ParticleVolume:
         spacing, band = grid.spacing, level_set.limit * grid.spacing
         distance = grid.interior(level_set.phi.numpy()) * np.float32(spacing)
         density = grid.interior(level_set.density.numpy()).copy()
-        return [Volume("level_set", distance, spacing, band), Volume("density", density, spacing)]
+        return [Volume("level_set", distance, spacing, band, grid.origin), Volume("density", density, spacing, origin=grid.origin)]

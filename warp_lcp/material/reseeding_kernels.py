@@ -60,7 +60,7 @@ def find_kernel(k, j, i, s: ReseedingSetting, count: I32, capacity: F32, base: I
 
 @wp.func
 def emptiest(planes: int, cell: wp.vec3i, start: int, here: int, inverse_dx: float, position: wp.array(dtype=wp.vec3)):
-    """Return which of the 2^dimension parts of a cell (x, y, z) held the fewest of its particles `start` ... `start + here` when they were sorted."""
+    """Return which of the 2^dimension parts of a cell (x, y, z) held the fewest of its particles `start` ... `start + here` at the sort."""
     part = int(0)
     fewest = int(1 << 30)
     for q in range(2 << planes):
