@@ -136,6 +136,7 @@ class PressureProjection:
         self.kind, self.cells, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
         wp.copy(self.kind, boundary.base)
+        self.show()
         self._unknown = self.kind  # FLUID where there is an unknown
         self._b, self._start = (grid.field(wp.float64) for _ in range(2))
         self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None

@@ -20,11 +20,11 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary, CutBoundary
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.coverage import start_of
 from warp_lcp.material.particle_assembly import (
     Parts,
     make_bodies,
     make_boundary,
-    make_coverage,
     make_narrow_band,
     make_outlets,
     make_particles,
@@ -204,7 +204,7 @@ class LiquidSimulation(ParticleSimulation):
         }
         return [
             self.points(),
-            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, grid.domain_counts),
+            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, self.image_counts),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -317,7 +317,8 @@ class FluidsSimulator:
             boundary, warnings[:] = make_boundary(scene, grid, folder, wall_velocity, solids=solids)
             return Parts(boundary, make_sources(scene, grid, boundary, folder), make_narrow_band(scene, grid, boundary, folder))
 
-        coverage, grid, parts = make_coverage(scene, device, make_parts)
+        coverage, grid = start_of(scene, device, make_parts)
+        parts = make_parts(grid)
         without = start_band(scene, grid, parts.boundary, folder, parts.band)
         particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
         outlets = make_outlets(scene, grid, folder)

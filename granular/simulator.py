@@ -22,16 +22,8 @@ from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.particle_assembly import (
-    Parts,
-    make_bodies,
-    make_boundary,
-    make_coverage,
-    make_outlets,
-    make_particles,
-    make_sources,
-    placed_solids,
-)
+from warp_lcp.material.coverage import start_of
+from warp_lcp.material.particle_assembly import Parts, make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import extend_velocity
@@ -88,6 +80,7 @@ class SandSimulation(ParticleSimulation):
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress = Stress(self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried)
         self.outcome = SandReport(self.stress)
+        wp.copy(self.packing.kind, self.solids.base)
 
     def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
         """Go on on another grid of the same domain, see the base class."""
@@ -191,7 +184,7 @@ class SandSimulation(ParticleSimulation):
         shown = {name: field[at] for name, field in fields.items()}
         return [
             points,
-            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, shown, grid.domain_counts),
+            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, shown, self.image_counts),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -400,7 +393,8 @@ class GranularSimulator:
             warnings[:] = [*notes, *solids.notes]
             return Parts(boundary, make_sources(scene, grid, boundary, folder), solids=solids)
 
-        coverage, grid, parts = make_coverage(scene, device, make_parts)
+        coverage, grid = start_of(scene, device, make_parts)
+        parts = make_parts(grid)
         particles, notes = make_particles(scene, grid, parts.boundary, folder)
         outlets = make_outlets(scene, grid, folder)
         return SandSimulation(

@@ -12,8 +12,8 @@ import warp_lcp as wl
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.particle_assembly import Parts, make_boundary, make_outlets, make_particles, make_sources
-from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_log import Row
+from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.shapes import BoxTable, MaterialProperties
 from warp_lcp.simulation import Profiled, Recorded, Resampled, SimulationFailed

@@ -16,6 +16,7 @@ import warp as wp
 
 import small_liquids
 import small_sands
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import row_pass
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
@@ -37,7 +38,7 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
     """Note each kernel module that a launch asks for and each allocation with the source files on the stack."""
     traces = Traces()
     allocator = type(wp.get_device("cpu").default_allocator)
-    load, allocate, entry = wp.Module.load, allocator.allocate, row_pass.Form.entry
+    load, allocate, entry, allocate_field = wp.Module.load, allocator.allocate, row_pass.Form.entry, StaggeredGrid.field
 
     def noting_load(module: Any, *arguments: Any, **options: Any) -> Any:
         traces.modules.add(module.name)
@@ -47,9 +48,9 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
         traces.modules.add(self.kernel.module.name)
         return entry(self, *arguments)
 
-    def noting_allocate(self: Any, size: int) -> int:
+    def note(size: int) -> None:
         traces.total += size
-        frame, files = sys._getframe(1), set()
+        frame, files = sys._getframe(2), set()
         while frame is not None:
             files.add(frame.f_code.co_filename)
             frame = frame.f_back
@@ -57,12 +58,21 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
             path = Path(name).resolve()
             if path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in PACKAGES:
                 traces.bytes[path.relative_to(ROOT).as_posix()] += size
+
+    def noting_allocate(self: Any, size: int) -> int:
+        note(size)
         return int(allocate(self, size))
+
+    def noting_field(self: StaggeredGrid, dtype: Any = wp.float32) -> Any:
+        made = allocate_field(self, dtype)  # of NumPy's memory
+        note(made.capacity)
+        return made
 
     with patch.context() as patched:
         patched.setattr(wp.Module, "load", noting_load)
         patched.setattr(row_pass.Form, "entry", noting_entry)
         patched.setattr(allocator, "allocate", noting_allocate)
+        patched.setattr(StaggeredGrid, "field", noting_field)
         yield traces
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warp_lcp.grid.staggered import StaggeredGrid
+
+if TYPE_CHECKING:
+    from warp_lcp.material.particle_scene import ParticleScene
 
 ALIGNED = 16  # cells, of which a part's ends are multiples: its coarse levels then have the cells that those of the domain have
 LEAST_CELLS = 1 << 18  # of a domain whose grid need not cover all of it: a smaller one costs less than laying grids
@@ -61,6 +64,17 @@ class Coverage:
             return now
         return laid
 
+    def beyond(self, high: np.ndarray) -> str:
+        """Say along which axis a box of cells that ends with this one reaches beyond the domain; "" if it does not."""
+        axes = [axis for axis in range(self.domain.dimension) if high[axis] >= self.domain.counts[axis]]
+        most, names = max(self.domain.counts), " and ".join("xyz"[axis] for axis in axes)
+        if not axes:
+            return ""
+        return (
+            f"the material comes to {most} cells along {names}, and no domain reaches farther; use larger cells (domain.spacing), let a "
+            "drain or an open side take it away, or give the domain a size"
+        )
+
     def at(self, box: np.ndarray | None) -> StaggeredGrid:
         """Return the grid of a state's `box`, the domain's if it has none.
 
@@ -89,6 +103,17 @@ class Coverage:
             return domain
         (x, y, z), (nx, ny, nz) = low.tolist(), (high - low).tolist()
         return StaggeredGrid((nx, ny, nz), domain.spacing, domain.dimension, domain.device, origin=(x, y, z), whole=domain.counts)
+
+
+def start_of(scene: ParticleScene, device: Any, make_parts: Callable[[StaggeredGrid], Any]) -> tuple[Coverage, StaggeredGrid]:
+    """Return what lays a scene's grids, and the first one, around its materials at the start and its sources."""
+    whole = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
+    boxes = [shape.bounds(scene.dimension) for shape in (*scene.source, *scene.materials()[1])]
+    corners = [cells_between(box[0], box[1], whole.spacing, 1) for box in boxes if box is not None]
+    follows = scene.domain.follow and bool(corners) and len(corners) == len(boxes)
+    coverage = Coverage(whole, make_parts, follows, tuple(corners[: len(scene.source)]), scene.endless)
+    low, high = zip(*corners, strict=True) if follows else ([0], [0])
+    return coverage, coverage.around(np.min(low, axis=0), np.max(high, axis=0))
 
 
 def box_of(grid: StaggeredGrid) -> dict[str, np.ndarray]:

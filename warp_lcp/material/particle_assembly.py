@@ -19,7 +19,6 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
-from warp_lcp.material.coverage import Coverage, cells_between
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_scene import ParticleScene
@@ -125,18 +124,6 @@ class Parts:
     sources: Sources | None = None
     band: NarrowBand | None = None
     solids: Any = None
-
-
-def make_coverage(scene: ParticleScene, device: str, make_parts: Callable[[StaggeredGrid], Parts]) -> tuple[Coverage, StaggeredGrid, Parts]:
-    """Return what lays a scene's grids, and the first one, around its materials at the start and its sources, with what belongs to it."""
-    whole = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
-    boxes = [shape.bounds(scene.dimension) for shape in (*scene.source, *scene.materials()[1])]
-    corners = [cells_between(box[0], box[1], whole.spacing, 1) for box in boxes if box is not None]
-    follows = scene.domain.follow and bool(corners) and len(corners) == len(boxes)
-    coverage = Coverage(whole, make_parts, follows, tuple(corners[: len(scene.source)]), scene.endless)
-    low, high = zip(*corners, strict=True) if follows else ([0], [0])
-    grid = coverage.around(np.min(low, axis=0), np.max(high, axis=0))
-    return coverage, grid, make_parts(grid)
 
 
 def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:

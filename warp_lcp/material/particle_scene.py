@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
+from warp_lcp.material.coverage import start_of
 from warp_lcp.material.particle_volume import VOLUME_BYTES
 from warp_lcp.scene.models import Model, model_lines, prices
 from warp_lcp.scene.presets import preset_values
@@ -255,8 +256,11 @@ class ParticleScene(Scene):
         settings = self.particles
         at_first = f"{self.particle_estimate(later=False):,} at the start, " if self.source else ""
         most = "about" if settings.narrow_band is not None else "at most"
+        covered = f"{' x '.join(map(str, self.covered_counts[: self.dimension]))} cells at the start, then what the material reaches"
+        part = [("covered", covered)] if self.covered_counts != self.cell_counts else []
         return [
             *super().plan(),
+            *part,
             ("particles", f"{at_first}{most} {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
             *self._rearrangement(),
             *self.model_plan(),
@@ -270,7 +274,7 @@ class ParticleScene(Scene):
         Args:
             measured: how long a step takes on the machine at hand [s]; None: as where the prices were measured.
         """
-        cells, particles = math.prod(self.cell_counts), self.particle_estimate()
+        cells, particles = math.prod(self.covered_counts), self.particle_estimate()
         listed = prices(self.scene.simulator, self.dimension)
         return model_lines(self.models(), listed, cells, particles, memory=sum(self.memory_parts().values()), measured=measured)
 
@@ -313,7 +317,7 @@ class ParticleScene(Scene):
 
     def _surface_bytes(self) -> int:
         """Return what the lattice of a surface mesh takes, and a mesh as large as the domain's sides [bytes]."""
-        nx, ny, nz = (n * (self.output.surface_resolution or self.particles.per_axis) for n in self.cell_counts)
+        nx, ny, nz = (n * (self.output.surface_resolution or self.particles.per_axis) for n in self.covered_counts)
         cells = nx * ny * (nz if self.dimension == 3 else 3)
         points = 2 * (nx * ny + ny * nz + nz * nx) if self.dimension == 3 else 2 * (nx + ny)
         return cells * (MESH_LATTICE_BYTES + MESH_SOLID_BYTES * bool(self.solid)) + points * MESH_POINT_BYTES
@@ -324,15 +328,20 @@ class ParticleScene(Scene):
 
     def memory_estimate(self) -> int:
         """Return about how much memory a run takes at most [bytes], without the program itself; the particles' making may take the most."""
-        nx, ny, _ = self.cell_counts
+        nx, ny, _ = self.covered_counts
         lattice = nx * ny * self.particles.per_axis**self.dimension
         making = self.counted_cells * (GRID_BYTES + self.solve_bytes) // 2 + self.particle_estimate() * SEEDING_BYTES
         return max(super().memory_estimate(), making + lattice * LATTICE_BYTES)
 
     @property
+    def covered_counts(self) -> tuple[int, int, int]:
+        """Return the cells along x, y and z that the grid covers at the start; it grows with what the material reaches."""
+        return start_of(self, "cpu", lambda grid: None)[1].counts
+
+    @property
     def counted_cells(self) -> int:
-        """Return how many cells of a 3-D grid the scene's cells count for in memory."""
-        nx, ny, nz = self.cell_counts
+        """Return how many cells of a 3-D grid the cells that it covers at the start count for in memory."""
+        nx, ny, nz = self.covered_counts
         return round(nx * ny * (nz if self.dimension == 3 else PLANES))
 
     @property

@@ -162,8 +162,11 @@ class ParticleSimulation(ABC):
             return
         way = travel(totals.max_speed, float(np.linalg.norm(self.gravity)), dt, self.grid.spacing)
         grow = self.reach + 3 + way  # `window`, a cell off the grid's end, where the step brings the material
-        grid = self._coverage.around(*cells_between(totals.low, totals.high, self.grid.spacing, grow), self.grid)
-        if grid is not self.grid:
+        low, high = cells_between(totals.low, totals.high, self.grid.spacing, grow)
+        if self.scene.domain.boundless and (trouble := self._coverage.beyond(high)):
+            raise SimulationFailed(f"step {self.step_count}: {trouble}")
+        grid = self._coverage.around(low, high, self.grid)
+        if grid != self.grid:
             with self.watch.stage("laying the grid", *self.velocity):
                 self.cover(grid)
 
@@ -221,12 +224,10 @@ class ParticleSimulation(ABC):
 
     def bring_to_faces(self, window: Window) -> None:
         """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
-        particles = self.particles
-        with self.watch.stage("particles-to-grid", *particles.arrays().values(), *self.velocity, *self.weights):
-            particles_to_faces(
-                self.grid, particles.position, particles.velocity, particles.affine, self.velocity, self.weights, window=window,
-                offsets=particles.offsets,
-            )  # fmt: skip
+        p = self.particles
+        with self.watch.stage("particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights):
+            faces, offsets = (self.velocity, self.weights), p.offsets
+            particles_to_faces(self.grid, p.position, p.velocity, p.affine, *faces, window=window, offsets=offsets)
             if self.band is not None:
                 self.band.blend(window, self.velocity, self.weights)
             for field, saved in zip(self.velocity, self._saved or (), strict=False):
@@ -242,9 +243,8 @@ class ParticleSimulation(ABC):
             kind: int8 of AIR, FLUID, SOLID.
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.boundary_kernels`.
         """
-        wall = self.boundary
-        with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *wall.open):
-            wall.extend(window, self.velocity, self.weights, list(known), kind, contact, self.layers)
+        with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
+            self.boundary.extend(window, self.velocity, self.weights, list(known), kind, contact, self.layers)
             if self.sources is not None:
                 self.sources.hold(self.velocity, [])
 
@@ -344,6 +344,11 @@ class ParticleSimulation(ABC):
         }
         return columns(self.own_columns(), told, self.bodies.columns() if self.bodies is not None else ())
 
+    @property
+    def image_counts(self) -> tuple[int, int, int] | None:
+        """Return the cells of the image that a frame of cells is; None: of a grid that follows the material those that hold some."""
+        return self.grid.domain_counts if self.shared or self.grid.whole is None else None
+
     def points(self) -> Points:
         """Return the particles as a frame shows them, with velocity and speed [m/s]."""
         position, velocity = self.particles.position.numpy().copy(), self.particles.velocity.numpy().copy()
@@ -417,10 +422,9 @@ class ParticleSimulation(ABC):
         Raises:
             ValueError: its box is not in this domain.
         """
-        if self._coverage is None or not np.array_equal(state.get("signature", ()), signature(self.scene, self.grid)):
-            return state
-        grid = self._coverage.at(state.get("box"))
-        if grid != self.grid and self._coverage.follows:
+        same = np.array_equal(state.get("signature", ()), signature(self.scene, self.grid))
+        grid = self._coverage.at(state.get("box")) if self._coverage is not None and same else self.grid
+        if grid != self.grid and self.scene.domain.follow:
             self.cover(grid, state)
         if grid == self.grid:
             return state
@@ -483,12 +487,10 @@ class ParticleSimulation(ABC):
 
     def _exchange(self, dt: float) -> dict[str, int]:
         """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
-        drained = departed = emitted = 0
+        span = self.time, self.time + dt
         with self.watch.stage("sources and outlets", self.particles.position):
-            if self.outlets is not None:
-                drained, departed = self.outlets.apply(self.particles, self.time, self.time + dt)
-            if self.sources is not None:
-                emitted = self.sources.emit(self.particles, self.time, self.time + dt)
+            drained, departed = self.outlets.apply(self.particles, *span) if self.outlets is not None else (0, 0)
+            emitted = self.sources.emit(self.particles, *span) if self.sources is not None else 0
         return {"emitted": emitted, "drained": drained, "departed": departed}
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:

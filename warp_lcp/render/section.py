@@ -65,7 +65,8 @@ class Section:
         if frame.bodies is not None:
             self._fill_bodies(axes, frame.bodies)
         camera = self.scene.camera
-        low, high = camera.low or [0.0, 0.0], camera.high or self.scene.domain.size
+        seen = [corner.tolist() for corner in self.scene.seen]
+        low, high = camera.low or seen[0], camera.high or seen[1]
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
         if self.at is not None:
             axes.set_title(f"z = {self.at:g} m", fontsize="medium")

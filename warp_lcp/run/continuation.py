@@ -17,7 +17,8 @@ from warp_lcp.scene.table import KeyFault, SceneError, written
 
 RESOLUTION = "domain.resolution"
 MAY_CHANGE = (
-    "scene.name, scene.description, time.duration, time.cfl, time.dt_max, time.dt_min, [solver], [output], [camera] and domain.resolution"
+    "scene.name, scene.description, time.duration, time.cfl, time.dt_max, time.dt_min, [solver], [output], [camera], domain.follow and "
+    "domain.resolution"
 )
 
 
@@ -32,7 +33,7 @@ class Change(Enum):
 
 RULES = (
     (re.compile(r"scene\.(name|description)|time\.duration|(output|camera)\..*"), Change.SAME_STEPS),
-    (re.compile(r"solver\..*|time\.(cfl|dt_max|dt_min)"), Change.OTHER_STEPS),
+    (re.compile(r"solver\..*|time\.(cfl|dt_max|dt_min)|domain\.follow"), Change.OTHER_STEPS),
     (re.compile(re.escape(RESOLUTION)), Change.RESAMPLED),
 )
 MESH_KEY = re.compile(r"\w+\[\d+\]\.file")

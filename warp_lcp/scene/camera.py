@@ -111,14 +111,14 @@ class Viewpoint:
 def viewpoint(scene: Scene, aspect: float) -> Viewpoint:
     """Return where images of this aspect are seen from: as the scene's [camera] says, or from as near as shows all of the domain."""
     camera = scene.camera
-    size = np.array([*scene.domain.size, 0.0][:3])
+    low, high = scene.seen
     if scene.dimension == 2:
-        corners = [np.append(camera.low or [0.0, 0.0], 0.0), np.append(camera.high or size[:2], 0.0)]
+        corners = [np.append(camera.low or low[:2], 0.0), np.append(camera.high or high[:2], 0.0)]
         return _around(corners[0], corners[1], Z_AXIS, VIEW_ANGLE, aspect)
     angle = camera.field_of_view or VIEW_ANGLE
     if camera.position is None:
-        return _around(np.zeros(3), size, THREE_QUARTERS, angle, aspect)
-    position, focus = np.array(camera.position), np.array(camera.look_at) if camera.look_at else 0.5 * size
+        return _around(low, high, THREE_QUARTERS, angle, aspect)
+    position, focus = np.array(camera.position), np.array(camera.look_at) if camera.look_at else 0.5 * (low + high)
     plain = Viewpoint(position, focus, np.array(camera.up or Y_AXIS), angle, aspect)
     return Viewpoint(position, focus, plain.axes[1], angle, aspect)
 

@@ -22,6 +22,9 @@ from warp_lcp.scene.table import Complaint, KeyFault, SceneError, Table, Vector,
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
 from warp_lcp.solvers.registry import grid_methods
 
+MOST_CELLS = 8192  # along an axis: float32 positions there are rounded to a thousandth of a cell
+FAR_SIDES = ("right", "top", "front")
+
 __all__ = ["Complaint", "KeyFault", "Liquid", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
 
 GridMethod = Literal[grid_methods()]
@@ -83,12 +86,21 @@ class Time(Table):
 
 
 class Domain(Table):
-    """[domain]: the box that everything happens in, and its grid."""
+    """[domain]: the box that everything happens in, and its grid.
+
+    A domain of cells of a `spacing` has no far ends: right, top and front are open, and nothing gets there.
+    """
 
     later: ClassVar = {"periodic": frozenset({True})}
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
-    size: list[Positive] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
-    resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
+    size: list[Positive] = Field(
+        min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]; left out with spacing"
+    )
+    resolution: int = Field(ge=2, le=MOST_CELLS, description="cells along the longest side; left out with spacing")
+    spacing: Positive | None = Field(
+        default=None, description=f"instead of size and resolution: the side of a cell [m] of a domain without far ends, {MOST_CELLS} cells"
+    )
+    dimension: Literal[2, 3] | None = Field(default=None, description="with spacing: the domain's number of axes; 3 unless given")
     wall: Wall = Field(default="separating", description="whether material may let go of the domain's walls")
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
@@ -100,6 +112,30 @@ class Domain(Table):
         default=True, description="the grid covers what the material reaches where that is much less than the domain; false: all of it"
     )
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_ends(cls, data: Any) -> Any:
+        """Give a domain of a spacing sides that are farther than anything gets."""
+        if not isinstance(data, dict) or not isinstance(data.get("spacing"), int | float) or isinstance(data.get("open", []), str):
+            return data
+        axes = 2 if data.get("dimension") == 2 else 3
+        sides = [*data.get("open", []), *(side for side in FAR_SIDES[:axes] if side not in data.get("open", []))]
+        return {"size": [MOST_CELLS * data["spacing"]] * axes, "resolution": MOST_CELLS, "dimension": axes} | {**data, "open": sides}
+
+    @property
+    def boundless(self) -> bool:
+        """Return whether there are no far ends."""
+        return self.spacing is not None
+
+    def spacing_complaints(self) -> list[Complaint]:
+        """Return what stands against `spacing` and `dimension`."""
+        place, axes = ("domain", "spacing"), int(self.dimension or 0)
+        if self.spacing is None:
+            return [Complaint(("domain", "dimension"), axes, "is of a domain with spacing; size says it otherwise")] if axes else []
+        if (self.size, self.resolution) != ([MOST_CELLS * self.spacing] * axes, MOST_CELLS):
+            return [Complaint(place, self.spacing, "stands instead of size and resolution: leave these out, or it")]
+        return [] if self.follow else [Complaint(("domain", "follow"), False, "must be true with spacing: no grid covers such a domain")]
 
 
 class Physics(Table):
@@ -166,8 +202,9 @@ class Scene(Table):
         """Fill in gravity, whose default needs the number of dimensions."""
         domain, physics = (data.get("domain"), data.get("physics", {})) if isinstance(data, dict) else (None, None)
         size = domain.get("size") if isinstance(domain, dict) else None
+        boundless = isinstance(domain, dict) and size is None and domain.get("spacing") is not None and domain.get("dimension") != 2
         if isinstance(physics, dict):
-            gravity = [0.0, -9.81, 0.0] if isinstance(size, list) and len(size) == 3 else [0.0, -9.81]
+            gravity = [0.0, -9.81, 0.0] if boundless or (isinstance(size, list) and len(size) == 3) else [0.0, -9.81]
             return {**data, "physics": {"gravity": gravity, **physics}}
         return data
 
@@ -190,7 +227,18 @@ class Scene(Table):
     @property
     def spacing(self) -> float:
         """Return the side of a cell [m]."""
-        return max(self.domain.size) / self.domain.resolution
+        return self.domain.spacing or max(self.domain.size) / self.domain.resolution
+
+    @property
+    def seen(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the low and the high corner [m] of what pictures show: the domain, without far ends what shapes reach over, shape (3,)."""
+        size = np.array([*self.domain.size, 0.0][:3])
+        boxes = [shape.bounds(self.dimension) for _, shape in self.shapes()] if self.domain.boundless else []
+        near = [np.clip(box, 0.0, size) for box in boxes if box is not None]
+        if not near:
+            return np.zeros(3), size
+        low, high = np.min([box[0] for box in near], axis=0), np.max([box[1] for box in near], axis=0)
+        return low, np.maximum(high, low + self.spacing * (size > 0.0))
 
     @property
     def cell_counts(self) -> tuple[int, int, int]:
@@ -271,13 +319,14 @@ class Scene(Table):
 
     def plan(self) -> list[tuple[str, str]]:
         """Return what a run would do, as pairs of a word and a line. Subclasses append theirs, such as particles and memory."""
-        cells = self.cell_counts[: self.dimension]
+        cells, spacing = self.cell_counts[: self.dimension], f"{self.spacing:.6g} m"
+        extent = f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {spacing}"
         moving = ", ".join(f"solid {index} {solid.motion.kind}" for index, solid in enumerate(self.solid) if solid.motion)
         bodies = ", ".join(self._body_line(index, solid) for index, solid in enumerate(self.solid) if solid.is_body)
         preset = preset_line(self)
         return [
             *([("preset", preset)] if preset else []),
-            ("grid", f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {self.spacing:.6g} m"),
+            ("grid", f"no far ends, cells of {spacing}, at most {MOST_CELLS} along an axis" if self.domain.boundless else extent),
             ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
             *([("open", ", ".join(self.domain.open))] if self.domain.open else []),
             *([("moving", moving)] if moving else []),
@@ -321,8 +370,8 @@ class Scene(Table):
         return f"solid {index} {solid.shape} of " + (f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3")
 
     def _grid_complaints(self) -> list[Complaint]:
-        found = []
-        for axis, side in enumerate(self.domain.size):
+        found = self.domain.spacing_complaints()
+        for axis, side in enumerate(self.domain.size if not found else ()):
             cells = side / self.spacing
             if round(cells) < 1 or abs(cells - round(cells)) > WHOLE_CELLS * cells:
                 sides = [f"{n * self.spacing:.8g}" for n in (math.floor(cells), math.ceil(cells)) if n > 0]
