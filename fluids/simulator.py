@@ -29,6 +29,7 @@ from warp_lcp.material.particle_assembly import (
     make_outlets,
     make_particles,
     make_sources,
+    make_spray,
     placed_solids,
     start_band,
 )
@@ -321,9 +322,9 @@ class FluidsSimulator:
         parts = make_parts(grid)
         without = start_band(scene, grid, parts.boundary, folder, parts.band)
         particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
-        outlets = make_outlets(scene, grid, folder)
+        outlets, spray = make_outlets(scene, grid, folder), make_spray(scene, coverage, solids)
         return LiquidSimulation(
-            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, notes=[*warnings, *notes]
+            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray, notes=[*warnings, *notes]
         )  # fmt: skip
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:

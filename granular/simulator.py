@@ -23,7 +23,16 @@ from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.coverage import start_of
-from warp_lcp.material.particle_assembly import Parts, make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
+from warp_lcp.material.particle_assembly import (
+    Parts,
+    make_bodies,
+    make_boundary,
+    make_outlets,
+    make_particles,
+    make_sources,
+    make_spray,
+    placed_solids,
+)
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import extend_velocity
@@ -176,7 +185,7 @@ class SandSimulation(ParticleSimulation):
             "pressure": self.pressures().astype(np.float32),
             "yield_ratio": self.outcome.ratio.numpy(),
         }
-        i, j, k = self.particles.cells_of(points.points).T + 1
+        i, j, k = np.clip(self.particles.cells_of(points.points), -1, self.grid.counts).T + 1
         for name, field in fields.items():
             points.fields[name] = field[k, j, i]
         cells = np.argwhere(self.packing.kind.numpy() == FLUID)
@@ -396,7 +405,7 @@ class GranularSimulator:
         coverage, grid = start_of(scene, device, make_parts)
         parts = make_parts(grid)
         particles, notes = make_particles(scene, grid, parts.boundary, folder)
-        outlets = make_outlets(scene, grid, folder)
+        outlets, spray = make_outlets(scene, grid, folder), make_spray(scene, coverage, placed)
         return SandSimulation(
-            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, notes=(*warnings, *notes)
+            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray, notes=(*warnings, *notes)
         )  # fmt: skip

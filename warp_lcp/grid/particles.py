@@ -50,6 +50,24 @@ class ParticleTotals:
         """Whether every position and velocity is finite."""
         return self.bad_positions == 0 and self.bad_velocities == 0
 
+    def joined(self, other: "ParticleTotals") -> "ParticleTotals":
+        """Return sums over these particles and others."""
+        count = self.count + other.count
+        if 0 in (self.count, other.count):
+            return self if other.count == 0 else other
+        mine, theirs = self.count / count, other.count / count
+        return ParticleTotals(
+            count=count,
+            mean_square_speed=mine * self.mean_square_speed + theirs * other.mean_square_speed,
+            velocity=mine * self.velocity + theirs * other.velocity,
+            center=mine * self.center + theirs * other.center,
+            low=np.minimum(self.low, other.low),
+            high=np.maximum(self.high, other.high),
+            max_speed=max(self.max_speed, other.max_speed),
+            bad_positions=self.bad_positions + other.bad_positions,
+            bad_velocities=self.bad_velocities + other.bad_velocities,
+        )
+
 
 class Column:
     """A vector for each particle, in storage that may have room for more.

@@ -46,6 +46,11 @@ class Coverage:
     always: tuple[tuple[Corner, Corner], ...] = ()
     endless: Sequence[int] = ()
 
+    @property
+    def active(self) -> bool:
+        """Return whether a grid may ever cover less than the domain."""
+        return self.follows and self.domain.size >= LEAST_CELLS
+
     def around(self, low: Corner, high: Corner, now: StaggeredGrid | None = None) -> StaggeredGrid:
         """Return a grid that covers a box of cells.
 
@@ -54,7 +59,7 @@ class Coverage:
             high: last cell.
             now: the grid there is, which is returned if it will do.
         """
-        if not self.follows or self.domain.size < LEAST_CELLS:
+        if not self.active:
             return self.domain
         corners = np.array([(low, high), *self.always])
         last = np.array(self.domain.counts) - 1

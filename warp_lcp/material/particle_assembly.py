@@ -19,12 +19,14 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.material.coverage import Coverage
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_volume import ParticleVolume
 from warp_lcp.material.reseeding import Reseeding
 from warp_lcp.material.sources import Drain, Outlets, Source, Sources
+from warp_lcp.material.spray import Spray
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
@@ -124,6 +126,13 @@ class Parts:
     sources: Sources | None = None
     band: NarrowBand | None = None
     solids: Any = None
+
+
+def make_spray(scene: ParticleScene, coverage: Coverage, placed: Sequence[PlacedSolid]) -> Spray | None:
+    """Return what carries particles that are alone, if they need no grid: where one follows the material, and no surface is wrapped."""
+    if not (coverage.active and scene.flies) or scene.output.surface or scene.output.volume:
+        return None
+    return Spray(coverage.domain, placed, side_bits(scene.domain.open))
 
 
 def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:

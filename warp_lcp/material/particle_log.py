@@ -40,9 +40,10 @@ def columns(own: Sequence[str], told: Mapping[str, bool], bodies: Sequence[str])
     no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1, or at the
     start of a step that none was due in; density_status and density_iterations: of that correction, empty where none was due;
     reseeded: particles that went to a neighboring cell; emitted, drained, departed: those that sources have added in the step, that
-    drains have swallowed, and that have left through open sides. Rigid bodies, numbered from 0 in the order of the scene's solids,
-    have body0_x, body0_y, body0_z [m], the center of mass; body0_vx, body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far it
-    has turned, and body0_spin [degrees/s]; 3-D: body0_wx, body0_wy, body0_wz [degrees/s], the angular velocity. contacts: points where
+    drains have swallowed, and that have left through open sides; spray: those that fly off the grid, see `warp_lcp.material.spray`.
+    Rigid bodies, numbered from 0 in the order of the scene's solids, have body0_x, body0_y, body0_z [m], the center of mass; body0_vx,
+    body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far it has turned, and body0_spin [degrees/s]; 3-D: body0_wx, body0_wy,
+    body0_wz [degrees/s], the angular velocity. contacts: points where
     bodies touch walls or each other, or nearly do.
 
     Args:

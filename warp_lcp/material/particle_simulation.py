@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,23 +12,24 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, travel
 from warp_lcp.material.flight import Flights
 from warp_lcp.material.narrow_band import without_band
 from warp_lcp.material.particle_assembly import Parts, make_particle_volume, make_surface_mesh
+from warp_lcp.material.particle_frames import ParticleFrames
 from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
 from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
 from warp_lcp.material.resample import resampled, resampling_notes
 from warp_lcp.material.sources import Drain, Outlets, Source
+from warp_lcp.material.spray import Spray
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.simulation import NoStopwatch, Points, SimulationFailed, Stopwatch, Surface, Volume
+from warp_lcp.simulation import NoStopwatch, SimulationFailed, Stopwatch
 
 
-class ParticleSimulation(ABC):
+class ParticleSimulation(ParticleFrames):
     """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
 
     Particles have the velocities of the middle of the last step, the grid in a step those of its middle: forces act for `kick_dt`, half of
@@ -53,10 +54,11 @@ class ParticleSimulation(ABC):
         outlets: where it leaves.
         bodies: solids of the boundary that the material moves.
         coverage: lays other grids when the material needs one; None: this one is kept.
+        spray: carries particles that need no grid; None: none does.
         notes: facts for the start of a run.
 
     Attributes:
-        particles: the material.
+        particles: the material, but for its spray.
         velocity: of the last step on the faces, one field a component [m/s].
         weights: of the particles on each component's faces, in the last step.
         flights: gives bodies in flight their momenta back; None: the material has none, or none that can be told.
@@ -83,6 +85,7 @@ class ParticleSimulation(ABC):
         outlets: Outlets | None = None,
         bodies: RigidBodies | None = None,
         coverage: Coverage | None = None,
+        spray: Spray | None = None,
         notes: Sequence[str] = (),
     ) -> None:
         """Allocate the fields, fill the sources that run at the start and sort the particles."""
@@ -93,7 +96,7 @@ class ParticleSimulation(ABC):
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
         self.layers = self.reach = math.ceil(scene.time.cfl) + 2
-        self._coverage = coverage
+        self._coverage, self.spray = coverage, spray or Spray(grid, (), 0, active=False)
         self.lay(grid, parts)
         self._notes = [*notes, *self.rearrangement.notes()]
         if self.sources is not None:
@@ -199,7 +202,9 @@ class ParticleSimulation(ABC):
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
         totals = self.checked_totals("at the start of")
-        self.kick_dt, self._velocity_before = 0.5 * (self.last_dt + dt), totals.velocity
+        with self.watch.stage("spray", self.particles.position):
+            totals = self.spray.exchange(self.particles, totals, self.step_count, self.time, dt)
+        self.kick_dt, self._velocity_before = 0.5 * (self.last_dt + dt), self.spray.with_own(totals).velocity
         self._follow(totals, dt)
         with self.watch.stage("sort", *self.particles.arrays().values()):
             self.particles.arrange(self.step_count)
@@ -319,6 +324,7 @@ class ParticleSimulation(ABC):
             if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
                 raise SimulationFailed(f"step {self.step_count}: {trouble}")
         met = self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
+        self.spray.fly(self.gravity * self.kick_dt, dt)
         if self.flights is not None:
             with self.watch.stage("bodies in flight", self.particles.position):
                 self.flights.end(self.particles, self.velocity)
@@ -338,45 +344,12 @@ class ParticleSimulation(ABC):
         told = {
             **{"stopped": True, "pushed": self.boundary.moves, "stuck": self.boundary.moves, "interior_density": self.band is not None},
             **dict.fromkeys(self.rearrangement.columns(), True),
+            "spray": self.spray.active,
             "emitted": bool(self.scene.source),
             "drained": bool(self.scene.drain),
             "departed": bool(self.scene.domain.open),
         }
         return columns(self.own_columns(), told, self.bodies.columns() if self.bodies is not None else ())
-
-    @property
-    def image_counts(self) -> tuple[int, int, int] | None:
-        """Return the cells of the image that a frame of cells is; None: of a grid that follows the material those that hold some."""
-        return self.grid.domain_counts if self.shared or self.grid.whole is None else None
-
-    def points(self) -> Points:
-        """Return the particles as a frame shows them, with velocity and speed [m/s]."""
-        position, velocity = self.particles.position.numpy().copy(), self.particles.velocity.numpy().copy()
-        return Points("particles", position, {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))})
-
-    def surfaces(self) -> list[Surface]:
-        """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it."""
-        if self.surface_mesh is None:
-            return []
-        position = self.particles.position
-        band = self.band
-        mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
-        if not self._faces_know:  # the next step overwrites what the faces are given here
-            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
-        velocity = sample(self.grid, self.velocity, mesh.points)
-        return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
-
-    def volumes(self) -> list[Volume]:
-        """Return the material's level set and density as a frame shows them, if the scene wants them."""
-        fill = self.band.fill if self.band is not None else None
-        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles, fill=fill)
-
-    def body_surfaces(self) -> list[Surface]:
-        """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""
-        if self.bodies is None:
-            return []
-        surface = self.bodies.surfaces()
-        return [Surface("bodies", surface.points, surface.corners, surface.fields)]
 
     def _fields(self) -> dict[str, np.ndarray]:
         """Return copies of what of the state lies on the grid, with the numbers that belong to it."""
@@ -390,9 +363,21 @@ class ParticleSimulation(ABC):
         if self.band is not None:
             self.band.restore(state)
 
+    def _particle_arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of the particles' arrays by name, those of the spray at the end."""
+        return {name: self.spray.behind(name, array.numpy()) for name, array in self.particles.arrays().items()}
+
+    def _assign(self, arrays: Mapping[str, np.ndarray], flying: int = 0) -> None:
+        """Take other particles, of which the last ones fly."""
+        on_grid = len(arrays["position"]) - (flying if self.spray.active else 0)
+        self.particles.assign({name: arrays[name][:on_grid] for name in self.particles.arrays()})
+        self.spray.particles.assign({name: arrays[name][on_grid:] for name in self.spray.particles.arrays()})
+        self._faces_know = False
+
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too."""
-        particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
+        flying = self.spray.particles.count
+        particles = self._particle_arrays() | ({"spray": np.array(flying)} if flying else {})
         clock = {name: np.array(getattr(self, name)) for name in ("time", "step_count", "last_dt")}
         bodies = self.bodies.state() if self.bodies is not None else {}
         return clock | {"signature": signature(self.scene, self.grid)} | particles | self._fields() | bodies | box_of(self.grid)
@@ -408,8 +393,7 @@ class ParticleSimulation(ABC):
         expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
         varies = bool(self.sources or self.outlets or self.band)
         check_state(state, expected, changing=[*self.particles.arrays()] if varies else [], solids_move=self.boundary.moves)
-        self.particles.assign(state)
-        self._faces_know = False
+        self._assign(state, int(state.get("spray", 0)))
         self._take_fields(state)
         self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
         if self.bodies is not None:
@@ -450,8 +434,7 @@ class ParticleSimulation(ABC):
             {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=spacing,
             per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
         )  # fmt: skip
-        self.particles.assign(arrays)
-        self._faces_know = False
+        self._assign(arrays)
         if self.band is not None:
             self.band.forget()
         self.particles.sort()
@@ -487,16 +470,20 @@ class ParticleSimulation(ABC):
 
     def _exchange(self, dt: float) -> dict[str, int]:
         """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
-        span = self.time, self.time + dt
+        span, drained, departed = (self.time, self.time + dt), 0, 0
         with self.watch.stage("sources and outlets", self.particles.position):
-            drained, departed = self.outlets.apply(self.particles, *span) if self.outlets is not None else (0, 0)
+            for outlets in [] if self.outlets is None else [self.outlets]:
+                for particles in (self.particles, self.spray.particles):
+                    swallowed, gone = outlets.apply(particles, *span)
+                    drained, departed = drained + swallowed, departed + gone
             emitted = self.sources.emit(self.particles, *span) if self.sources is not None else 0
         return {"emitted": emitted, "drained": drained, "departed": departed}
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
         moved = Moved(self.particle_mass, self.gravity, self._velocity_before, dt, self.kick_dt)
-        density = self.band.mean_density if self.band is not None else None
-        return totals_row(totals, moved, self.particles.count, self.grid.spacing) | {"interior_density": density}
+        density, flying = self.band.mean_density if self.band is not None else None, self.spray.particles.count
+        row = totals_row(self.spray.with_own(totals), moved, self.particles.count + flying, self.grid.spacing)
+        return row | {"interior_density": density, "spray": flying}
 
     def _admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m], shape (n, 3), a particle may be at."""

@@ -1,0 +1,170 @@
+"""A grid that covers the material alone, or all of the domain: the same run."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+import small_liquids
+import small_sands
+from warp_lcp.fluids import LiquidScene
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.material import coverage as module
+from warp_lcp.material.coverage import Coverage, box_of, carry_over
+from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.scene.scene import MOST_CELLS
+from warp_lcp.scene.table import SceneError
+from warp_lcp.simulation import SimulationFailed
+
+DOMAIN = StaggeredGrid((200, 96, 64), 0.1, 3, "cpu")
+THROWN = {**small_liquids.box([0.2, 1.0], [0.5, 1.3]), "velocity": [3.0, 1.0]}
+BALL = {"shape": "sphere", "center": [1.2, 0.6], "radius": 0.2}
+SWAY = {"motion": {"kind": "sinusoid", "amplitude": [0.1, 0.0], "period": 0.5}}
+SOURCE = {"source": [small_liquids.box([0.9, 1.0], [1.0, 1.1], velocity=[2.0, 0.0], stop=0.1)]}
+LIQUIDS: dict[str, dict[str, Any]] = {
+    "apic": {},
+    "flip": {"particles": {"transfer": "flip"}},
+    "band": {"particles": {"narrow_band": {"width": 3}}, "liquid": [{**small_liquids.box([0.2, 0.5], [1.0, 1.3]), "velocity": [3.0, 1.0]}]},
+    "reseeding": {"particles": {"reseed": {"every": 3}}},
+    "correction": {"density_correction": {"every": 2}},
+    "unilateral": {"pressure": {"model": "unilateral"}},
+    "voxel surface": {"pressure": {"surface": "voxel"}},
+    "solid": {"solid": [BALL]},
+    "voxel solid": {"solid": [BALL], "solids": "voxel"},
+    "moving solid": {"solid": [BALL | SWAY]},
+    "body": {"solid": [BALL | {"density": 300.0}]},
+    "source": SOURCE,
+    "drain": {"drain": [small_liquids.box([0.8, 0.5], [1.2, 1.0])]},
+}
+SANDS: dict[str, dict[str, Any]] = {"sand": {}, "solid in sand": {"solid": [BALL]}, "sand source": {"source": SOURCE["source"]}}
+CASES = [*LIQUIDS, *SANDS]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lay grids even in small domains, and often."""
+    for name, value in {"LEAST_CELLS": 0, "MOST": 1.0, "ALIGNED": 8, "SPARE": 1}.items():
+        monkeypatch.setattr(module, name, value)
+
+
+def made(name: str, *, follow: bool) -> ParticleSimulation:
+    tables: dict[str, Any] = {"liquid" if name in LIQUIDS else "sand": [THROWN]} | (LIQUIDS | SANDS)[name]
+    short = {key: tables.pop(key) for key in ("solids",) if key in tables}
+    data = {"time": {"duration": 10.0}, "domain": {"size": [3.0, 1.5], "resolution": 60, "follow": follow, **short}} | tables
+    if name in LIQUIDS:
+        return small_liquids.create(LiquidScene.model_validate({"scene": {"simulator": "fluids"}} | data))
+    return small_sands.create(SandScene.model_validate({"scene": {"simulator": "granular"}} | data))
+
+
+def run(simulation: ParticleSimulation, steps: int) -> list[Mapping[str, Any]]:
+    return [simulation.step(0.008 if n % 3 else 0.004) for n in range(steps)]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_grid_that_follows_finds_what_one_of_the_domain_does(name: str, small: None) -> None:
+    """Sums run in another order on grids of other sizes, coarse levels of the solver may differ: no bits, but rounding."""
+    part, whole, grids = made(name, follow=True), made(name, follow=False), set()
+    for n in range(24):
+        dt = 0.008 if n % 3 else 0.004
+        row, expected = part.step(dt), whole.step(dt)
+        grids.add((part.grid.origin, part.grid.counts))
+        assert row["particles"] == expected["particles"]
+        assert row["kinetic_energy"] == pytest.approx(expected["kinetic_energy"], rel=1e-3)
+        assert row["center_of_mass_y"] == pytest.approx(expected["center_of_mass_y"], rel=1e-4)
+    assert part.grid.whole == whole.grid.counts
+    assert part.grid.size < 0.7 * whole.grid.size
+    assert len(grids) > 1, "nothing was laid anew"
+    cells = part.frame()[1].index  # type: ignore[union-attr]
+    assert np.array_equal(np.unique(cells, axis=0), np.unique(whole.frame()[1].index, axis=0))  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_goes_on_from_a_state_bit_for_bit_and_on_the_other_grid(name: str, small: None) -> None:
+    through, later, whole = made(name, follow=True), made(name, follow=True), made(name, follow=False)
+    run(through, 9)
+    state = {key: np.array(value) for key, value in through.state().items()}
+    assert state["box"].tolist() == [list(through.grid.origin), (np.array(through.grid.origin) + through.grid.counts).tolist()]
+    later.restore(state)
+    whole.restore(state)
+    for simulation in (through, later, whole):
+        run(simulation, 9)
+    found = later.state()
+    assert [key for key, value in through.state().items() if not np.array_equal(value, found[key])] == []
+    assert "box" not in whole.state()
+    assert whole.particles.totals().center == pytest.approx(through.particles.totals().center, abs=1e-4)
+    later.restore(whole.state())
+    assert later.grid == whole.grid
+
+
+def test_it_pays_for_what_there_is() -> None:
+    """The same liquid in 512 times the domain: as many cells."""
+    sizes = []
+    for n in (64, 512):
+        drop = {"shape": "sphere", "center": [0.05 * n] * 3, "radius": 1.2}
+        simulation = small_liquids.create(small_liquids.scene(size=[0.1 * n] * 3, resolution=n, liquid=[drop]))
+        simulation.step(0.004)
+        sizes.append(simulation.grid.size)
+        state = simulation.state()
+        assert state["pressure"].size == simulation.grid.size
+    assert sizes[1] <= sizes[0]
+
+
+def test_grids_are_laid_where_the_material_leaves_them() -> None:
+    laid = Coverage(DOMAIN, lambda grid: None)
+    first = laid.around([40, 40, 20], [70, 60, 40])
+    assert all(low % module.ALIGNED == 0 for low in first.origin)
+    assert first.covers([32, 32, 12], [78, 68, 48])  # and some to spare
+    assert laid.around([41, 40, 20], [71, 60, 40], first) is first
+    assert laid.around([40, 40, 20], [first.origin[0] + first.counts[0], 60, 40], first) is not first
+    assert laid.around([50, 40, 20], [51, 41, 21], first).size < first.size / module.LOOSE
+    assert laid.around([0, 0, 0], [150, 90, 60]) is DOMAIN  # more than half of it
+    assert laid.around([-50, 200, 0], [-40, 300, 9]).domain_counts == DOMAIN.counts  # beyond it
+    assert Coverage(DOMAIN, lambda grid: None, follows=False).around([40, 40, 20], [41, 41, 21]) is DOMAIN
+    always = Coverage(DOMAIN, lambda grid: None, always=(([90, 90, 60], [91, 91, 61]),), endless=[2])
+    kept = always.around([40, 40, 20], [50, 50, 30])
+    assert kept.covers([40, 40, 0], [91, 91, 63])
+    assert laid.at(box_of(first)["box"]) == first
+    assert laid.at(None) is DOMAIN
+    with pytest.raises(ValueError, match=r"not in this scene's \(200, 96, 64\)"):
+        laid.at(np.array([[0, 0, 0], [201, 9, 9]]))
+
+
+def test_fields_go_along_where_both_grids_know_them() -> None:
+    """Rings too, where they are the domain's."""
+    old = StaggeredGrid((32, 96, 64), 0.1, 3, "cpu", origin=(16, 0, 0), whole=DOMAIN.counts)
+    new = StaggeredGrid((32, 96, 32), 0.1, 3, "cpu", origin=(32, 0, 16), whole=DOMAIN.counts)
+    numbers = np.arange(np.prod(DOMAIN.shape)).reshape(DOMAIN.shape)
+    view = tuple(slice(o, o + n + 2) for o, n in zip(old.origin[::-1], old.counts[::-1], strict=True))
+    found = carry_over({"a": numbers[view], "b": np.array(7)}, old, new, {"a": np.full(new.shape, -1)})["a"]
+    assert np.array_equal(found[1:-1, :, 1:17], numbers[17:49, :, 33:49])
+    assert (found[:, :, 17:] == -1).all()
+    assert (found[0] == -1).all()  # the new grid's own ring
+
+
+def test_a_domain_without_far_ends() -> None:
+    data = {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "liquid": [{**THROWN, "velocity": [40.0, 0.0]}]}
+    model = LiquidScene
+    scene = model.model_validate(data | {"domain": {"spacing": 0.05, "dimension": 2, "open": ["left"]}})
+    assert scene.cell_counts == (MOST_CELLS, MOST_CELLS, 1)
+    assert scene.domain.open == ["left", "right", "top"]
+    assert scene.seen[1][0] < 1.0
+    assert model.model_validate(scene.model_dump(exclude_none=True)) == scene
+    simulation = small_liquids.create(scene)
+    while simulation.particles.totals().low[0] < 20.0:
+        row = simulation.step(simulation.stable_dt())
+    assert simulation.grid.size < 1 << 14
+    assert row["kinetic_energy"] == pytest.approx(0.5 * row["mass"] * 1600.0, rel=0.1)
+    state = simulation.state()
+    state["position"][:, 0] += np.float32(MOST_CELLS * 0.05 - state["position"][:, 0].max() - 0.3)
+    simulation.restore(state)
+    with pytest.raises(SimulationFailed, match=rf"comes to {MOST_CELLS} cells along x"):
+        simulation.step(0.001)
+    for wrong, message in (
+        ({"spacing": 0.05, "size": [1.0, 1.0], "resolution": 16, "dimension": 2}, "instead of size and resolution"),
+        ({"size": [1.0, 1.0], "resolution": 16, "dimension": 2}, "size says it"),
+        ({"spacing": 0.05, "dimension": 2, "follow": False}, "no grid covers"),
+    ):
+        with pytest.raises((SceneError, ValueError), match=message):
+            model.model_validate(data | {"domain": wrong})

@@ -1,0 +1,71 @@
+"""What frames show of a material that particles carry."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.surface_mesh import Interior, SurfaceMesh, faces_from_particles, sample
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.narrow_band import NarrowBand
+from warp_lcp.material.particle_volume import ParticleVolume
+from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.simulation import Points, Surface, Volume
+
+
+class ParticleFrames(ABC):
+    """The parts of a frame that all materials have; attributes as of `ParticleSimulation`."""
+
+    grid: StaggeredGrid
+    boundary: Boundary
+    particles: Particles
+    band: NarrowBand | None
+    bodies: RigidBodies | None
+    surface_mesh: SurfaceMesh | None
+    particle_volume: ParticleVolume | None
+    velocity: list[wp.array]
+    weights: list[wp.array]
+    shared: bool
+    _faces_know: bool
+
+    @abstractmethod
+    def _particle_arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of the particles' arrays by name."""
+
+    @property
+    def image_counts(self) -> tuple[int, int, int] | None:
+        """Return the cells of the image that a frame of cells is; None: of a grid that follows the material those that hold some."""
+        return self.grid.domain_counts if self.shared or self.grid.whole is None else None
+
+    def points(self) -> Points:
+        """Return the particles as a frame shows them, with velocity and speed [m/s]."""
+        position, velocity = (self._particle_arrays()[name] for name in ("position", "velocity"))
+        return Points("particles", position, {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))})
+
+    def surfaces(self) -> list[Surface]:
+        """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it."""
+        if self.surface_mesh is None:
+            return []
+        position = self.particles.position
+        band = self.band
+        mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
+        if not self._faces_know:  # the next step overwrites what the faces are given here
+            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
+        velocity = sample(self.grid, self.velocity, mesh.points)
+        return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
+
+    def volumes(self) -> list[Volume]:
+        """Return the material's level set and density as a frame shows them, if the scene wants them."""
+        fill = self.band.fill if self.band is not None else None
+        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles, fill=fill)
+
+    def body_surfaces(self) -> list[Surface]:
+        """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""
+        if self.bodies is None:
+            return []
+        surface = self.bodies.surfaces()
+        return [Surface("bodies", surface.points, surface.corners, surface.fields)]

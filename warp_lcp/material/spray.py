@@ -1,0 +1,149 @@
+"""Particles in free flight far from all others: they need no grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, no_type_check
+
+import numpy as np
+import warp as wp
+from scipy import ndimage
+
+from warp_lcp.grid.particles import Particles, ParticleTotals
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.voxelize import PlacedSolid
+
+EVERY = 8  # steps between looks for particles that have left the others
+TILE = 8  # cells: clusters of particles are told apart by empty tiles between them
+FEW = 8  # particles: no more make a cluster that flies off the grid
+AWAY = 2 * TILE  # cells from the box around all others from which on it does; it comes back at half of that
+MOST_TILES = 1 << 22  # else they are larger
+CLEAR = 3  # cells from a solid or a wall, and its way in a step: nearer than that it is on the grid
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.material.spray")
+@no_type_check
+def fly_kernel(change: wp.vec3, dt: float, position: wp.array(dtype=wp.vec3), velocity: wp.array(dtype=wp.vec3)):
+    """Change velocities, then move for a time step."""
+    p = wp.tid()
+    v = velocity[p] + change
+    velocity[p] = v
+    position[p] = position[p] + dt * v
+
+
+class Spray:
+    """Carry particles that are alone along their parabolas, off the grid, until they come near others, a solid or a wall.
+
+    A cluster of at most `FEW` particles far outside the box around all others flies: the grid need not reach there. Its particles go
+    straight on with what forces give them, as a body in flight on the grid would, but for its turning: mass, momentum, energy and angular
+    momentum stay what they are. The gradients that APIC carries are lost, those of a lone particle move nothing.
+
+    Args:
+        grid: any of the simulation's.
+        solids: what it may meet.
+        open_sides: of the domain, see `warp_lcp.grid.sides.side_bits`.
+        active: whether any particle may fly.
+
+    Attributes:
+        particles: those that fly.
+    """
+
+    def __init__(self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], open_sides: int, *, active: bool = True) -> None:
+        self.active, self._solids, self._open, self._extent, self._dimension = (
+            active,
+            tuple(solids),
+            open_sides,
+            grid.extent,
+            grid.dimension,
+        )
+        nothing = np.zeros((0, 3), dtype=np.float32)
+        self.particles = Particles(grid, nothing, nothing, affine=False, indexed=False)
+
+    def exchange(self, particles: Particles, totals: ParticleTotals, step: int, time: float, dt: float) -> ParticleTotals:
+        """Take what has left the others, give back what comes near something, and return sums over those on the grid.
+
+        Args:
+            particles: on the grid (updated).
+            totals: sums over them.
+            step: number of the step.
+            time: at its start [s].
+            dt: its length [s].
+        """
+        own, dx, before = self.particles, particles.grid.spacing, particles.count
+        if own.count:
+            reach = 0.5 * AWAY * dx
+            near = self._within(own, totals.low - reach, totals.high + reach) | self._meets(own, time, dt, dx)
+            self._move(own, particles, near)
+        if self.active and step % EVERY == 0 and particles.count:
+            self._move(particles, own, self._leaves(particles, time, dt, dx))
+        return totals if particles.count == before else particles.totals()
+
+    def fly(self, change: np.ndarray, dt: float) -> None:
+        """Move by a time step [s], after a change of the velocity [m/s], shape (3,)."""
+        own = self.particles
+        if own.count:
+            wp.launch(fly_kernel, own.count, [wp.vec3(*change), dt, own.position, own.velocity], device=own.grid.device)
+
+    def behind(self, name: str, array: np.ndarray) -> np.ndarray:
+        """Return an array of the particles on the grid with that of those that fly behind it, shape (n, 3)."""
+        own = self.particles.arrays().get(name)
+        return np.concatenate([array, np.zeros((self.particles.count, 3), dtype=array.dtype) if own is None else own.numpy()])
+
+    def with_own(self, totals: ParticleTotals) -> ParticleTotals:
+        """Return sums over particles on the grid with those over the ones that fly."""
+        return totals.joined(self.particles.totals()) if self.particles.count else totals
+
+    def _leaves(self, particles: Particles, time: float, dt: float, dx: float) -> np.ndarray:
+        """Tell which particles are alone, away from the box around all others, and near nothing."""
+        x = particles.position.numpy()
+        alone = self._alone(x, dx)
+        if alone.any() and not alone.all():
+            rest = x[~alone]
+            alone &= ~self._within(particles, rest.min(axis=0) - AWAY * dx, rest.max(axis=0) + AWAY * dx)
+        if alone.any():
+            alone[alone] = ~self._meets(particles, time, dt, dx, alone)
+        return alone
+
+    def _within(self, particles: Particles, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Tell which particles lie in a box."""
+        x, axes = particles.position.numpy(), slice(self._dimension)
+        return np.asarray(((x >= low) & (x <= high))[:, axes].all(axis=1))
+
+    def _meets(self, particles: Particles, time: float, dt: float, dx: float, which: np.ndarray | None = None) -> np.ndarray:
+        """Tell which of some particles may come near a solid or a closed side of the domain in a step."""
+        x, v = (array.numpy() if which is None else array.numpy()[which] for array in (particles.position, particles.velocity))
+        room = CLEAR * dx + (np.linalg.norm(v, axis=1) + 10.0 * dx) * dt
+        near = ~np.isfinite(x + v).all(axis=1)
+        for axis in range(self._dimension):
+            for side, gap in enumerate((x[:, axis], self._extent[axis] - x[:, axis])):
+                if not self._open >> (2 * axis + side) & 1:
+                    near |= gap < room
+        points = wp.array(x, dtype=wp.vec3, device=particles.grid.device)
+        distance = wp.empty(len(x), dtype=wp.float32, device=particles.grid.device)
+        for solid in self._solids:
+            geometry = solid.geometry if solid.motion is None else solid.geometry.moved(solid.motion.pose(time))
+            geometry.signed_distance(points, distance)
+            near |= distance.numpy() < room
+        return near
+
+    def _alone(self, position: np.ndarray, dx: float) -> np.ndarray:
+        """Tell which particles [m] belong to clusters of few."""
+        tile, low = np.floor(position / (TILE * dx)).astype(np.int64), np.floor(position.min(axis=0) / (TILE * dx)).astype(np.int64)
+        while np.prod((tile - low).max(axis=0) + 1.0) > MOST_TILES:
+            tile, low = tile // 2, low // 2
+        tile -= low
+        shape = tuple(int(n) + 1 for n in tile.max(axis=0))
+        flat = np.ravel_multi_index(tuple(tile.T), shape)
+        held = np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape)
+        cluster, _ = ndimage.label(held, structure=np.ones((3, 3, 3)))
+        few = np.bincount(cluster.ravel(), weights=held.ravel()) <= FEW
+        return np.asarray(few[cluster.ravel()[flat]])
+
+    def _move(self, source: Particles, target: Particles, which: np.ndarray) -> None:
+        """Move some particles from one set to the end of another."""
+        if not which.any():
+            return
+        target.append(source.position.numpy()[which], source.velocity.numpy()[which])
+        marks: Any = source.marks
+        marks.assign(which.astype(np.int32))
+        source.remove(marks)
