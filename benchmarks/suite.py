@@ -104,6 +104,11 @@ THREADS = Suite(
     "kernels, cycles, solves and steps of scenes on 1, 2, 4, ... threads up to all cores, against what memory allows",
     "4 minutes",
 )
+DOMAINS = Suite(
+    "domains",
+    "the same liquid in domains of 48^3 to 768^3 cells: a step, its memory, a checkpoint; laying grids around a ball that flies",
+    "2 minutes",
+)
 PEERS = Suite(
     "peers",
     "the same problems by PyAMG, AMGCL, SciPy, PETSc, OSQP, PIQP, Clarabel, Warp's CG, as far as they are there",

@@ -59,10 +59,11 @@ TAP = {"shape": "box", "min": [0.0, 0.5], "max": [0.125, 0.625], "velocity": [1.
 SCENES = {  # cells along the longest side, and the time [s] whose parts are the moments
     "balls-on-sand-2d": (48, 0.6), "carried-box-2d": (48, 0.7), "ceiling-drop": (32, 0.8), "column-collapse-2d": (48, 0.7),
     "column-collapse": (24, 0.5), "dam-break-2d": (48, 1.2), "dam-break": (32, 0.8), "floating-bodies-2d": (64, 1.2),
-    "floating-bodies": (32, 0.8), "hourglass-2d": (48, 0.6), "hourglass": (28, 0.4), "inclined-layer": (32, 0.8),
-    "mesh-obstacle": (30, 0.6), "pouring-pile": (24, 1.2), "retracting-wall": (60, 1.8), "sand-on-mesh": (24, 0.4),
+    "floating-bodies": (32, 0.8), "hourglass-2d": (48, 0.6), "hourglass": (28, 0.4), "inclined-layer": (32, 0.8), "jet": (128, 0.8),
+    "mesh-obstacle": (30, 0.6), "pouring-pile": (24, 1.2), "retracting-wall": (60, 1.8), "river": (256, 1.6), "sand-on-mesh": (24, 0.4),
     "sliding-slab": (32, 0.8), "splash-in-circle": (40, 1.2), "splash-in-square": (40, 1.0), "splash-unilateral": (80, 0.8),
-    "stirred-tank": (24, 0.8), "tap-and-drain": (32, 1.6), "water-labyrinth": (48, 1.6), "wave-maker": (120, 2.4),
+    "stirred-tank": (24, 0.8), "tap-and-drain": (32, 1.6), "water-labyrinth": (48, 1.6), "waterfall": (32, 1.2),
+    "wave-maker": (120, 2.4),
 }  # fmt: skip
 SHORTER = (1e-6, 1e-5, 1e-4, 1e-3)  # [s], than the normal step
 MOST = 1e-3  # of the total that a step may add

@@ -6,6 +6,7 @@ from pydantic import ValidationError
 from small_liquids import box, create, scene
 from warp_lcp import fluids
 from warp_lcp.fluids import LiquidScene
+from warp_lcp.material import coverage
 from warp_lcp.scene.scene import Scene
 
 LIQUID = [box([0.0, 0.0], [0.5, 0.25])]
@@ -67,7 +68,8 @@ def test_the_plan_says_what_moves_particles_apart() -> None:
     assert plan["reseeding"] == "4 to 18 particles a cell, every step"
 
 
-def test_the_estimate_of_memory_counts_what_the_options_add() -> None:
+def test_the_estimate_of_memory_counts_what_the_options_add(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(coverage, "LEAST_CELLS", 1 << 30)  # of all of the domain
     ball = {"shape": "sphere", "center": [0.7, 0.2], "radius": 0.1}
     moving = ball | {"motion": {"kind": "translation", "velocity": [1.0, 0.0]}}
     voxel = {"solids": "voxel", "pressure": {"surface": "voxel"}}

@@ -10,7 +10,7 @@ import small_sands
 from mesh_checks import assert_closed, enclosed
 from warp_lcp.frames.frames import FrameFolder, frame_bytes
 from warp_lcp.frames.ply import write_ply
-from warp_lcp.material import particle_simulation
+from warp_lcp.material import particle_frames
 from warp_lcp.simulation import Points, Surface
 
 SURFACE = {"output": {"surface": True}}
@@ -80,8 +80,8 @@ def test_a_frame_changes_nothing_of_the_run():
 def test_off_is_nothing(monkeypatch):
     """No surface, no field, no kernel."""
     launched = []
-    monkeypatch.setattr(particle_simulation, "faces_from_particles", lambda *a: launched.append(a))
-    monkeypatch.setattr(particle_simulation, "sample", lambda *a: launched.append(a))
+    monkeypatch.setattr(particle_frames, "faces_from_particles", lambda *a: launched.append(a))
+    monkeypatch.setattr(particle_frames, "sample", lambda *a: launched.append(a))
     simulation = small_liquids.dam(2)
     assert simulation.surface_mesh is None
     assert not any(isinstance(part, Surface) for part in simulation.frame())

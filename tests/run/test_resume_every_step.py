@@ -8,9 +8,12 @@ from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 
 CELLS = {
+    "jet": 128,
     "mesh-obstacle": 15,
     "pouring-pile": 18,
     "retracting-wall": 25,
+    "river": 256,
+    "waterfall": 32,
     "wave-maker": 30,
 }  # along the longest side, where 24 and 12 do not fit
 IN_BAND = {

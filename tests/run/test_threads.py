@@ -10,7 +10,10 @@ from warp_lcp.rows import team
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators
 
-CELLS = {"mesh-obstacle": 15, "retracting-wall": 25, "stirred-tank": 24, "water-labyrinth": 24, "wave-maker": 30}  # whose sizes need others
+CELLS = {  # whose sizes need others
+    "jet": 128, "mesh-obstacle": 15, "retracting-wall": 25, "river": 256, "stirred-tank": 24, "water-labyrinth": 24, "waterfall": 32,
+    "wave-maker": 30,
+}  # fmt: skip
 
 
 def digests(name: str, count: int, steps: int) -> list[str]:

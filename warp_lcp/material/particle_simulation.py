@@ -202,8 +202,9 @@ class ParticleSimulation(ParticleFrames):
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
         totals = self.checked_totals("at the start of")
-        with self.watch.stage("spray", self.particles.position):
-            totals = self.spray.exchange(self.particles, totals, self.step_count, self.time, dt)
+        if self.spray.active:
+            with self.watch.stage("spray", self.particles.position):
+                totals = self.spray.exchange(self.particles, totals, self.step_count, self.time, dt)
         self.kick_dt, self._velocity_before = 0.5 * (self.last_dt + dt), self.spray.with_own(totals).velocity
         self._follow(totals, dt)
         with self.watch.stage("sort", *self.particles.arrays().values()):

@@ -1,0 +1,159 @@
+"""The same liquid in larger domains: what a step and its memory cost, and what laying grids around the liquid takes of a run."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Record, Results, Table, Target, table_of_targets
+from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns, ratios
+from warp_lcp.fluids import SIMULATOR, LiquidScene
+from warp_lcp.simulation import NoStopwatch
+
+TITLE = "The same liquid in larger domains"
+SIDE = 48  # cells of the cube of liquid, and of the smallest domain
+LARGER = (48, 96, 192, 384, 768)
+STEPS, LONGEST = 4, 0.005  # before a step is measured; the longest one [s]
+FLIGHT = 0.8  # [s] that a ball flies through a domain without far ends, and falls onto a floor
+TIME_LIMITS, MEMORY_LIMIT, LAYING_LIMIT = {192: 1.2, 768: 1.5}, 200.0, 8.0  # MB; % of a step
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Step the liquid in each domain, in turns; then memory, a process each; then the flight."""
+    if wp.get_device(options.device).is_cuda:
+        raise ValueError(f"--device {options.device}: the suite domains measures the CPU")
+    sizes = options.sizes or LARGER
+    work = {}
+    for n in sizes:
+        options.say(f"{n}^3")
+        work[str(n)] = _stepping(n)
+    times = in_turns(work, options.repeat)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
+        grown = dict(zip(sizes, pool.map(memory_of, sizes), strict=True))
+    records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
+    for n in sizes:
+        cells, growth, state = grown[n]
+        figures = {
+            "milliseconds": Figure.of([1e3 * t for t in times[str(n)]], "ms"),
+            "ratio": ratios(times[str(n)], times[str(sizes[0])]),
+            "memory": Figure(growth, "MB"),
+            "checkpoint": Figure(state, "MB"),
+        }
+        records.append(Record(f"{n}^3", figures, {"covered": cells}))
+    options.say("a flight")
+    flight = _flight()
+    records.append(flight)
+    rows = [[r.name, *(str(f) for f in r.figures.values()), str(r.facts["covered"])] for r in records[1:-1]]
+    remark = (
+        f"{(SIDE // 2) ** 3 * 8:,} particles in free fall in the middle of a closed cube. Steps: medians of {options.repeat} in turns, and "
+        "their range. Memory: what a process of its own grew by at most, the kernels it loads among it. Checkpoint: a state's arrays."
+    )
+    heads = ["domain", "a step", "over the first", "memory", "checkpoint", "cells covered"]
+    tables = [Table("A step and its memory", heads, rows, remark), _flight_table(flight), _targets(records)]
+    return Results(records, tables)
+
+
+def falling(n: int) -> LiquidScene:
+    """Return the scene of a cube of liquid in a domain of n^3 cells."""
+    dx = 1.0 / SIDE
+    low, high = 0.5 * (n - SIDE) * dx + 0.25, 0.5 * (n - SIDE) * dx + 0.75
+    return LiquidScene.model_validate({
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 1.0},
+        "domain": {"size": [n * dx] * 3, "resolution": n},
+        "liquid": [{"shape": "box", "min": [low] * 3, "max": [high] * 3}],
+    })  # fmt: skip
+
+
+def _stepping(n: int) -> Any:
+    simulation = SIMULATOR.create(falling(n), device="cpu", folder=Path())
+    start = simulation.state()
+
+    def step() -> None:
+        if simulation.step_count > STEPS + 40:  # it must not reach the floor
+            simulation.restore(start)
+        simulation.step(min(simulation.stable_dt(), LONGEST))
+
+    for _ in range(STEPS):
+        step()
+    return step
+
+
+def memory_of(n: int) -> tuple[int, float, float]:
+    """Return the cells that the grid covers, what the process grew by in some steps, and the size of a state [MB]."""
+    unit = 1024.0 if sys.platform != "darwin" else 1024.0**2
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    simulation = SIMULATOR.create(falling(n), device="cpu", folder=Path())
+    for _ in range(STEPS):
+        simulation.step(min(simulation.stable_dt(), LONGEST))
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    return simulation.grid.size, grown / unit, sum(array.nbytes for array in simulation.state().values()) / 2**20
+
+
+class Shares(NoStopwatch):
+    """Seconds of each stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def stage(self, name: str, *arrays: Any) -> Iterator[None]:
+        """Add the seconds of what happens to a stage."""
+        begun = time.perf_counter()
+        yield
+        self.seconds[name] += time.perf_counter() - begun
+
+
+def _flight() -> Record:
+    """Return what laying grids takes of a ball's flight over a solid, in a domain without far ends."""
+    scene = LiquidScene.model_validate({
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": FLIGHT},
+        "domain": {"spacing": 0.02, "open": ["left", "back"]},
+        "liquid": [{"shape": "sphere", "center": [2.0, 2.0, 2.0], "radius": 0.4, "velocity": [6.0, 2.0, 0.0]}],
+        "solid": [{"shape": "box", "min": [1.0, 0.0, 1.0], "max": [5.0, 0.5, 3.0]}],
+    })  # fmt: skip
+    simulation = SIMULATOR.create(scene, device="cpu", folder=Path())
+    for _ in range(STEPS):
+        simulation.step(min(simulation.stable_dt(), LONGEST))
+    watch = simulation.watch = Shares()
+    grids, begun = [simulation.grid], time.perf_counter()
+    while simulation.time < FLIGHT:
+        simulation.step(min(simulation.stable_dt(), LONGEST))
+        if simulation.grid != grids[-1]:
+            grids.append(simulation.grid)
+    whole = time.perf_counter() - begun
+    figures = {
+        "laying": Figure(100.0 * (watch.seconds["laying the grid"] + watch.seconds["spray"]) / whole, "%"),
+        "grids": Figure(len(grids)),
+        "steps": Figure(simulation.step_count - STEPS),
+        "step": Figure(1e3 * whole / (simulation.step_count - STEPS), "ms"),
+    }
+    return Record("a ball's flight", figures, {"covered": max(grid.size for grid in grids)})
+
+
+def _flight_table(record: Record) -> Table:
+    remark = "A ball of .4 m flies 4 m and falls onto a solid and the floor, cells of 2 cm, a domain without far ends."
+    heads = ["", "laying grids, share of a step", "grids", "steps", "a step", "most cells covered"]
+    return Table("Laying grids", heads, [[record.name, *(str(f) for f in record.figures.values()), str(record.facts["covered"])]], remark)
+
+
+def _targets(records: list[Record]) -> Table:
+    by_name = {record.name: record for record in records}
+    times = {n: by_name[f"{n}^3"].figures["ratio"] for n in TIME_LIMITS if f"{n}^3" in by_name}
+    found = [Target(f"{n}^3 over {SIDE}^3, a step", TIME_LIMITS[n], ratio, " x") for n, ratio in times.items()]
+    if "768^3" in by_name:
+        found.append(Target("768^3, memory", MEMORY_LIMIT, by_name["768^3"].figures["memory"], " MB"))
+    found.append(Target("laying grids, share of a step", LAYING_LIMIT, records[-1].figures["laying"], " %"))
+    return table_of_targets("of large domains", found)
