@@ -115,8 +115,10 @@ def test_grids_are_laid_where_the_material_leaves_them() -> None:
     laid = Coverage(DOMAIN, lambda grid: None)
     first = laid.around([40, 40, 20], [70, 60, 40])
     assert all(low % module.ALIGNED == 0 for low in first.origin)
-    assert first.covers([32, 32, 12], [78, 68, 48])  # and some to spare
-    assert laid.around([41, 40, 20], [71, 60, 40], first) is first
+    moving = laid.around([40, 40, 20], [70, 60, 40], pace=(np.zeros(3), np.array([0.25, 9.0, 0.0])))
+    assert moving.covers([40, 40, 20], [74, 68, 40])  # and some to spare, where it goes
+    assert moving.origin == first.origin
+    assert laid.around([41, 40, 20], [69, 60, 40], first) is first
     assert laid.around([40, 40, 20], [first.origin[0] + first.counts[0], 60, 40], first) is not first
     assert laid.around([50, 40, 20], [51, 41, 21], first).size < first.size / module.LOOSE
     assert laid.around([0, 0, 0], [150, 90, 60]) is DOMAIN  # more than half of it

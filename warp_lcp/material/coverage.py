@@ -9,19 +9,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
 
 if TYPE_CHECKING:
     from warp_lcp.material.particle_scene import ParticleScene
 
-ALIGNED = 16  # cells, of which a part's ends are multiples: its coarse levels then have the cells that those of the domain have
+ALIGNED = 8  # cells, of which a part's ends are multiples: its coarse levels then have the cells that those of the domain have
 LEAST_CELLS = 1 << 18  # of a domain whose grid need not cover all of it: a smaller one costs less than laying grids
-SPARE = 8  # cells that a grid has to spare on each side when it is laid, an eighth of what it covers if that is more
+SPARE = 8  # cells at most that a grid has to spare on a side when it is laid, an eighth of what it covers if that is more
+AHEAD = 16  # steps that it is laid for, as the material moves now
+START = 10  # cells around a material at the start that its first steps reach
 MOST = 0.5  # of the domain's cells that a part may have; else the grid covers all of it
 LOOSE = 3.0  # times the cells of a grid that would be laid now: one that has more is laid anew
 
 FAR = 1 << 30  # cells: beyond any domain
 
+NO_PACE = (np.zeros(3), np.zeros(3))
 Corner = Sequence[int] | np.ndarray  # cell (x, y, z), counted from 0
 
 
@@ -51,20 +55,21 @@ class Coverage:
         """Return whether a grid may ever cover less than the domain."""
         return self.follows and self.domain.size >= LEAST_CELLS
 
-    def around(self, low: Corner, high: Corner, now: StaggeredGrid | None = None) -> StaggeredGrid:
+    def around(self, low: Corner, high: Corner, now: StaggeredGrid | None = None, pace: Sequence[np.ndarray] = NO_PACE) -> StaggeredGrid:
         """Return a grid that covers a box of cells.
 
         Args:
             low: first cell (x, y, z) of the domain, counted from 0; what lies outside the domain does not count.
             high: last cell.
             now: the grid there is, which is returned if it will do.
+            pace: cells a step that the box's low and high sides may move outward, shape (3,) each, see `pace_of`.
         """
         if not self.active:
             return self.domain
         corners = np.array([(low, high), *self.always])
         last = np.array(self.domain.counts) - 1
         first, final = np.clip(corners[:, 0].min(axis=0), 0, last), np.clip(corners[:, 1].max(axis=0), 0, last)
-        laid = self._laid(first, final)
+        laid = self._laid(first, final, pace)
         if now is not None and now.covers(first, final) and now.size <= LOOSE * laid.size:
             return now
         return laid
@@ -93,10 +98,11 @@ class Coverage:
             raise ValueError(f"the state's box from cell {low.tolist()} to {high.tolist()} is not in this scene's {self.domain.counts}")
         return self._part(low, high)
 
-    def _laid(self, first: np.ndarray, final: np.ndarray) -> StaggeredGrid:
-        counts, spare = np.array(self.domain.counts), np.maximum(SPARE, (final - first + 1) // 8)
-        low = np.maximum((first - spare) // ALIGNED * ALIGNED, 0)
-        high = np.minimum(-(-(final + 1 + spare) // ALIGNED) * ALIGNED, counts)
+    def _laid(self, first: np.ndarray, final: np.ndarray, pace: Sequence[np.ndarray]) -> StaggeredGrid:
+        counts, most = np.array(self.domain.counts), np.maximum(SPARE, (final - first + 1) // 8)
+        before, behind = (np.minimum(np.ceil(AHEAD * np.asarray(side)), most).astype(int) for side in pace)
+        low = np.maximum((first - before) // ALIGNED * ALIGNED, 0)
+        high = np.minimum(-(-(final + 1 + behind) // ALIGNED) * ALIGNED, counts)
         for axis in self.endless:
             low[axis], high[axis] = 0, counts[axis]
         part = self._part(low, high)
@@ -114,7 +120,7 @@ def start_of(scene: ParticleScene, device: Any, make_parts: Callable[[StaggeredG
     """Return what lays a scene's grids, and the first one, around its materials at the start and its sources."""
     whole = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
     boxes = [shape.bounds(scene.dimension) for shape in (*scene.source, *scene.materials()[1])]
-    corners = [cells_between(box[0], box[1], whole.spacing, 1) for box in boxes if box is not None]
+    corners = [cells_between(box[0], box[1], whole.spacing, START) for box in boxes if box is not None]
     follows = scene.domain.follow and bool(corners) and len(corners) == len(boxes)
     coverage = Coverage(whole, make_parts, follows, tuple(corners[: len(scene.source)]), scene.endless)
     low, high = zip(*corners, strict=True) if follows else ([0], [0])
@@ -164,6 +170,13 @@ def cells_between(low: np.ndarray, high: np.ndarray, spacing: float, grow: int =
     """Return the first and the last cell of a box between two corners [m], with some more on each side."""
     first, last = (np.clip(np.nan_to_num(np.floor(np.asarray(corner) / spacing)), -FAR, FAR) for corner in (low, high))
     return first.astype(int) - grow, last.astype(int) + grow
+
+
+def pace_of(totals: ParticleTotals, dt: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return how many cells a step the low and high sides of the box around particles may move outward: with all of them, and apart."""
+    drift = totals.velocity * dt / spacing
+    apart = max(totals.max_speed * dt / spacing - float(np.linalg.norm(drift)), 0.0)
+    return np.maximum(-drift, 0.0) + apart, np.maximum(drift, 0.0) + apart
 
 
 def travel(speed: float, acceleration: float, dt: float, spacing: float) -> int:

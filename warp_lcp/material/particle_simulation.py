@@ -13,7 +13,7 @@ import warp_lcp as wl
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
-from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, travel
+from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, pace_of, travel
 from warp_lcp.material.flight import Flights
 from warp_lcp.material.narrow_band import without_band
 from warp_lcp.material.particle_assembly import Parts, make_particle_volume, make_surface_mesh
@@ -168,7 +168,7 @@ class ParticleSimulation(ParticleFrames):
         low, high = cells_between(totals.low, totals.high, self.grid.spacing, grow)
         if self.scene.domain.boundless and (trouble := self._coverage.beyond(high)):
             raise SimulationFailed(f"step {self.step_count}: {trouble}")
-        grid = self._coverage.around(low, high, self.grid)
+        grid = self._coverage.around(low, high, self.grid, pace_of(totals, dt, self.grid.spacing))
         if grid != self.grid:
             with self.watch.stage("laying the grid", *self.velocity):
                 self.cover(grid)
