@@ -15,7 +15,7 @@ from warp_lcp.operators.stencil import Ghosts, Stencil, find_spans_kernel
 from warp_lcp.problem.pickling import OnHost, Pickled, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import PaddedLayout, check_kept, check_storable, real_array
+from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, real_array
 from warp_lcp.rows.vectors import Across
 
 HEADERS = Path(__file__).parent / "headers"
@@ -109,14 +109,22 @@ class GridPoisson(Pickled):
         self.faces = [self._stored_face(f, axis) for axis, f in enumerate(faces)]
         self.shift = self._stored_shift(shift)
         self._check_sums()
-        self.cells = wp.full(self.layout.stored_shape, SOLID, dtype=wp.int8, device=self.device)
+        padded = np.full(self.layout.stored_shape, SOLID, dtype=np.int8)
+        padded[1:-1, 1:-1, 1:-1] = host.reshape(counts)
+        self.cells = wp.array(padded, device=self.device, copy=self.device.is_cuda)
         self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) or self._ghosts is not None else self.cells
-        self._spans = wp.zeros((counts[0], counts[1]), dtype=wp.vec2i, device=self.device)
+        self._spans, self._reach = (wp.zeros(counts[:2], dtype=wp.vec2i, device=self.device) for _ in range(2))
+        whole = self.device.is_cuda or self.cells_around is not self.cells or self.layout.size < LARGE
+        chunks = 0 if whole else -(-self.layout.size // CPU_CHUNK)
+        self._chunks = wp.zeros((chunks, 1), dtype=wp.vec2i, device=self.device)
+        self.layout.chunks = self._chunks if chunks else None
+        self._find_rows()
+        self.layout.find_use(self._reach.numpy()[..., 1] > 0)
         self.version = 0
         self.stencil = self._empty_stencil()
         self._mask: wp.array[Any] | None = None
         self._finder: ComponentFinder | None = None
-        self._refill(wp.array(np.pad(host.reshape(counts), 1).astype(np.int8), device=self.device))
+        self._fill_stencil()
 
     def update(self, cells: wp.array[Any]) -> None:
         """Take new cell types, and what face coefficients and shift in padded arrays have become, in place and without allocating.
@@ -222,7 +230,7 @@ class GridPoisson(Pickled):
     @property
     def unknowns(self) -> int:
         """Number of FLUID cells, those of ghosts not counted."""
-        return int(np.count_nonzero(self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID))
+        return sum(int(np.count_nonzero(plane == FLUID)) for plane in self.cells.numpy()[1:-1, 1:-1, 1:-1])
 
     def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
         """Return the coefficients of lower faces as a padded array, or an empty array for a number."""
@@ -304,11 +312,19 @@ class GridPoisson(Pickled):
 
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
-        counts, s = self.layout.padding.counts, self.stencil
-        padding, whole = self.layout.padding, self._whole_rows
         if cells is not self.cells:
-            COPY_CELLS.bind(whole, source=cells.flatten(), to=self.cells.flatten()).launch()
-        wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans], device=self.device)
+            COPY_CELLS.bind(Rows.of(self.layout.padding, self.device), source=cells.flatten(), to=self.cells.flatten()).launch()
+        self._find_rows()
+        self._fill_stencil()
+
+    def _find_rows(self) -> None:
+        """Find what of each row is in use."""
+        counts = self.layout.padding.counts
+        wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans, self._reach, self._chunks], device=self.device)
+
+    def _fill_stencil(self) -> None:
+        """Compute diagonal and weights, on rows that are in use or have been."""
+        s, padding, reach = self.stencil, self.layout.padding, self._rows_in_reach
         self.version += 1
         if self.cells_around is not self.cells:
             wp.copy(self.cells_around, self.cells)
@@ -316,20 +332,20 @@ class GridPoisson(Pickled):
         around = {"cells": self.cells_around.flatten()}
         if self._counts_faces:
             axes: dict[str, Any] = {f"around_{a}": c > 0 for a, c in zip(AXES, self.uniform, strict=True)}
-            COUNT_FACES.bind(whole, **around, diagonal=s.d, **axes).launch()
+            COUNT_FACES.bind(reach, **around, diagonal=s.d, **axes).launch()
             return
         faces: dict[str, Any] = {}
         for axis, field, number in zip(AXES, self.faces, self.uniform, strict=True):
             faces |= {f"f{axis}": field.flatten() if field.size else None, f"n{axis}": number, f"FIELD_{axis.upper()}": field.size > 0}
         shift = self.shift.flatten() if self.shift.size else None
-        DIAGONAL.bind(whole, **around, **faces, shift=shift, SHIFTED=self.shift.size > 0, diagonal=s.d).launch()
+        DIAGONAL.bind(reach, **around, **faces, shift=shift, SHIFTED=self.shift.size > 0, diagonal=s.d).launch()
         if s.weights is not None:
             weights = dict(zip(("wx", "wy", "wz"), s.weights, strict=True))
             WEIGHTS.bind(Rows.of(padding, self.device, more=1), **around, **faces, **weights).launch()
 
     @cached_property
-    def _whole_rows(self) -> Rows:
-        return Rows.of(self.layout.padding, self.device)
+    def _rows_in_reach(self) -> Rows:
+        return Rows.of(self.layout.padding, self.device, self._reach)
 
 
 def _checked_cells(cells: Any) -> np.ndarray:
