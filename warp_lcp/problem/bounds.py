@@ -164,7 +164,7 @@ class Bounds:
         host = host.reshape(target.shape)
         at_once = len(host) if host.dtype == np.float64 else -(-LARGE // host[0].size)  # else a copy is made
         parts = [slice(k, k + at_once) for k in range(0, len(host), at_once)]
-        return all([self._code_part(side, host[part], value, code, target[part]) for part in parts])
+        return all(self._code_part(side, host[part], value, code, target[part]) for part in parts)
 
     def _code_part(self, side: int, host: np.ndarray, value: float, code: np.ndarray, target: np.ndarray) -> bool:
         """Do that for some planes of the code."""
