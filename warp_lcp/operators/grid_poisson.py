@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.operators.cell_lists import cells_of
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.stencil import Ghosts, Stencil, find_spans_kernel
 from warp_lcp.problem.pickling import OnHost, Pickled, made_again
@@ -125,6 +127,28 @@ class GridPoisson(Pickled):
         self._mask: wp.array[Any] | None = None
         self._finder: ComponentFinder | None = None
         self._fill_stencil()
+
+    @classmethod
+    def from_cells(cls, shape: Sequence[int], fluid: Any, solid: Any = (), **options: Any) -> GridPoisson:
+        """Make the operator of a grid from lists of its FLUID and SOLID cells, the others being AIR.
+
+        Args:
+            shape: cells along each axis, (nz, ny, nx) or (ny, nx).
+            fluid: indices of FLUID cells, integers of shape (n, 3), a row (k, j, i) a cell as it is found in fields, or (n, 2) in 2-D;
+                numpy or wp.array. The order of the cells does not matter; lists in the order of memory are taken fastest.
+            solid: likewise of SOLID cells.
+            options: all that the class takes beside `cells`.
+
+        Raises:
+            ValueError: a list has another shape or type, a cell is not in the grid, is listed twice or in both lists; the message names it.
+
+        Example:
+            >>> import warp_lcp as wl
+            >>> A = wl.GridPoisson.from_cells((1, 1, 3), fluid=[(0, 0, 0), (0, 0, 1)], device="cpu")
+            >>> print(A.diagonal().numpy())
+            [[[1. 2. 0.]]]
+        """
+        return cls(cells=cells_of(shape, fluid, solid), **options)
 
     def update(self, cells: wp.array[Any]) -> None:
         """Take new cell types, and what face coefficients and shift in padded arrays have become, in place and without allocating.
