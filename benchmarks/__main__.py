@@ -11,7 +11,8 @@ from pathlib import Path
 from warp_lcp.benchmarks.harness.timing import Options
 
 SUITES = (
-    "kernels", "solvers", "scaling", "threads", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff", "validation", "extremes",
+    "kernels", "solvers", "scaling", "tank", "threads", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff", "validation",
+    "extremes",
 )  # fmt: skip
 
 
