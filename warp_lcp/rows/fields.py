@@ -227,7 +227,7 @@ class PaddedLayout(Layout):
         k, j = np.nonzero(used)
         if self.chunks is None or not k.size:
             return
-        self.sparse = 4 * np.count_nonzero(self.chunks.numpy()[:, 0, 1]) < 3 * len(self.chunks)
+        self.sparse = 4 * int(np.count_nonzero(self.chunks.numpy()[:, 0, 1])) < 3 * len(self.chunks)
         begin = 4 * ((k + 1) * self.padding.plane + (j + 1) * self.padding.row)  # bytes, of a field of four each
 
         def taken(page: int) -> int:
