@@ -56,7 +56,7 @@ class GridPoisson(Pickled):
 
     Args:
         cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or wp.array. Unknowns live on FLUID cells,
-            fields have the shape of `cells`.
+            fields have the shape of `cells`, but on the CPU their memory is taken only near rows that have held FLUID cells.
         face_x: c_f >= 0 of the faces normal to x: a number or an array (nz, ny, nx + 1), or (ny, nx + 1) in 2-D.
         face_y: likewise, (nz, ny + 1, nx).
         face_z: likewise, (nz + 1, ny, nx); 2-D has none.
