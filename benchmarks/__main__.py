@@ -11,7 +11,7 @@ from pathlib import Path
 from warp_lcp.benchmarks.harness.timing import Options
 
 SUITES = (
-    "kernels", "solvers", "scaling", "threads", "domains", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff",
+    "kernels", "solvers", "scaling", "tank", "threads", "domains", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff",
     "validation", "extremes",
 )  # fmt: skip
 

@@ -99,6 +99,11 @@ SCALING = Suite(
     "linear and LCP solves from 32^3 up to what memory holds: seconds to three tolerances, bytes a cell, exponents, floors",
     "3 minutes; with --engine petsc MPI and PETSc",
 )
+TANK = Suite(
+    "tank",
+    "a tank filled to 30 %, up to 768^3 cells: seconds, iterations and bytes a cell of the box and of the liquid, on all cores",
+    "3 minutes",
+)
 THREADS = Suite(
     "threads",
     "kernels, cycles, solves and steps of scenes on 1, 2, 4, ... threads up to all cores, against what memory allows",

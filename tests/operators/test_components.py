@@ -1,6 +1,7 @@
 """Floating components against SciPy's connected components of the dense graph."""
 
 import numpy as np
+import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -8,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 import warp_lcp as wl
 from oracle import assemble
+from warp_lcp.operators.components import ComponentFinder
 
 
 def expected_labels(cells, faces, shift, periodic):
@@ -60,3 +62,15 @@ def test_found_again_after_the_cells_changed():
     cells[0, 0] = wl.AIR
     A.update(wp.array(np.pad(cells[None], 1), device="cpu"))
     assert A.floating_components() is None
+
+
+def test_cells_that_stay_the_same_are_not_searched_again(device, monkeypatch):
+    cells = np.full((3, 4, 5), wl.FLUID, dtype=np.int8)
+    cells[-1] = wl.AIR
+    A = wl.GridPoisson(cells, device=device)
+    assert A.floating_components() is None
+    monkeypatch.setattr(ComponentFinder, "_grow", lambda *_: pytest.fail("searched"))
+    assert A.floating_components() is None
+    monkeypatch.undo()
+    A.update(wp.array(np.full_like(cells, wl.FLUID), device=device))
+    assert A.floating_components().count == 1

@@ -17,7 +17,7 @@ from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.operators.stencil import Stencil, coarsen_spans_kernel
 from warp_lcp.rows import Bound, RowPass, Rows
-from warp_lcp.rows.fields import Padding, zeros
+from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.program import Launch, Program, Task
 from warp_lcp.rows.sequence import CUDA_THREADS
 from warp_lcp.rows.vectors import convert
@@ -37,7 +37,7 @@ class Level:
 
     def __init__(self, stencil: Stencil, real: Any, *, bounded: bool, upper: bool = True, bounds: Pair | None = None) -> None:
         self.stencil, self.real = stencil, real
-        field: Callable[[], wp.array[Any]] = lambda: zeros(stencil.padding.size, real, stencil.device)  # noqa: E731
+        field: Callable[[], wp.array[Any]] = lambda: stencil.padding.zeros(real, stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
         nothing = wp.empty(0, dtype=real, device=stencil.device)
         self.lower, self.upper = (bounds or (field(), field() if upper else nothing)) if bounded else (self.x, self.x)
@@ -412,10 +412,11 @@ class Hierarchy:
         s, counts = fine.stencil, fine.stencil.padding.counts
         whole = whole_counts(s)
         factors = self._factors(whole)
-        padding = Padding(tuple(-(-n // f) for n, f in zip(counts, reversed(factors), strict=True)))  # type: ignore[arg-type]
+        fewer: Any = tuple(-(-n // f) for n, f in zip(counts, reversed(factors), strict=True))
+        padding = Padding(fewer, s.padding.small_pages)
         for axis in range(3):  # a coarse face is as many finer ones as the other axes were aggregated by
             self._strength[axis] *= math.prod(factors) / factors[axis]
-        new = [wp.zeros(padding.size, dtype=self.real, device=self.device) for _ in range(4)]
+        new = [padding.zeros(self.real, self.device) for _ in range(4)]
         periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(padding.counts), strict=True))
         spans = None if s.spans is None else wp.zeros(padding.counts[:2], dtype=wp.vec2i, device=self.device)
         weights = (new[1], new[2], new[3])
@@ -443,8 +444,8 @@ def _finest_level(stencil: Stencil, real: Any, *, bounded: bool, bounds: Pair | 
     d_type = wp.uint8 if stencil.d.dtype is wp.uint8 and not shifted else real
     weights = stencil.weights
     if weights is not None and weights[0].dtype is not real:
-        weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)
-    d = wp.zeros(stencil.d.size, dtype=d_type, device=stencil.device)
+        weights = tuple(stencil.padding.zeros(real, w.device) for w in weights)
+    d = stencil.padding.zeros(d_type, stencil.device)
     unit = stencil.unit if d_type is wp.uint8 else 1.0
     finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans, ghosts=stencil.ghosts)
     return Level(finest, real, bounded=bounded, bounds=bounds)

@@ -189,13 +189,19 @@ class ComponentFinder:
     def __init__(self, A: GridPoisson) -> None:
         self._A, device = A, A.device
         self._own: Scratch | None = None
+        self._none_at = -1  # the operator's version that had no floating components
         self._count = wp.zeros(1, dtype=wp.int32, device=device)
 
     def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the floating components, or None if there are none; `scratch` as in GridPoisson.floating_components."""
         A = self._A
+        if self._none_at == A.version:
+            return None
         parent, grounded = self._grow(scratch, A.cells_around)
-        return self._label(parent.numpy(), grounded.numpy()) if self._count.numpy()[0] else None
+        if self._count.numpy()[0]:
+            return self._label(parent.numpy(), grounded.numpy())
+        self._none_at = A.version
+        return None
 
     def _grow(self, scratch: Scratch | None, joined: wp.array[Any]) -> Scratch:
         """Return each cell's parent in the tree of its component, and which roots something holds; their number is `_count`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.operators.cell_lists import cells_of
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.stencil import Ghosts, Stencil, find_spans_kernel
 from warp_lcp.problem.pickling import OnHost, Pickled, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import PaddedLayout, check_kept, check_storable, real_array
+from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, real_array
 from warp_lcp.rows.vectors import Across
 
 HEADERS = Path(__file__).parent / "headers"
@@ -54,7 +56,7 @@ class GridPoisson(Pickled):
 
     Args:
         cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or wp.array. Unknowns live on FLUID cells,
-            fields have the shape of `cells`.
+            fields have the shape of `cells`, but on the CPU their memory is taken only near rows that have held FLUID cells.
         face_x: c_f >= 0 of the faces normal to x: a number or an array (nz, ny, nx + 1), or (ny, nx + 1) in 2-D.
         face_y: likewise, (nz, ny + 1, nx).
         face_z: likewise, (nz + 1, ny, nx); 2-D has none.
@@ -109,14 +111,44 @@ class GridPoisson(Pickled):
         self.faces = [self._stored_face(f, axis) for axis, f in enumerate(faces)]
         self.shift = self._stored_shift(shift)
         self._check_sums()
-        self.cells = wp.full(self.layout.stored_shape, SOLID, dtype=wp.int8, device=self.device)
+        padded = np.full(self.layout.stored_shape, SOLID, dtype=np.int8)
+        padded[1:-1, 1:-1, 1:-1] = host.reshape(counts)
+        self.cells = wp.array(padded, device=self.device, copy=self.device.is_cuda)
         self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) or self._ghosts is not None else self.cells
-        self._spans = wp.zeros((counts[0], counts[1]), dtype=wp.vec2i, device=self.device)
+        self._spans, self._reach = (wp.zeros(counts[:2], dtype=wp.vec2i, device=self.device) for _ in range(2))
+        whole = self.device.is_cuda or self.cells_around is not self.cells or self.layout.size < LARGE
+        chunks = 0 if whole else -(-self.layout.size // CPU_CHUNK)
+        self._chunks = wp.zeros((chunks, 1), dtype=wp.vec2i, device=self.device)
+        self.layout.chunks = self._chunks if chunks else None
+        self._find_rows()
+        self.layout.find_use(self._reach.numpy()[..., 1] > 0)
         self.version = 0
         self.stencil = self._empty_stencil()
         self._mask: wp.array[Any] | None = None
         self._finder: ComponentFinder | None = None
-        self._refill(wp.array(np.pad(host.reshape(counts), 1).astype(np.int8), device=self.device))
+        self._fill_stencil()
+
+    @classmethod
+    def from_cells(cls, shape: Sequence[int], fluid: Any, solid: Any = (), **options: Any) -> GridPoisson:
+        """Make the operator of a grid from lists of its FLUID and SOLID cells, the others being AIR.
+
+        Args:
+            shape: cells along each axis, (nz, ny, nx) or (ny, nx).
+            fluid: indices of FLUID cells, integers of shape (n, 3), a row (k, j, i) a cell as it is found in fields, or (n, 2) in 2-D;
+                numpy or wp.array. The order of the cells does not matter; lists in the order of memory are taken fastest.
+            solid: likewise of SOLID cells.
+            options: all that the class takes beside `cells`.
+
+        Raises:
+            ValueError: a list has another shape or type, a cell is not in the grid, is listed twice or in both lists; the message names it.
+
+        Example:
+            >>> import warp_lcp as wl
+            >>> A = wl.GridPoisson.from_cells((1, 1, 3), fluid=[(0, 0, 0), (0, 0, 1)], device="cpu")
+            >>> print(A.diagonal().numpy())
+            [[[1. 2. 0.]]]
+        """
+        return cls(cells=cells_of(shape, fluid, solid), **options)
 
     def update(self, cells: wp.array[Any]) -> None:
         """Take new cell types, and what face coefficients and shift in padded arrays have become, in place and without allocating.
@@ -222,7 +254,7 @@ class GridPoisson(Pickled):
     @property
     def unknowns(self) -> int:
         """Number of FLUID cells, those of ghosts not counted."""
-        return int(np.count_nonzero(self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID))
+        return sum(int(np.count_nonzero(plane == FLUID)) for plane in self.cells.numpy()[1:-1, 1:-1, 1:-1])
 
     def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
         """Return the coefficients of lower faces as a padded array, or an empty array for a number."""
@@ -304,11 +336,19 @@ class GridPoisson(Pickled):
 
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
-        counts, s = self.layout.padding.counts, self.stencil
-        padding, whole = self.layout.padding, self._whole_rows
         if cells is not self.cells:
-            COPY_CELLS.bind(whole, source=cells.flatten(), to=self.cells.flatten()).launch()
-        wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans], device=self.device)
+            COPY_CELLS.bind(Rows.of(self.layout.padding, self.device), source=cells.flatten(), to=self.cells.flatten()).launch()
+        self._find_rows()
+        self._fill_stencil()
+
+    def _find_rows(self) -> None:
+        """Find what of each row is in use."""
+        counts = self.layout.padding.counts
+        wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans, self._reach, self._chunks], device=self.device)
+
+    def _fill_stencil(self) -> None:
+        """Compute diagonal and weights, on rows that are in use or have been."""
+        s, padding, reach = self.stencil, self.layout.padding, self._rows_in_reach
         self.version += 1
         if self.cells_around is not self.cells:
             wp.copy(self.cells_around, self.cells)
@@ -316,20 +356,20 @@ class GridPoisson(Pickled):
         around = {"cells": self.cells_around.flatten()}
         if self._counts_faces:
             axes: dict[str, Any] = {f"around_{a}": c > 0 for a, c in zip(AXES, self.uniform, strict=True)}
-            COUNT_FACES.bind(whole, **around, diagonal=s.d, **axes).launch()
+            COUNT_FACES.bind(reach, **around, diagonal=s.d, **axes).launch()
             return
         faces: dict[str, Any] = {}
         for axis, field, number in zip(AXES, self.faces, self.uniform, strict=True):
             faces |= {f"f{axis}": field.flatten() if field.size else None, f"n{axis}": number, f"FIELD_{axis.upper()}": field.size > 0}
         shift = self.shift.flatten() if self.shift.size else None
-        DIAGONAL.bind(whole, **around, **faces, shift=shift, SHIFTED=self.shift.size > 0, diagonal=s.d).launch()
+        DIAGONAL.bind(reach, **around, **faces, shift=shift, SHIFTED=self.shift.size > 0, diagonal=s.d).launch()
         if s.weights is not None:
             weights = dict(zip(("wx", "wy", "wz"), s.weights, strict=True))
             WEIGHTS.bind(Rows.of(padding, self.device, more=1), **around, **faces, **weights).launch()
 
     @cached_property
-    def _whole_rows(self) -> Rows:
-        return Rows.of(self.layout.padding, self.device)
+    def _rows_in_reach(self) -> Rows:
+        return Rows.of(self.layout.padding, self.device, self._reach)
 
 
 def _checked_cells(cells: Any) -> np.ndarray:

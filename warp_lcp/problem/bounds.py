@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Array, Layout, real_array
+from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
@@ -110,10 +110,10 @@ class Bounds:
             return
         if self._memory is None:
             self._memory = self.layout.zeros(wp.uint8)
-            self._others = wp.zeros(self._rows.places, dtype=wp.float64, device=self.device)
+            self._others = wp.zeros(Rows.of_fields(self.layout).places, dtype=wp.float64, device=self.device)
         least, most = (0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True))
         given = {"lower": self.fields[0], "upper": self.fields[1], "least": least, "most": most, "code": self._memory}
-        ENCODE.bind(self._rows, **given, out=self._others).launch()
+        ENCODE.bind(Rows.of_fields(self.layout), **given, out=self._others).launch()
         self.code = self._no_code if self._others.numpy().any() else self._memory
 
     def as_field(self, side: int) -> wp.array[Any]:
@@ -123,7 +123,7 @@ class Bounds:
         field = wp.full(self.layout.size, self.values[side], dtype=wp.float64, device=self.device)
         if self.code.size and not self.in_place:
             given: dict[str, Any] = {"bit": BITS[side], "value": self.values[side], "infinite": INFINITE[side]}
-            DECODE.bind(self._rows, code=self.code, field=field, **given).launch()
+            DECODE.bind(Rows.flat(self.layout.size, self.device), code=self.code, field=field, **given).launch()
         return field
 
     def host(self, side: int) -> np.ndarray:
@@ -135,13 +135,9 @@ class Bounds:
             field[self.code.numpy() & BITS[side] == 0] = INFINITE[side]
         return field
 
-    @property
-    def _rows(self) -> Rows:
-        return Rows.flat(self.layout.size, self.device)
-
     def _code_from_host(self, sides: tuple[Array, Array]) -> bool:
         """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
-        code, values = np.zeros(self.layout.stored_shape, dtype=np.uint8), list(self.values)
+        code, values = self.layout.host_zeros(wp.uint8), list(self.values)
         for side in (0, 1):
             host = real_array(sides[side], NAMES[side])
             if not self.varying[side]:
@@ -154,7 +150,7 @@ class Bounds:
                 return False
             values[side] = value
         self.values = values
-        self.code = wp.array(code.ravel(), dtype=wp.uint8, device=self.device)
+        self.code = wp.array(code.ravel(), dtype=wp.uint8, device=self.device, copy=self.device.is_cuda)
         return True
 
     def _code_rows(self, side: int, host: np.ndarray, value: float, code: np.ndarray) -> bool:
@@ -165,6 +161,13 @@ class Bounds:
             target += (BITS[side] * finite).astype(np.uint8).reshape(target.shape)
             return not (finite & (host != value)).any()
         target = target if target.ndim == 3 else target.reshape(1, 1, -1)
+        host = host.reshape(target.shape)
+        at_once = len(host) if host.dtype == np.float64 else -(-LARGE // host[0].size)  # else a copy is made
+        parts = [slice(k, k + at_once) for k in range(0, len(host), at_once)]
+        return all(self._code_part(side, host[part], value, code, target[part]) for part in parts)
+
+    def _code_part(self, side: int, host: np.ndarray, value: float, code: np.ndarray, target: np.ndarray) -> bool:
+        """Do that for some planes of the code."""
         first = target.__array_interface__["data"][0] - code.__array_interface__["data"][0]
         rows = Rows.strided(code.size, wp.get_device("cpu"), (first, *target.strides[:2]), target.shape)
         arrays = (np.ascontiguousarray(host, dtype=np.float64).ravel(), code.ravel(), np.zeros(rows.places))

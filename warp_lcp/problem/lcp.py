@@ -12,7 +12,7 @@ from warp_lcp.problem.bounds import HEADERS, INFINITE, LAUNCHED, Bounds
 from warp_lcp.problem.pickling import OnHost, Pickled
 from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Array, Layout, real_array
+from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
 from warp_lcp.rows.vectors import ADD, rows_of
 
 CHECK = RowPass(
@@ -78,7 +78,7 @@ class LCP(Pickled):
         A = as_operator(A, b.device if isinstance(b, wp.array) else None)
         self.A, self.layout = A, layout_of(A)
         self.unknown = _unknown(A, self.layout)
-        if has(A, HasCells) and self._totals(np.array([np.count_nonzero(self.unknown.numpy() == 1)])) == [0]:
+        if has(A, HasCells) and self._totals(np.array([_count(self.unknown.numpy())])) == [0]:
             raise ValueError("A has no unknowns: the problem is empty")
         self.in_place = isinstance(b, wp.array) and self.layout.holds(b, wp.float64) and tuple(b.shape) != tuple(A.shape)
         self.b = self.layout.load(b, wp.float64, "b")
@@ -129,7 +129,7 @@ class LCP(Pickled):
             b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
             faults = (~np.isfinite(b), np.isnan(lower), np.isnan(upper), lower > upper, lower == np.inf, upper == -np.inf)
             return self._totals(np.array([np.count_nonzero(fault) for fault in faults]))
-        rows = Rows.flat(self.layout.size, self.device)
+        rows = Rows.of_fields(self.layout)
         counts = wp.zeros(len(CHECK.sums) * rows.places, dtype=wp.float64, device=self.device)
         CHECK.bind(rows, bounds=bounds.operands, b=field, unknown=self.unknown, out=counts).launch()
         return self._totals(counts.numpy().reshape(-1, rows.places).sum(axis=1))
@@ -150,6 +150,11 @@ class LCP(Pickled):
                 raise ValueError(f"{name} holds {wrong}: no x could meet it")
         if crossed:
             raise ValueError(f"lower > upper in {crossed} unknowns")
+
+
+def _count(unknown: np.ndarray) -> int:
+    """Return how many entries are 1."""
+    return sum(int(np.count_nonzero(part == 1)) for part in np.array_split(unknown, 1 + unknown.size // LARGE))
 
 
 def _unknown(A: Operator, layout: Layout) -> wp.array[Any]:

@@ -19,7 +19,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.problem.scale import scale_by_products
 from warp_lcp.rows import Known, RowPass, Rows
-from warp_lcp.rows.vectors import Sums, rows_of
+from warp_lcp.rows.vectors import Sums
 
 HEADERS = Path(__file__).parent / "headers"
 f64, i8 = wp.float64, wp.int8
@@ -55,7 +55,7 @@ class NaturalResidual:
         self.diagonal = stencil.d if stencil else wp.zeros(layout.size, dtype=problem.A.dtype, device=layout.device)
         self.unit = float(stencil.unit) if stencil else 1.0
         self._diagonal_of = None if stencil else version_of(problem.A)  # of an operator whose scale is a copy
-        self._sums = Sums(Rows.flat(layout.size, layout.device), across=layout.across)
+        self._sums = Sums(Rows.of_fields(layout), across=layout.across)
         if not stencil:
             self.rescale()
 
@@ -90,7 +90,7 @@ class NaturalResidual:
             self.rescale()
         for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
             p.bounds.follow(x)
-            WITHIN.bind(rows_of(x), bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=keep).launch()
+            WITHIN.bind(Rows.of_fields(p.layout), bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=keep).launch()
         self.current = False
 
     def rescale(self) -> None:
@@ -126,7 +126,7 @@ class NaturalResidual:
         p, sizes = self.problem, self.row_sizes
         zero_if_empty = self.diagonal if sizes is None else sizes  # of grids, only an empty row has a zero diagonal
         fields = {"d": zero_if_empty, "b": p.b, "unknown": p.unknown, "x": x}
-        SETTLE_ISOLATED.bind(rows_of(x), bounds=p.bounds.operands, **fields).launch()
+        SETTLE_ISOLATED.bind(Rows.of_fields(p.layout), bounds=p.bounds.operands, **fields).launch()
         self.current = False
 
     def unattainable(self) -> float:

@@ -160,14 +160,13 @@ class IterateMemory:
     def keep(self) -> None:
         """Remember x as the best iterate."""
         if self._best is None:
-            self._best = wp.clone(self.x)
-        else:
-            wp.copy(self._best, self.x)
+            self._best = self.problem.layout.zeros(wp.float64)
+        self.problem.layout.copy(self._best, self.x)
 
     def restore(self) -> None:
         """Make x the best iterate again."""
         if self._best is not None:
-            wp.copy(self.x, self._best)
+            self.problem.layout.copy(self.x, self._best)
 
     def round_iterate(self) -> None:
         """Round x to its precision."""
@@ -432,7 +431,7 @@ class _LoopInBox(_Loop):
         return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
 
     def _take(self, guess: wp.array[Any]) -> None:
-        wp.copy(self.work.x, guess)
+        self.problem.layout.copy(self.work.x, guess)
         self.residual.start(self.work.x, keep=True)
         self.work.round_iterate()
         if not math.isfinite(self.residual.evaluate(self.work.x)):

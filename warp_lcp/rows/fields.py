@@ -6,24 +6,37 @@ A user's field has the operator's shape; a *stored* field is a flat array of `si
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import mmap
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 Array = Any  # a numpy array or a wp.array
+CPU_CHUNK = 8192  # elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
+LARGE = 1 << 20  # elements from which a field of the CPU is looked through for what of it is in use
+HUGE_PAGE, SMALL_PAGE = 1 << 21, 1 << 12  # bytes that the system gives memory by, when something in them is first written
 
 
-def zeros(n: int, dtype: Any, device: wp.Device) -> wp.array[Any]:
-    """Return a flat field of zeros.
+def zeros(n: int, dtype: Any, device: wp.Device, *, small_pages: bool = False) -> wp.array[Any]:
+    """Return a flat field of zeros, whose memory on the CPU is taken when it is first written.
 
     On the CPU it is NumPy's memory: NumPy asks for huge pages, Warp does not. At 128^3 that makes a workspace in 5 instead of 20 ms, and
-    solves 10 % faster, for a pass over many fields misses in the table of small pages.
+    solves 10 % faster, for a pass over many fields misses in the table of small pages. `small_pages` are for fields of which so little is
+    written, here and there, that huge ones would be taken for all of it.
     """
-    if device.is_cpu:
-        return wp.array(np.zeros(n, dtype=wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=False)
-    return wp.zeros(n, dtype=dtype, device=device)
+    if not device.is_cpu:
+        return wp.zeros(n, dtype=dtype, device=device)
+    kind = np.dtype(wp.dtype_to_numpy(dtype))
+    if small_pages and n * kind.itemsize > HUGE_PAGE and hasattr(mmap, "MAP_ANONYMOUS"):
+        memory = mmap.mmap(-1, n * kind.itemsize, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        if hasattr(mmap, "MADV_NOHUGEPAGE"):
+            memory.madvise(mmap.MADV_NOHUGEPAGE)
+        host: np.ndarray = np.frombuffer(memory, dtype=kind)
+    else:
+        host = np.zeros(n, dtype=kind)
+    return wp.array(host, dtype=dtype, device=device, copy=False)
 
 
 def real_array(values: Any, name: str) -> np.ndarray:
@@ -75,9 +88,14 @@ class Layout:
 
     Attributes:
         across: who stores the other parts of the fields, see `warp_lcp.rows.vectors.Across`; None: nobody.
+        chunks: (0, its elements) of each chunk of `CPU_CHUNK` elements that has ever been in use, (0, 0) of others, where fields are 0
+            and stay untouched: wp.vec2i, shape (chunks, 1); None: all are in use.
+        rows: what `warp_lcp.rows.Rows.of_fields` has made of that.
     """
 
     across: Any = None
+    chunks: wp.array[Any] | None = None
+    rows: Any = None
 
     def __init__(self, shape: tuple[int, ...], device: wp.Device) -> None:
         self.shape, self.device = tuple(shape), device
@@ -113,10 +131,22 @@ class Layout:
         host = real_array(field, name)
         if not self.fits(host):
             raise ValueError(f"{name} has shape {host.shape}: expected {self.shape}")
-        stored = np.zeros(self.stored_shape, dtype=wp.dtype_to_numpy(dtype))
+        stored = self.host_zeros(dtype)
         target = self.target(stored, host)
-        target[...] = host.reshape(target.shape)
+        self._fill(target, host.reshape(target.shape))
         return wp.array(stored.ravel(), dtype=dtype, device=self.device, copy=self.device.is_cuda)
+
+    def host_zeros(self, dtype: Any) -> np.ndarray:
+        """Return zeros of the stored shape on the host."""
+        return zeros(self.size, dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+
+    def copy(self, to: wp.array[Any], source: wp.array[Any]) -> None:
+        """Copy a stored field to another one of its type."""
+        wp.copy(to, source)
+
+    def _fill(self, target: np.ndarray, host: np.ndarray) -> None:
+        """Write an array to a part of a stored field of zeros."""
+        target[...] = host
 
     def fits(self, host: np.ndarray) -> bool:
         """Return whether an array has the operator's shape or a stored one."""
@@ -141,9 +171,19 @@ class Layout:
 
 @dataclass(frozen=True)
 class Padding:
-    """Counts of cells (nz, ny, nx) and of stored cells, which include one ghost cell on every side."""
+    """Counts of cells (nz, ny, nx) and of stored cells, which include one ghost cell on every side.
+
+    Args:
+        counts: of cells.
+        small_pages: of what fields are made, see `zeros`.
+    """
 
     counts: tuple[int, int, int]
+    small_pages: bool = False
+
+    def zeros(self, dtype: Any, device: wp.Device) -> wp.array[Any]:
+        """Return a flat stored field of zeros."""
+        return zeros(self.size, dtype, device, small_pages=self.small_pages)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -176,10 +216,72 @@ class PaddedLayout(Layout):
         nz, ny, nx = shape if len(shape) == 3 else (1, *shape)
         self.padding = Padding((nz, ny, nx))
         self.stored_shape = self.padding.shape
+        self.sparse = False  # whether so little is in use that zeros elsewhere are better not written
+
+    def find_use(self, used: np.ndarray) -> None:
+        """Choose how fields take their memory, from which rows are in use at first.
+
+        Args:
+            used: bool, shape (nz, ny).
+        """
+        k, j = np.nonzero(used)
+        if self.chunks is None or not k.size:
+            return
+        self.sparse = 4 * int(np.count_nonzero(self.chunks.numpy()[:, 0, 1])) < 3 * len(self.chunks)
+        begin = 4 * ((k + 1) * self.padding.plane + (j + 1) * self.padding.row)  # bytes, of a field of four each
+
+        def taken(page: int) -> int:
+            first, last = begin // page, (begin + 4 * self.padding.row - 1) // page
+            return page * int((last - first + 1).sum() - np.count_nonzero(first[1:] == last[:-1]))
+
+        if self.sparse and taken(HUGE_PAGE) > 1.25 * taken(SMALL_PAGE):
+            self.padding = replace(self.padding, small_pages=True)
+
+    def zeros(self, dtype: Any) -> wp.array[Any]:
+        """Return a stored field of zeros."""
+        return self.padding.zeros(dtype, self.device)
+
+    def host_zeros(self, dtype: Any) -> np.ndarray:
+        """Return zeros of the stored shape on the host."""
+        return self.padding.zeros(dtype, wp.get_device("cpu")).numpy().reshape(self.stored_shape)
+
+    def copy(self, to: wp.array[Any], source: wp.array[Any]) -> None:
+        """Copy what is in use of a stored field to another one of its type, which is 0 elsewhere."""
+        if not self.sparse:
+            wp.copy(to, source)
+            return
+        a, b = to.numpy(), source.numpy()
+        for begin, end in self._runs():
+            a[begin:end] = b[begin:end]
+
+    def _runs(self) -> list[tuple[int, int]]:
+        """Return the elements that are in use, as few ranges."""
+        assert self.chunks is not None
+        edges = np.flatnonzero(np.diff(self.chunks.numpy()[:, 0, 1] > 0, prepend=False, append=False))
+        return [(int(a) * CPU_CHUNK, min(int(b) * CPU_CHUNK, self.size)) for a, b in edges.reshape(-1, 2)]
+
+    def _fill(self, target: np.ndarray, host: np.ndarray) -> None:
+        if not self.sparse:
+            target[...] = host
+            return
+        for plane, values in zip(target, host, strict=True):
+            rows = np.flatnonzero(values.any(axis=1))
+            if rows.size:
+                plane[rows[0] : rows[-1] + 1] = values[rows[0] : rows[-1] + 1]
 
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape."""
         inner = stored.reshape(self.stored_shape)[1:-1, 1:-1, 1:-1]
+        if self.sparse:
+            inside, padding = inner.numpy(), self.padding
+            field = zeros(math.prod(padding.counts), stored.dtype, self.device, small_pages=padding.small_pages)
+            out = field.numpy().reshape(padding.counts)
+            for begin, end in self._runs():
+                for k in range(max(begin // padding.plane - 1, 0), min(-(-end // padding.plane) - 1, len(out))):
+                    first = (k + 1) * padding.plane
+                    low, high = max(begin - first, padding.row) // padding.row - 1, max(-(-(end - first) // padding.row) - 1, 0)
+                    out[k, low:high] = inside[k, low:high]
+            return field.reshape(self.shape)
         if self.device.is_cpu:  # NumPy copies strided rows four times as fast
             return wp.array(np.ascontiguousarray(inner.numpy()).reshape(self.shape), dtype=stored.dtype, device=self.device, copy=False)
         return inner.contiguous().reshape(self.shape)

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.fields import CPU_CHUNK, Layout, Padding
 
-CPU_CHUNK = 8192  # elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
 CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large GPU
 # planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of a method
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
@@ -230,6 +229,16 @@ class Rows:
     def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":
         """Return a flat field as one row, on CUDA as rows as long as there are threads that sum; `serial`: one row for one thread."""
         return _flat(size, device.alias, serial)
+
+    @staticmethod
+    def of_fields(layout: Layout) -> "Rows":
+        """Return a layout's stored fields as one row, without the chunks of it that have never been in use; sums have the same order."""
+        if layout.rows is None:
+            layout.rows = Rows.flat(layout.size, layout.device)
+            if layout.chunks is not None:
+                counts = (len(layout.chunks), 1, CPU_CHUNK)
+                layout.rows = Rows.strided(layout.size, layout.device, (0, CPU_CHUNK, 0), counts, layout.chunks, cells=CPU_CHUNK, slab=1)
+        return layout.rows
 
     @staticmethod
     def box(low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, cells: int | None = None) -> "Rows":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.multigrid.cycle_passes import UNMARK
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.shared_levels import clear_ghosts
 from warp_lcp.multigrid.turning import make_hierarchy
@@ -145,7 +146,7 @@ class MultigridWorkspace(IterateMemory):
         options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
         self.hierarchy = make_hierarchy(A.stencil, real, **options)
         super().__init__(problem, precision, residual=self._residual(problem, precision is Precision.SINGLE))
-        self._flat = Rows.flat(problem.layout.size, A.device)
+        self._flat = Rows.of_fields(problem.layout)
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
@@ -169,7 +170,7 @@ class MultigridWorkspace(IterateMemory):
     def restore(self) -> None:
         """Make x the best iterate again."""
         if self._stored:
-            wp.copy(self.x, self._best)
+            self.problem.layout.copy(self.x, self._best)
         elif self._past == 1:
             self._undo(self.x)
         self.residual.set(kernels.STEP, 0.0)
@@ -191,11 +192,11 @@ class MultigridWorkspace(IterateMemory):
     def _keep_stored(self, *, by_undoing: bool) -> None:
         """Store x, or where its last step began."""
         if self._best is None:
-            self._best = wp.empty_like(self.x)
+            self._best = self.problem.layout.zeros(wp.float64)
         if by_undoing:
             self._undo(self._best)
         else:
-            wp.copy(self._best, self.x)
+            self.problem.layout.copy(self._best, self.x)
         self._stored = True
 
     def _undo(self, out: wp.array[Any]) -> None:
@@ -210,7 +211,8 @@ class MultigridWorkspace(IterateMemory):
         self._descent.start(self.residual.energy, self.residual.norm)
         self._tolerance, self._pace, self._algebraic = tolerance, Pace(tolerance), None
         self._forget()
-        self.hierarchy.finest.x[: self.x.size // 4 + 1].zero_()  # its bytes were scratch memory
+        if self.scratch is not None:
+            UNMARK.bind(self._flat, changed=self.scratch[1]).launch()
         size = float(self.residual.scalars.numpy()[int(kernels.SIZE)])
         rescale = not 1e-6 < self.residual.norm / size < 1e6  # corrections in float32 would overflow, or vanish
         if rescale:
