@@ -89,7 +89,8 @@ class SandSimulation(ParticleSimulation):
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress = Stress(self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried)
         self.outcome = SandReport(self.stress)
-        wp.copy(self.packing.kind, self.solids.base)
+        inner = (slice(1, -1),) * 3
+        wp.copy(self.packing.kind[inner], self.solids.base[inner])
 
     def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
         """Go on on another grid of the same domain, see the base class."""
