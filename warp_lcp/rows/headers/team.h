@@ -118,14 +118,14 @@ const auto help = [=](Word* H, Word runs, Long limit) -> int {  // work through 
         else relax(++spins, YIELDS); } };
 
 if (mode == QUIT) { set(T + QUITS, 1); wake(); }
-else if (mode == CANCEL) {  // nobody takes any more; wait for those who have
-    const Word runs = get(H + RUNS); Word left = 0; int spins = 0;
+else if (mode == CANCEL) {  // nobody takes any more, who comes later neither; wait for those who have
+    const Word runs = get(H + RUNS), after = (runs + 1) & 0xffffffff; Word left = 0; int spins = 0;
     for (Word o = 0; o < H[COUNT]; ++o) for (Word l = 0; l < ((Word*)H[OPERATIONS] + o*WORDS)[LANES]; ++l) {
         const Word* op = (const Word*)H[OPERATIONS] + o*WORDS; const Word all = start_of(op, l + 1) - start_of(op, l);
-        const Word w = __atomic_exchange_n((Word*)op[TAKEN] + l*LANE_WORDS, runs << 32 | all, __ATOMIC_SEQ_CST);
+        const Word w = __atomic_exchange_n((Word*)op[TAKEN] + l*LANE_WORDS, after << 32 | all, __ATOMIC_SEQ_CST);
         left += all - (w >> 32 == runs ? (w & 0xffff) + (w >> 16 & 0xffff) : 0); }
     while (get(H + DONE) + left < H[TOTAL]) relax(++spins, YIELDS);
-    set(H + RUNS, (runs + 1) & 0xffffffff);
+    set(H + RUNS, after);
 } else if (mode == RUN) {  // share: 0: alone, 1: with the team, 2: go on
     if (share < 2) { H[SHARED] = 0; set(H + DONE, 0); set(H + RUNS, (get(H + RUNS) + 1) & 0xffffffff); }
     if (share == 1) {
