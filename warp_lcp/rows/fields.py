@@ -261,10 +261,14 @@ class PaddedLayout(Layout):
         return [(int(a) * CPU_CHUNK, min(int(b) * CPU_CHUNK, self.size)) for a, b in edges.reshape(-1, 2)]
 
     def _fill(self, target: np.ndarray, host: np.ndarray) -> None:
-        for plane, values in zip(target, host, strict=True) if self.sparse else [(target, host)]:
-            rows = np.flatnonzero(values.any(axis=1)) if self.sparse else ()
-            within = slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 0) if self.sparse else slice(None)
-            plane[within] = values[within]
+        if not self.sparse:
+            super()._fill(target, host)
+            return
+        for plane, values in zip(target, host, strict=True):
+            rows = np.flatnonzero(values.any(axis=1))
+            if rows.size:
+                within = slice(rows[0], rows[-1] + 1)
+                plane[within] = values[within]
 
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape."""
