@@ -262,12 +262,13 @@ class PaddedLayout(Layout):
 
     def _fill(self, target: np.ndarray, host: np.ndarray) -> None:
         if not self.sparse:
-            target[...] = host
+            super()._fill(target, host)
             return
         for plane, values in zip(target, host, strict=True):
             rows = np.flatnonzero(values.any(axis=1))
             if rows.size:
-                plane[rows[0] : rows[-1] + 1] = values[rows[0] : rows[-1] + 1]
+                within = slice(rows[0], rows[-1] + 1)
+                plane[within] = values[within]
 
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape."""
