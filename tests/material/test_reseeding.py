@@ -8,6 +8,8 @@ from pydantic import ValidationError
 
 from small_liquids import advance, box, create, dam, scene
 from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import Window
+from warp_lcp.material import reseeding_kernels as kernels
 from warp_lcp.material.reseeding import Reseeding
 from warp_lcp.scene.table import SceneError
 
@@ -42,6 +44,22 @@ def counts(grid: Any, particles: Particles) -> np.ndarray:
 def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
     """Return one that is sure of its arguments."""
     return Reseeding(simulation.grid, simulation.boundary, least=least, most=most, particles_a_cell=2**simulation.grid.dimension, every=1)
+
+
+def test_nothing_is_sought_beyond_an_open_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ring there is open as cells are, and a look at its neighbors would leave the memory."""
+    simulation = dam(3, particles={"reseed": {"every": 1}}, domain={"size": [1.0, 0.5, 0.25], "resolution": 16, "open": ["top", "right"]})
+    launch, sought = Window.launch, []
+
+    def noted(window: Window, kernel: Any, inputs: list[Any], **more: Any) -> None:
+        if kernel is kernels.find_kernel:
+            sought.append(window)
+        launch(window, kernel, inputs, **more)
+
+    monkeypatch.setattr(Window, "launch", noted)
+    simulation.rearrangement.reseeding.apply(simulation.particles, simulation.grid.everywhere, 0)  # type: ignore[union-attr]
+    (window,) = sought
+    assert (window.low, window.high) == (simulation.grid.domain.low, simulation.grid.domain.high)
 
 
 @pytest.mark.parametrize(("dimension", "least", "most"), [(2, 3, 6), (3, 5, 12)])

@@ -73,7 +73,9 @@ class Reseeding:
         s.planes, s.seed, s.dx, s.inverse_dx = grid.planes, step, grid.spacing, 1.0 / grid.spacing
         s.origin, s.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
         s.least, s.at_rest, s.most = self.least, self.particles_a_cell, self.most
-        window.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
+        inside = window.common(grid.domain)  # beyond open sides lies air without particles, and nothing beyond that
+        assert inside is not None, "windows reach into the domain"
+        inside.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
         takers = int(self._numbers.numpy()[0])
         if takers == 0:
             return 0
