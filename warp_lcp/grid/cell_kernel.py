@@ -28,6 +28,11 @@ k = cells.k + plane
 j = cells.j + row
 first = cells.i + chunk * cells.grain
 end = wp.min(first + cells.grain, cells.end)
+if cells.grain == 0:
+    k = cells.pieces[chunk, 0][0]
+    j = cells.pieces[chunk, 0][1]
+    first = cells.pieces[chunk, 1][0]
+    end = cells.pieces[chunk, 1][1]
 """
 LOOP = "for i in range(first, end): pass"
 ELEMENTS = """

@@ -8,7 +8,7 @@ of the larger grid, so that a point has the same in all parts, and lies in store
 """
 
 import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,9 @@ from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.layout import grain
 from warp_lcp.rows.program import Launch, launch_ranges
+
+
+SEGMENT = 8  # cells of a row that are visited together where a box is visited in part
 
 
 @wp.struct
@@ -32,7 +35,8 @@ class CellRange:
     j: int
     i: int
     end: int  # one past the last i
-    grain: int
+    grain: int  # 0: a piece
+    pieces: wp.array2d(dtype=wp.vec2i)  # (k, j) and (first, one past the last i) of each piece of a box in part
 
 
 @wp.func
@@ -62,11 +66,14 @@ class Window:
         low: first (k, j, i), ring included.
         high: one past the last (k, j, i).
         device: where kernels run.
+        near: where the rest of the box need not be visited, which segments of rows must be, see `warp_lcp.grid.vicinity`; None: all. Sums
+            over rows visit what lies between the first and the last of a row.
     """
 
     low: tuple[int, int, int]
     high: tuple[int, int, int]
     device: wp.Device
+    near: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, low: typing.Sequence[int], high: typing.Sequence[int], device: wp.Device) -> "Window":
@@ -77,12 +84,29 @@ class Window:
     def common(self, other: "Window") -> "Window | None":
         """Return the cells that are in both windows; None: there are none."""
         low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
-        return Window.of(low.tolist(), high.tolist(), self.device) if (low < high).all() else None
+        if not (low < high).all():
+            return None
+        return replace(Window.of(low.tolist(), high.tolist(), self.device), near=self.near)
 
     @cached_property
     def cells(self) -> typing.Any:
         """The CellRange that kernels take as their first argument."""
-        return self._cells(grain(self.high[2] - self.low[2], self.device))
+        return self._cells(grain(self.high[2] - self.low[2], self.device)) if self.near is None else _in_part(self._pieces)
+
+    @cached_property
+    def _pieces(self) -> wp.array:
+        """The pieces that are visited, see `pieces_of`."""
+        assert self.near is not None
+        return wp.array(pieces_of(self.near, self.low, self.high), dtype=wp.vec2i, device=self.device)
+
+    @cached_property
+    def _hulls(self) -> wp.array:
+        """The pieces that sums over rows visit, one a row."""
+        host = self._pieces.numpy()
+        first = np.flatnonzero(np.append(True, (host[1:, 0] != host[:-1, 0]).any(axis=1))[: len(host)])
+        made = host[first]
+        made[:, 1, 1] = host[np.append(first[1:], len(host)) - 1, 1, 1]
+        return wp.array(made, dtype=wp.vec2i, device=self.device)
 
     def _cells(self, each: int) -> typing.Any:
         box = CellRange()
@@ -98,7 +122,11 @@ class Window:
 
     def rows_of(self, sums: wp.array) -> np.ndarray:
         """Return what rows of the box have in a field of sums, one entry or several a row of the grid."""
-        return np.asarray(sums.numpy()[self.low[0] : self.high[0], self.low[1] : self.high[1]])
+        rows = np.asarray(sums.numpy()[self.low[0] : self.high[0], self.low[1] : self.high[1]])
+        if self.near is None:
+            return rows
+        visited = self.near[self.low[0] : self.high[0], self.low[1] : self.high[1]].any(axis=2)
+        return np.where(visited.reshape(*visited.shape, *[1] * (rows.ndim - 2)), rows, 0)
 
     def run(self, passed: RowPass, *, whole: bool = False, launch: Launch | None = None, **given: typing.Any) -> None:
         """Launch a pass over the box, or record it with `Program.launch`.
@@ -113,11 +141,20 @@ class Window:
 
     @cached_property
     def _shared(self) -> Rows:
-        return Rows.box(self.low, self.high, self.device)
+        if self.near is None:
+            return Rows.box(self.low, self.high, self.device)
+        return Rows.in_part(self._pieces, self._visited, self.high)
+
+    @property
+    def _visited(self) -> int:
+        """How many cells there are to visit in part, to within the ends of segments."""
+        return SEGMENT * int(np.count_nonzero(self.near))
 
     @cached_property
     def _whole(self) -> Rows:
-        return Rows.box(self.low, self.high, self.device, cells=self.high[2] - self.low[2])
+        if self.near is None:
+            return Rows.box(self.low, self.high, self.device, cells=self.high[2] - self.low[2])
+        return Rows.in_part(self._hulls, self._visited, self.high)
 
     def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
         """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row), or record it with `Program.launch`."""
@@ -125,12 +162,13 @@ class Window:
 
     def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
         """Launch kernel(cells, *inputs) with one thread a row (plane, row, 0), for sums that are the same on every run."""
-        self._launch(kernel, self._cells(self.high[2] - self.low[2]), inputs, None)
+        cells = self._cells(self.high[2] - self.low[2]) if self.near is None else _in_part(self._hulls)
+        self._launch(kernel, cells, inputs, None)
 
     def _launch(self, kernel: wp.Kernel, cells: typing.Any, inputs: list[typing.Any], launch: Launch | None) -> None:
         ordered = getattr(kernel, "ordered", False)
-        dim = (*self.rows, cells.chunks)
-        launch_ranges(kernel, dim, cells.grain, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
+        dim, cost = ((*self.rows, cells.chunks), cells.grain) if cells.grain else ((1, 1, cells.chunks), self._visited // max(cells.chunks, 1))
+        launch_ranges(kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
 
 
 class Trail:
@@ -149,11 +187,39 @@ class Trail:
         self._last = self.all
 
     def through(self, window: Window | None) -> Window:
-        """Return a box around the last window and this one, which becomes the last; None: all cells."""
-        now = (window and window.common(self.all)) or self.all
-        low, high = np.minimum(now.low, self._last.low), np.maximum(now.high, self._last.high)
+        """Return a box around the last window and this one, which becomes the last, or their parts; None: all cells."""
+        now, last = (window and window.common(self.all)) or self.all, self._last
+        low, high = np.minimum(now.low, last.low), np.maximum(now.high, last.high)
         self._last = now
-        return Window.of(low.tolist(), high.tolist(), now.device)
+        near = None if now.near is None or last.near is None else now.near | last.near
+        return replace(Window.of(low.tolist(), high.tolist(), now.device), near=near)
+
+
+def _in_part(pieces: wp.array) -> typing.Any:
+    """Return the CellRange of some pieces."""
+    part = CellRange()
+    part.pieces, part.rows, part.chunks = pieces, 1, len(pieces)
+    return part
+
+
+def pieces_of(near: np.ndarray, low: typing.Sequence[int], high: typing.Sequence[int]) -> np.ndarray:
+    """Return the runs of marked segments in a box of cells, in order: (k, j) and (first, one past the last i), int32, shape (n, 2, 2).
+
+    Args:
+        near: not 0 where a segment counts, shape (planes, rows, segments of a row) of the grid.
+        low: first cell (k, j, i) of the box.
+        high: one past the last.
+    """
+    part = near[low[0] : high[0], low[1] : high[1]]
+    planes, rows, segments = part.shape
+    flat = np.zeros(planes * rows * (segments + 1) + 1, dtype=bool)  # each row behind an element that is not marked
+    flat[:-1].reshape(planes, rows, segments + 1)[..., 1:] = part
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    row, first = np.divmod(changes[::2], segments + 1)
+    first, last = (first - 1) * SEGMENT, (changes[1::2] - row * (segments + 1) - 1) * SEGMENT
+    k, j = np.divmod(row, rows)
+    made = np.stack((k + low[0], j + low[1], np.maximum(first, low[2]), np.minimum(last, high[2])), axis=-1)
+    return made[made[:, 2] < made[:, 3]].astype(np.int32).reshape(-1, 2, 2)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.vicinity import Vicinity
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, pace_of, travel
 from warp_lcp.material.flight import Flights
@@ -110,10 +111,20 @@ class ParticleSimulation(ParticleFrames):
         self._faces_know = False  # the velocity of the particles, around them
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
+        self.vicinity = self._vicinity()
         self.flights = self._flights()
         self.rearrangement = Rearrangement(scene, grid, self.boundary, shared=self.shared)
         self.surface_mesh = make_surface_mesh(scene, grid, self.boundary)
         self.particle_volume = make_particle_volume(scene, grid, self.boundary)
+
+    def _vicinity(self) -> Vicinity | None:
+        """Return what finds the cells to visit, on a grid that a material without an end or an interior does not fill."""
+        if self.shared or self.band is not None or self.scene.endless:
+            return None
+        before, made = getattr(self, "vicinity", None), Vicinity(self.grid)
+        if before is not None:
+            made.take(before)
+        return made
 
     def _flights(self) -> Flights | None:
         s = self.scene
@@ -222,7 +233,8 @@ class ParticleSimulation(ParticleFrames):
     def window(self, totals: ParticleTotals) -> Window:
         """Return the cells that the particles can touch in a step."""
         low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
-        return self.grid.window(low, high, grow=self.reach + 2)
+        box = self.grid.window(low, high, grow=self.reach + 2)
+        return box if self.vicinity is None else self.vicinity.window(box, self.particles, self.reach + 2, self.step_count)
 
     def top_speed(self, totals: ParticleTotals) -> float:
         """Return the scale of the velocities that `bring_to_faces` leaves [m/s]."""

@@ -44,6 +44,7 @@ class RowLayout:
     slabs: int  # their number
     apart: int  # planes on either side of a cut that keep a place of their own
     spans: wp.array2d(dtype=wp.vec2i)  # first (even, for `pairs`) and one past the last cell of each row (k, j) with unknowns; null: all
+    pieces: wp.array2d(dtype=wp.vec2i)  # (plane, row) and (first, one past the last) cell of each piece of a box in part; null: all of it
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
     o2: wp.int64
@@ -173,6 +174,7 @@ class Rows:
         other_size: elements of a field of the other level of a transfer; 0: there is none.
         device: where the fields are.
         place: first stored cell of a box.
+        ends: one past the last stored cell (k, j, i) of a box.
         weight: cells of a usual pass that one costs as much as.
     """
 
@@ -182,6 +184,7 @@ class Rows:
     other_size: int
     device: wp.Device
     place: Mapping[str, int] = field(default_factory=dict)
+    ends: tuple[int, ...] = ()
     weight: int = 1
 
     @staticmethod
@@ -251,7 +254,21 @@ class Rows:
             raise ValueError(f"box: from {low} to {high}: expected 0 <= low <= high")
         counts = tuple(end - begin for begin, end in zip(low, high, strict=True))
         made = Rows.strided(0, device, (0, 0, 0), counts, cells=cells)
-        return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)))
+        return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)), ends=high)
+
+    @staticmethod
+    def in_part(pieces: wp.array[Any], cells: int, ends: tuple[int, int, int]) -> "Rows":
+        """Return pieces of the rows of a grid, a thread takes one.
+
+        Args:
+            pieces: (k, j) and (first, one past the last i) of each, vec2i, shape (n, 2).
+            cells: how many there are in all.
+            ends: what they end before, (k, j, i).
+        """
+        check_memory("pieces", pieces, wp.vec2i, (len(pieces), 2))
+        made = Rows.box((0, 0, 0), (1, 1, len(pieces)), pieces.device, cells=1)
+        single = put(copy_of(made.single), {"pieces": pieces})
+        return replace(made, single=single, summed=single, ends=ends, weight=max(cells // max(len(pieces), 1), 1))
 
     @staticmethod
     def entries(count: int, device: wp.Device, cells: int | None = None, *, weight: int = 1) -> "Rows":
@@ -321,12 +338,6 @@ class Rows:
     def count(self) -> int:
         """How many rows there are."""
         return int(self.single.planes * self.single.rows)
-
-    @functools.cached_property
-    def ends(self) -> tuple[int, ...]:
-        """One past the last stored cell (k, j, i) of a box."""
-        L = self.single
-        return tuple(first + n for first, n in zip(self.place.values(), (L.planes, L.rows, L.nx), strict=True))
 
     @functools.cached_property
     def places(self) -> int:

@@ -25,6 +25,9 @@ const auto piece = [&](int k, int j, int c, const Ring& ring) -> Piece {
     if (L.spans.data) {
         const auto span = L.spans.data[P.row];
         first = first > span[0] ? first : span[0]; last = last < span[1] ? last : span[1]; }
+    if constexpr (BOX) if (L.pieces.data) {
+        const auto *row = L.pieces.data + 2*(long long)c, *run = row + 1;
+        P.k = (*row)[0]; P.j = (*row)[1]; first = (*run)[0]; last = (*run)[1]; }
     P.first = first; P.n = last > first ? last - first : 0;
     P.p = L.base + k*L.s1 + j*L.s2 + first;
     P.ym = -L.s2; P.yp = L.s2; P.zm = -L.s1; P.zp = L.s1;
