@@ -11,7 +11,8 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import SEGMENT, StaggeredGrid, Window
 
 LEAST_CELLS = 1 << 17  # of a box that may be visited in part: finding the part costs as much as a pass over particles and one over segments
-MOST = 0.5  # of a box's segments that a part may have
+MOST = 0.4  # of a box's segments that a part may have
+REST = 6  # steps after which one looks again whether a part has become smaller
 
 MARK = particle_pass(
     "warp_lcp.grid.vicinity.mark_segments", {"position": wp.vec3}, whole={"marks": wp.uint8},
@@ -35,6 +36,7 @@ class Vicinity:
         self._marks: wp.array[wp.uint8] | None = None
         self._shape = nz, ny, -(-nx // SEGMENT)
         self._step, self._now, self._before = -1, None, None  # the step that has been looked at, what it reaches, and the one before it
+        self._rest = -1  # the step until which all is visited
         self.active = not grid.device.is_cuda and grid.size >= LEAST_CELLS
 
     def take(self, other: "Vicinity") -> None:
@@ -60,7 +62,8 @@ class Vicinity:
             grow: cells that they reach beyond their own.
             step: number of the step; what it has reached before counts as well.
         """
-        if not self.active or math.prod(np.subtract(box.high, box.low)) < LEAST_CELLS:
+        whole = math.prod(np.subtract(box.high, box.low))
+        if not self.active or whole < LEAST_CELLS or step < self._rest:
             self._step, self._now, self._before = step, None, None
             return box
         near = self._near(box, particles, grow)
@@ -70,8 +73,10 @@ class Vicinity:
         if self._before is None:
             return box
         both = self._now | self._before
-        whole = math.prod(np.subtract(box.high, box.low)) / SEGMENT
-        return box if both.sum(dtype=np.int64) > MOST * whole else replace(box, near=both)
+        if SEGMENT * np.count_nonzero(both) > MOST * whole:
+            self._rest = step + REST
+            return box
+        return replace(box, near=both)
 
     def _near(self, box: Window, particles: Particles, grow: int) -> np.ndarray:
         """Return which segments of rows are reached."""

@@ -124,11 +124,10 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
     result = np.zeros(len(points), dtype=bool)
     for geometry in geometries:
         bounds = geometry.bounds()
-        near = ~result
-        if bounds is not None:
-            for axis, column in enumerate(points.T):
-                near &= (column >= bounds[0][axis]) & (column <= bounds[1][axis])
-        wanted = np.flatnonzero(near)
+        wanted = np.flatnonzero(~result) if result.any() else np.arange(len(points))
+        for axis in range(3)[::-1] if bounds is not None else ():  # along z first, where points often are of one plane
+            column = points[wanted, axis]
+            wanted = wanted[(column >= bounds[0][axis]) & (column <= bounds[1][axis])]
         for first in range(0, len(wanted), CHUNK):
             part = wanted[first : first + CHUNK]
             positions = wp.array(points[part], dtype=wp.vec3, device=device)
