@@ -10,6 +10,7 @@ import small_liquids
 import small_sands
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.granular.scene import SandScene
+from warp_lcp.grid import vicinity
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material import coverage as module
 from warp_lcp.material.coverage import Coverage, box_of, carry_over
@@ -96,6 +97,19 @@ def test_it_goes_on_from_a_state_bit_for_bit_and_on_the_other_grid(name: str, sm
     assert whole.particles.totals().center == pytest.approx(through.particles.totals().center, abs=1e-4)
     later.restore(whole.state())
     assert later.grid == whole.grid
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_visiting_what_particles_reach_leaves_the_same_bits(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = made(name, follow=False)
+    for setting, value in {"LEAST_CELLS": 0, "MOST": 9.0}.items():  # segments end beyond a small box
+        monkeypatch.setattr(vicinity, setting, value)
+    part = made(name, follow=False)
+    assert run(part, 18) == run(whole, 18)
+    found, expected = part.state(), whole.state()
+    assert [key for key, value in expected.items() if not np.array_equal(value, found[key])] == []
+    if name != "band":  # an interior without particles
+        assert part.window(part.particles.totals()).near is not None
 
 
 def test_it_pays_for_what_there_is() -> None:

@@ -19,7 +19,6 @@ from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.layout import grain
 from warp_lcp.rows.program import Launch, launch_ranges
 
-
 SEGMENT = 8  # cells of a row that are visited together where a box is visited in part
 
 
@@ -105,7 +104,7 @@ class Window:
         host = self._pieces.numpy()
         first = np.flatnonzero(np.append(True, (host[1:, 0] != host[:-1, 0]).any(axis=1))[: len(host)])
         made = host[first]
-        made[:, 1, 1] = host[np.append(first[1:], len(host)) - 1, 1, 1]
+        made[:, 1, 1] = host[np.append(first[1:], len(host))[: len(first)] - 1, 1, 1]
         return wp.array(made, dtype=wp.vec2i, device=self.device)
 
     def _cells(self, each: int) -> typing.Any:
@@ -148,7 +147,7 @@ class Window:
     @property
     def _visited(self) -> int:
         """How many cells there are to visit in part, to within the ends of segments."""
-        return SEGMENT * int(np.count_nonzero(self.near))
+        return 0 if self.near is None else SEGMENT * int(np.count_nonzero(self.near))
 
     @cached_property
     def _whole(self) -> Rows:
@@ -167,7 +166,9 @@ class Window:
 
     def _launch(self, kernel: wp.Kernel, cells: typing.Any, inputs: list[typing.Any], launch: Launch | None) -> None:
         ordered = getattr(kernel, "ordered", False)
-        dim, cost = ((*self.rows, cells.chunks), cells.grain) if cells.grain else ((1, 1, cells.chunks), self._visited // max(cells.chunks, 1))
+        dim, cost = (*self.rows, cells.chunks), cells.grain
+        if self.near is not None:
+            dim, cost = (1, 1, cells.chunks), self._visited // max(cells.chunks, 1)
         launch_ranges(kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
 
 

@@ -28,20 +28,25 @@ class Vicinity:
 
     Args:
         grid: of the particles.
+        before: what has looked at another part of the same domain, whose cells begin a multiple of `SEGMENT` apart.
     """
 
-    def __init__(self, grid: StaggeredGrid) -> None:
+    def __init__(self, grid: StaggeredGrid, before: "Vicinity | None" = None) -> None:
         self.grid = grid
         nz, ny, nx = grid.shape
         self._marks: wp.array[wp.uint8] | None = None
         self._shape = nz, ny, -(-nx // SEGMENT)
-        self._step, self._now, self._before = -1, None, None  # the step that has been looked at, what it reaches, and the one before it
+        self._step = -1  # that has been looked at
+        self._now: np.ndarray | None = None  # what it reaches
+        self._before: np.ndarray | None = None  # and what the one before it did; None: not known
         self._rest = -1  # the step until which all is visited
         self.active = not grid.device.is_cuda and grid.size >= LEAST_CELLS
+        if before is not None and self.active:
+            self._take(before)
 
-    def take(self, other: "Vicinity") -> None:
-        """Go on from what another one has found on another part of the same domain, whose cells begin a multiple of `SEGMENT` apart."""
-        if other._now is None or not self.active:
+    def _take(self, other: "Vicinity") -> None:
+        """Go on from what another one has found."""
+        if other._now is None:
             return
         shift = np.array(other.grid.origin) - self.grid.origin
         made = np.zeros(self._shape, dtype=np.uint8)

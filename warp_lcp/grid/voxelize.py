@@ -125,9 +125,9 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
     for geometry in geometries:
         bounds = geometry.bounds()
         wanted = np.flatnonzero(~result) if result.any() else np.arange(len(points))
-        for axis in range(3)[::-1] if bounds is not None else ():  # along z first, where points often are of one plane
+        for axis, low, high in [] if bounds is None else list(zip(range(3), *bounds, strict=True))[::-1]:  # points often are of one plane
             column = points[wanted, axis]
-            wanted = wanted[(column >= bounds[0][axis]) & (column <= bounds[1][axis])]
+            wanted = wanted[(column >= low) & (column <= high)]
         for first in range(0, len(wanted), CHUNK):
             part = wanted[first : first + CHUNK]
             positions = wp.array(points[part], dtype=wp.vec3, device=device)

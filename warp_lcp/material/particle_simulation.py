@@ -12,8 +12,8 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.grid.vicinity import Vicinity
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
+from warp_lcp.grid.vicinity import Vicinity
 from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, pace_of, travel
 from warp_lcp.material.flight import Flights
 from warp_lcp.material.narrow_band import without_band
@@ -72,9 +72,11 @@ class ParticleSimulation(ParticleFrames):
         last_dt: length of the last step [s], 0 before the first.
         kick_dt: how long forces act in the step that has begun [s].
         watch: what the stages of a step are measured with.
+        vicinity: finds the cells that a step must visit; None: all around the particles.
     """
 
     shared = False  # whether others have parts of the grid
+    vicinity: Vicinity | None = None
 
     def __init__(
         self,
@@ -111,20 +113,12 @@ class ParticleSimulation(ParticleFrames):
         self._faces_know = False  # the velocity of the particles, around them
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
-        self.vicinity = self._vicinity()
+        if not (self.shared or self.band is not None or scene.endless):  # without an interior, and ends where the grid does
+            self.vicinity = Vicinity(grid, self.vicinity)
         self.flights = self._flights()
         self.rearrangement = Rearrangement(scene, grid, self.boundary, shared=self.shared)
         self.surface_mesh = make_surface_mesh(scene, grid, self.boundary)
         self.particle_volume = make_particle_volume(scene, grid, self.boundary)
-
-    def _vicinity(self) -> Vicinity | None:
-        """Return what finds the cells to visit, on a grid that a material without an end or an interior does not fill."""
-        if self.shared or self.band is not None or self.scene.endless:
-            return None
-        before, made = getattr(self, "vicinity", None), Vicinity(self.grid)
-        if before is not None:
-            made.take(before)
-        return made
 
     def _flights(self) -> Flights | None:
         s = self.scene

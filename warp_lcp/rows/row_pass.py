@@ -280,7 +280,8 @@ class Form:
         d = self.declared
         into = not {*d.ring}.isdisjoint(d.writes)
         levels = d.finer or bool(d.other)
-        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOX": bool(d.box), "BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
+        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOX": bool(d.box)}
+        switches |= {"BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
         macros = {n: v for n, v in constants.items() if hasattr(v, "__index__")}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
