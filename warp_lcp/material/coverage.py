@@ -21,6 +21,7 @@ SPARE = 8  # cells at most that a grid has to spare on a side when it is laid, a
 AHEAD = 16  # steps that it is laid for, as the material moves now
 START = 10  # cells around a material at the start that its first steps reach
 MOST = 0.5  # of the domain's cells that a part may have; else the grid covers all of it
+LARGE_CELLS, MOST_OF_LARGE = 1 << 26, 0.9  # of a domain whose cells, all of them, are much memory
 LOOSE = 3.0  # times the cells of a grid that would be laid now: one that has more is laid anew
 
 FAR = 1 << 30  # cells: beyond any domain
@@ -106,7 +107,8 @@ class Coverage:
         for axis in self.endless:
             low[axis], high[axis] = 0, counts[axis]
         part = self._part(low, high)
-        return part if part.size <= MOST * self.domain.size else self.domain
+        most = MOST if self.domain.size < LARGE_CELLS else MOST_OF_LARGE
+        return part if part.size <= most * self.domain.size else self.domain
 
     def _part(self, low: np.ndarray, high: np.ndarray) -> StaggeredGrid:
         domain = self.domain

@@ -100,7 +100,9 @@ class ParticleSimulation(ParticleFrames):
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
         self.layers = self.reach = math.ceil(scene.time.cfl) + 2
         self._coverage, self.spray = coverage, spray or Spray(grid, (), 0, active=False)
+        others = set(vars(self))
         self.lay(grid, parts)
+        self._laid = vars(self).keys() - others  # attributes that belong to a grid
         self._notes = [*notes, *self.rearrangement.notes()]
         if self.sources is not None:
             self.sources.emit(particles, None, self.time)
@@ -157,6 +159,8 @@ class ParticleSimulation(ParticleFrames):
         """
         assert self._coverage is not None, "a grid that is kept covers what it must"
         before, kept = self.grid, self._fields() if state is None else state
+        for name in self._laid - {"vicinity"}:  # so that their memory is there for what comes
+            delattr(self, name)
         self.lay(grid, self._coverage.make_parts(grid))
         self.particles.move_to(grid)
         self.boundary.place(self.time)
