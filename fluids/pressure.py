@@ -280,7 +280,7 @@ class PressureProjection:
         """
         self._accept(result.x)
         for axis, field in enumerate(velocity):
-            self.known[axis].zero_()
+            window.clear(self.known[axis])
             faces = self._faces() | {"x": self.pressure, "field": field, "known": self.known[axis]}
             window.run(self._passes.subtract_gradient, axis=axis, **faces)
         self._support(velocity, window)

@@ -38,7 +38,7 @@ def complete(
         join: as of `extrapolate`.
     """
     for field, weight, marks in zip(velocity, weights, known, strict=True):
-        marks.zero_()
+        window.clear(marks)
         window.launch(weighted_kernel, [TINY_WEIGHT, weight, marks])
         extrapolate(window, marks, field, REACH, join=join)
 

@@ -10,6 +10,7 @@ of the larger grid, so that a point has the same in all parts, and lies in store
 import typing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -19,6 +20,12 @@ from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.layout import grain
 from warp_lcp.rows.program import Launch, launch_ranges
 
+CLEAR: dict[typing.Any, RowPass] = {
+    dtype: RowPass(
+        f"warp_lcp.grid.clear_{dtype.__name__}.clear", Path(__file__).parent / "headers" / "clear.h", dtype, box={"field": dtype}
+    )
+    for dtype in (wp.int8, wp.float32, wp.float64)
+}
 SEGMENT = 8  # cells of a row that are visited together where a box is visited in part
 
 
@@ -155,6 +162,14 @@ class Window:
             return Rows.box(self.low, self.high, self.device, cells=self.high[2] - self.low[2])
         return Rows.in_part(self._hulls, self._visited, self.high)
 
+    def clear(self, *given: wp.array) -> None:
+        """Put 0 into fields that every step clears; of a box in part into what is visited, so that no memory is taken for the rest."""
+        for array in given:
+            if self.near is None:
+                array.zero_()
+            else:
+                self.run(CLEAR[array.dtype], field=array)
+
     def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
         """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row), or record it with `Program.launch`."""
         self._launch(kernel, self.cells, inputs, launch)
@@ -234,6 +249,7 @@ class StaggeredGrid:
         device: a Warp device or its name.
         origin: cells (x, y, z) of a larger grid before the first one of this.
         whole: cells of the larger grid that this is a part of; None: it is no part.
+        sparse: whether only a small part of its fields will be written, for which memory is taken in small pages.
 
     Raises:
         ValueError: a count is not positive, nz is not 1 in 2-D, or the spacing is not positive.
@@ -245,6 +261,7 @@ class StaggeredGrid:
     device: typing.Any = "cpu"
     origin: tuple[int, int, int] = (0, 0, 0)
     whole: tuple[int, int, int] | None = None
+    sparse: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the arguments and resolve the device."""
@@ -303,7 +320,7 @@ class StaggeredGrid:
 
     def field(self, dtype: typing.Any = wp.float32) -> wp.array:
         """Return a field of zeros, one value a stored cell."""
-        return zeros(self.size, dtype, self.device).reshape(self.shape)
+        return zeros(self.size, dtype, self.device, small_pages=self.sparse).reshape(self.shape)
 
     def faces(self, dtype: typing.Any = wp.float32) -> list[wp.array]:
         """Return a field of zeros for each component: [u, v] in 2-D, [u, v, w] in 3-D."""

@@ -89,8 +89,7 @@ def particles_to_faces(
     window = window or grid.everywhere
     touched = touched_planes(grid, position) if offsets is None else None
     for axis, (field, weight) in enumerate(zip(fields, weights, strict=True)):
-        field.zero_()
-        weight.zero_()
+        window.clear(field, weight)
         gradient = affine[axis] if affine else None
         particles = {"position": position, "velocity": velocity, "gradient": gradient, "axis": axis}
         if offsets is not None:

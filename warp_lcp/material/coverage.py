@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ AHEAD = 16  # steps that it is laid for, as the material moves now
 START = 10  # cells around a material at the start that its first steps reach
 MOST = 0.5  # of the domain's cells that a part may have; else the grid covers all of it
 LARGE_CELLS, MOST_OF_LARGE = 1 << 26, 0.9  # of a domain whose cells, all of them, are much memory
+SPARSE = 32.0  # times as many cells as a material fills: a grid that has more is hardly written to
 LOOSE = 3.0  # times the cells of a grid that would be laid now: one that has more is laid anew
 
 FAR = 1 << 30  # cells: beyond any domain
@@ -56,7 +57,9 @@ class Coverage:
         """Return whether a grid may ever cover less than the domain."""
         return self.follows and self.domain.size >= LEAST_CELLS
 
-    def around(self, low: Corner, high: Corner, now: StaggeredGrid | None = None, pace: Sequence[np.ndarray] = NO_PACE) -> StaggeredGrid:
+    def around(
+        self, low: Corner, high: Corner, now: StaggeredGrid | None = None, pace: Sequence[np.ndarray] = NO_PACE, *, filled: float = math.inf
+    ) -> StaggeredGrid:  # fmt: skip
         """Return a grid that covers a box of cells.
 
         Args:
@@ -64,6 +67,7 @@ class Coverage:
             high: last cell.
             now: the grid there is, which is returned if it will do.
             pace: cells a step that the box's low and high sides may move outward, shape (3,) each, see `pace_of`.
+            filled: how many cells the material would fill.
         """
         if not self.active:
             return self.domain
@@ -73,7 +77,7 @@ class Coverage:
         laid = self._laid(first, final, pace)
         if now is not None and now.covers(first, final) and now.size <= LOOSE * laid.size:
             return now
-        return laid
+        return replace(laid, sparse=True) if laid.size > SPARSE * filled else laid
 
     def beyond(self, high: np.ndarray) -> str:
         """Say along which axis a box of cells that ends with this one reaches beyond the domain; "" if it does not."""

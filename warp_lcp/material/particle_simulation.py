@@ -177,7 +177,8 @@ class ParticleSimulation(ParticleFrames):
         low, high = cells_between(totals.low, totals.high, self.grid.spacing, grow)
         if self.scene.domain.boundless and (trouble := self._coverage.beyond(high)):
             raise SimulationFailed(f"step {self.step_count}: {trouble}")
-        grid = self._coverage.around(low, high, self.grid, pace_of(totals, dt, self.grid.spacing))
+        filled = totals.count / self.scene.particles.per_axis**self.grid.dimension
+        grid = self._coverage.around(low, high, self.grid, pace_of(totals, dt, self.grid.spacing), filled=filled)
         if grid != self.grid:
             with self.watch.stage("laying the grid", *self.velocity):
                 self.cover(grid)

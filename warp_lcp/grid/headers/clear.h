@@ -1,0 +1,2 @@
+// Nothing.
+for (int i = first; i < last; ++i) field[i] = 0;
