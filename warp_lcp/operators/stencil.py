@@ -40,7 +40,7 @@ def whole_span(first: int, last: int, n: int):
     """A span of whole vectors around first ... last of n cells; an empty one where there are none."""
     begin = first // SPAN_CELLS * SPAN_CELLS
     end = last
-    if last <= begin:
+    if last <= first:
         begin = 0
         end = 0
     return wp.vec2i(begin, wp.min(n, (end + SPAN_CELLS - 1) // SPAN_CELLS * SPAN_CELLS))
