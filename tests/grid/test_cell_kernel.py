@@ -84,6 +84,7 @@ def box_pass(tmp_path_factory) -> RowPass:
     return RowPass("tests.boxes.scaled", header, real, box=fields, by_row=sums, optional=("z",), constants={"SCALE": 0.5})
 
 
+@pytest.mark.cpu_form("threads take whole rows on the CPU")
 @pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("given", [False, True])
 def test_a_pass_over_a_box(box_pass: RowPass, whole: bool, given: bool) -> None:
@@ -96,6 +97,7 @@ def test_a_pass_over_a_box(box_pass: RowPass, whole: bool, given: bool) -> None:
     np.testing.assert_array_equal(sums.numpy(), inside(expected).sum(axis=2).ravel())
 
 
+@pytest.mark.cpu_form("threads take whole rows on the CPU")
 def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: RowPass) -> None:
     rows, fields = Rows.box(WINDOW.low, WINDOW.high, GRID.device), {"x": GRID.field(), "y": GRID.field(), "z": None}
     assert Rows.box(WINDOW.low, WINDOW.high, GRID.device, cells=10**6).single.chunks == rows.single.chunks == 1
@@ -133,6 +135,7 @@ def test_a_pass_over_listed_cells_sees_them_as_in_their_rows(tmp_path: Path) -> 
     np.testing.assert_array_equal(layers.numpy(), expected)
 
 
+@pytest.mark.cpu_form("how many entries a thread takes")
 @pytest.mark.parametrize("grain", [None, 4])
 def test_a_pass_over_entries(grain: int | None, tmp_path: Path) -> None:
     """A list is the row of a box; a thread takes some of it."""

@@ -84,6 +84,7 @@ def test_marks_spread_as_far_as_asked(cells: int) -> None:
         np.testing.assert_array_equal(spread(marks, cells, axis), expected)
 
 
+@pytest.mark.cpu_form("pieces of rows are the CPU's")
 @pytest.mark.parametrize("grid", [GRID, PLANE])
 def test_all_cells_that_particles_reach_are_near(grid: StaggeredGrid, small: None) -> None:
     """Now and in the step before, however often a step is tried; along x to the end of a segment."""
@@ -110,6 +111,7 @@ def test_all_cells_that_particles_reach_are_near(grid: StaggeredGrid, small: Non
         assert not (found & ~wide).any()
 
 
+@pytest.mark.cpu_form("pieces of rows are the CPU's")
 def test_what_was_reached_goes_along_to_another_part_of_a_domain(small: None) -> None:
     old, new = (StaggeredGrid((32, 20, 12), 0.1, 3, "cpu", origin=at, whole=(80, 60, 40)) for at in ((16, 8, 8), (24, 0, 16)))
     particles = Particles(old, np.array([[2.75, 1.25, 1.85]]), np.zeros((1, 3)), affine=False)

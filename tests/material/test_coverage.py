@@ -99,6 +99,7 @@ def test_it_goes_on_from_a_state_bit_for_bit_and_on_the_other_grid(name: str, sm
     assert later.grid == whole.grid
 
 
+@pytest.mark.cpu_form("pieces of rows are the CPU's")
 @pytest.mark.parametrize("name", CASES)
 def test_visiting_what_particles_reach_leaves_the_same_bits(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = made(name, follow=False)

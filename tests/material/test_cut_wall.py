@@ -102,9 +102,10 @@ class Slope:
         fields, known = [], []
         for axis, fraction in enumerate(self.open):
             fields.append(wp.array(np.where(fraction > 0, velocity[axis], closed[axis]).astype(np.float32), device="cpu"))
-            known.append(wp.array((fraction > 0).astype(np.int8), device="cpu"))
+            is_open = fraction > 0
             if grid.dimension == 2:
-                known[-1].numpy()[[0, 2]] = 0
+                is_open[[0, 2]] = False
+            known.append(wp.array(is_open.astype(np.int8), device="cpu"))
         extend_velocity_cut(
             grid.everywhere, fields, given, known, wp.array(self.kind, device="cpu"), wp.array(self.contact, device="cpu"),
             self.cut(), grid.faces(), layers,
@@ -269,10 +270,10 @@ def test_spray_keeps_its_own_velocity_on_open_faces_only() -> None:
     cut, marks = slope.cut(), FLAT.faces(wp.int8)
     fields, weights = FLAT.faces(), FLAT.faces()
     floor = int(slope.at[1]) + 1  # row of the plane's closed faces
-    fields[1].numpy()[1, floor + 4, 9] = -2.0
-    weights[1].numpy()[1, floor + 4, 9] = 1.0
-    fields[1].numpy()[1, floor - 1, 15] = 7.0
-    weights[1].numpy()[1, floor - 1, 15] = 1.0
+    fields[1][1, floor + 4, 9:10].fill_(-2.0)
+    weights[1][1, floor + 4, 9:10].fill_(1.0)
+    fields[1][1, floor - 1, 15:16].fill_(7.0)
+    weights[1][1, floor - 1, 15:16].fill_(1.0)
     kind, contact = wp.array(slope.kind, device="cpu"), wp.array(slope.contact, device="cpu")
     extend_velocity_cut(FLAT.everywhere, fields, weights, marks, kind, contact, cut, FLAT.faces(), 2)
     v, known = fields[1].numpy()[1], marks[1].numpy()[1]

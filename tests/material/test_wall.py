@@ -110,8 +110,8 @@ def test_what_rests_at_a_wall_is_not_thrown_after_what_leaves_it(
     air = Air(cells((0, 0)), (3.0, 0.0))
     air.separating.fill_(separating)
     air.contact.fill_(state)
-    air.velocity[0].numpy()[1, 1, 1] = own
-    air.weights[0].numpy()[1, 1, 1] = weight
+    air.velocity[0][1, 1, 1:2].fill_(own)
+    air.weights[0][1, 1, 1:2].fill_(weight)
     u, _ = air.extend()
     assert u[1, 2] == 3.0
     assert u[1, 1] == pytest.approx(expected)
@@ -123,8 +123,8 @@ def test_spray_beyond_one_layer_keeps_its_own_velocity() -> None:
     """A drop above a pool at rest: extrapolating the pool over it would make it hang."""
     air = Air(cells(*((x, 0) for x in range(5))), (0.0, 0.0))
     for row in (3, 5):
-        air.velocity[1].numpy()[1, row, 3] = -2.0
-        air.weights[1].numpy()[1, row, 3] = 1.0
+        air.velocity[1][1, row, 3:4].fill_(-2.0)
+        air.weights[1][1, row, 3:4].fill_(1.0)
     _, v = air.extend()
     assert v[2, 3] == 0.0
     assert v[3, 3] == 0.0  # the first layer above the pool's own faces
@@ -145,8 +145,8 @@ def test_spray_above_each_other_in_3d_keeps_its_own_velocity() -> None:
         known[axis].assign(np.where((kind == SOLID) & (below == SOLID), -1, projected).astype(np.int8))
     drops = range(4, 12)
     for plane in drops:
-        velocity[2].numpy()[plane, 3, 3] = -plane
-        weights[2].numpy()[plane, 3, 3] = 1.0
+        velocity[2][plane, 3, 3:4].fill_(-plane)
+        weights[2][plane, 3, 3:4].fill_(1.0)
     index = wp.array(np.where(kind == SOLID, 0, -1).astype(np.int32), device="cpu")
     walls = [wp.array(kind, device="cpu"), grid.field(wp.uint8), index, wp.array([1], dtype=wp.uint8, device="cpu")]
     extend_velocity(Window((3, 0, 0), grid.shape, grid.everywhere.device), velocity, weights, known, *walls, [], 12)
@@ -155,8 +155,8 @@ def test_spray_above_each_other_in_3d_keeps_its_own_velocity() -> None:
 
 def test_a_closed_face_is_no_source_of_spray() -> None:
     air = Air(cells(*((x, 0) for x in range(5))), (0.0, 0.0))
-    air.velocity[0].numpy()[1, 6, 1] = 3.0
-    air.weights[0].numpy()[1, 6, 1] = 1.0
+    air.velocity[0][1, 6, 1:2].fill_(3.0)
+    air.weights[0][1, 6, 1:2].fill_(1.0)
     u, _ = air.extend()
     assert u[6, 1] == 3.0  # AIR that leaves the wall
     assert u[6, 2] == 0.0

@@ -57,6 +57,7 @@ def solves(up, method, *, in_place):
     return A, found
 
 
+@pytest.mark.cpu_form("boxes that are partly in use are the CPU's")
 @pytest.mark.parametrize("in_place", [False, True])
 @pytest.mark.parametrize("up", [0, 1])
 @pytest.mark.parametrize("method", [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton(), wl.MPRGP()])
@@ -72,6 +73,7 @@ def test_bits_are_those_of_a_problem_that_looks_through_its_box(method, up, in_p
         assert history == recorded
 
 
+@pytest.mark.cpu_form("boxes that are partly in use are the CPU's")
 @pytest.mark.parametrize("up", [0, 1])
 def test_passes_take_the_chunks_that_have_been_in_use(up, monkeypatch):
     monkeypatch.setattr(grid_poisson, "LARGE", 0)

@@ -166,6 +166,7 @@ def test_grids_without_cells_are_left_alone(add, row_pass):
         assert not y.numpy().any() and rows.places == 0
 
 
+@pytest.mark.cpu_form("how many cells a thread takes")
 def test_rows_that_cannot_be(double):
     with pytest.raises(ValueError, match=r"rows: counts \(1, 1, 2147483648\)"):
         Rows.flat(1 << 31, CPU)
@@ -201,6 +202,7 @@ def test_a_wave_visits_a_coarse_plane_once(add, row_pass, planes):
     assert (c.numpy().reshape(-1, 4, 4)[1:-1, 1:-1, 1:-1] == 1).all() and y.numpy().sum() == planes * 16
 
 
+@pytest.mark.cpu_form("waves are the CPU's")
 def test_what_a_wave_cannot_take(add):
     for stages in ((), ((add, 0),) * 5, ((add, 1), (add, 0)), ((add, 0), (add, -1))):
         with pytest.raises(ValueError, match=r"misuse\.wrong: expected 1 to 4 passes"):

@@ -50,6 +50,7 @@ def test_a_product_and_its_sum(product, real, faces):
     assert out.numpy().sum() == pytest.approx(host.ravel() @ expected, rel=10 * tol)
 
 
+@pytest.mark.cpu_form("how many cells a thread takes")
 def test_a_product_that_is_known_stands_for_a_stencil(tmp_path):
     source = "T total = 0;\nSIMD for (int k = 0; k < n; ++k) { const T v = affine(x, b, k)*diagonal(k); y[k] = v; total += v; }\n"
     fields = {"reads": {"x": "S", "b": "S"}, "writes": {"y": "S"}, "sums": ("total",)}
@@ -84,6 +85,7 @@ def test_a_flat_field_goes_to_one_thread_or_by_turns_to_many(tmp_path, rows):
     assert out.numpy()[-1] == 9.0
 
 
+@pytest.mark.cpu_form("how many cells a thread takes")
 def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
     """As on CUDA: a cell a thread, several planes a place for sums; cells outside the spans are not visited."""
     A, _, x, _ = scene(wp.float64, {})
@@ -167,6 +169,7 @@ def wrong_launches():
     yield {"bounds": []}, TypeError, "product: needs stencil, takes no bounds"
 
 
+@pytest.mark.cpu_form("how many cells a thread takes")
 @pytest.mark.parametrize(("change", "error", "message"), [*wrong_launches()], ids=lambda v: next(iter(v)) if isinstance(v, dict) else "")
 def test_a_wrong_launch_is_named(product, change, error, message):
     A, _, x, _ = scene(wp.float32, {})

@@ -25,6 +25,8 @@ from warp_lcp.rows.vectors import ADD, Reduction, rows_of
 CPU = wp.get_device("cpu")
 COUNTS = (1, 2, 3, 7)
 
+pytestmark = pytest.mark.cpu_form("the team is the CPU's")
+
 
 @pytest.fixture(autouse=True)
 def threads_as_before():

@@ -155,6 +155,7 @@ def test_other_matrices_end_as_by_the_method_alone(A, b, lower):
             assert natural_residual(A, b, lower, np.inf, ours.x.numpy()) <= 1e-6
 
 
+@pytest.mark.cpu_form("direct solves are the CPU's")
 def test_a_small_problem_on_the_cpu_launches_nothing(monkeypatch):
     launched = []
     monkeypatch.setattr(wp, "launch", lambda kernel, *arguments, **options: launched.append(kernel.key))

@@ -32,6 +32,7 @@ def problem(A, b, kind, lower=0.0, upper=np.inf):
     return wl.LCP(operator, b, lower, upper)
 
 
+@pytest.mark.cpu_form("the CPU factors so few unknowns")
 @pytest.mark.parametrize("method", METHODS, ids=name)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_extreme_rows(kind, method):
@@ -93,6 +94,7 @@ def test_what_is_no_solution_is_not_called_infeasible_where_there_is_one(seed):
     assert result.status is not wl.SolveStatus.NON_FINITE
 
 
+@pytest.mark.cpu_form("the CPU factors so few unknowns")
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_entries_bounds_and_b_may_change_in_place(kind):
     rng = np.random.default_rng(109)

@@ -40,6 +40,7 @@ def inner(field):
     return field.numpy().reshape([n + 2 for n in SHAPE])[1:-1, 1:-1, 1:-1].ravel().astype(np.float64)
 
 
+@pytest.mark.cpu_form("waves are the CPU's")
 @pytest.mark.parametrize("form", FACES, ids=str)
 @pytest.mark.parametrize("shifted", [False, True])
 def test_conjugate_gradients_solve_the_masked_and_shifted_system(form, shifted):
@@ -104,6 +105,7 @@ def test_a_fischer_step_is_its_move_its_residual_and_its_system(form, upper, sha
     assert norm == pytest.approx(np.sqrt(np.sum(r[s.fluid] ** 2 / np.where(d > 0, d, 1)[s.fluid])), rel=10 * tol)
 
 
+@pytest.mark.cpu_form("waves are the CPU's")
 @pytest.mark.parametrize("form", FACES, ids=str)
 @pytest.mark.parametrize("upper", [np.inf, 2.0])
 def test_a_step_along_the_path_is_mehrotras(form, upper):

@@ -130,6 +130,7 @@ def test_a_set_that_begins_everywhere_is_no_trap():
         assert "coarse problem" in {r.step for r in result.history}
 
 
+@pytest.mark.cpu_form("the CPU factors the coarse problem")
 def test_a_workspace_serves_another_load_and_other_entries():
     A, b, lower, upper = torsion(120)
     operator, right = wl.SparseOperator(A, device="cpu"), wp.array(b, dtype=wp.float64, device="cpu")

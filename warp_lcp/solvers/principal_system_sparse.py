@@ -42,7 +42,7 @@ class SparseSystem(KrylovSystem):
 
     Symmetric matrices whose diagonal is not negative take conjugate gradients with algebraic multigrid, which falls back on sweeps where
     nothing aggregates. Others take GMRES: with algebraic multigrid if most rows are diagonally dominant and nearly all off-diagonal
-    entries negative (convection-diffusion), else with incomplete factors made anew by SciPy on the CPU, and sweeps on CUDA.
+    entries negative (convection-diffusion), else with incomplete factors that SciPy makes anew and applies, on the host for any device.
     """
 
     def __init__(self, A: SparseOperator, real: Any, *, shifted: bool = False, settings: AlgebraicSettings | None = None) -> None:
@@ -53,10 +53,8 @@ class SparseSystem(KrylovSystem):
         if (A.symmetric and positive) or suits_multigrid(host):
             usual = AlgebraicSettings if suits_multigrid(host) else FAR_FROM_M
             self.preconditioner = AlgebraicHierarchy(A, real, settings or usual())
-        elif A.device.is_cpu:
-            self.preconditioner = IncompleteFactors(A, real)
         else:
-            self.preconditioner = AlgebraicHierarchy(A, real, AlgebraicSettings(coarsest_cpu=0, coarsest_cuda=0, stall=0.0, last_sweeps=1))
+            self.preconditioner = IncompleteFactors(A, real)
         M = self.preconditioner
         weight = M.weight if shifted else None
         method = ConjugateGradient if A.symmetric and positive else GMRES
@@ -80,16 +78,16 @@ class SparseSystem(KrylovSystem):
 
 
 class IncompleteFactors:
-    """L U factors of the free block by SciPy, on the CPU; incomplete ones of more than `DIRECT` unknowns.
+    """L U factors of the free block by SciPy, on the host; incomplete ones of more than `DIRECT` unknowns.
 
     Args:
-        A: the matrix, on the CPU.
+        A: the matrix.
         real: type of the corrections.
     """
 
     def __init__(self, A: SparseOperator, real: Any) -> None:
         self._A = A
-        self.r, self.z, self.weight = (wp.zeros(A.unknowns, dtype=real, device="cpu") for _ in range(3))
+        self.r, self.z, self.weight = (wp.zeros(A.unknowns, dtype=real, device=A.device) for _ in range(3))
         self._solve: Any = None
         self._free = np.zeros(0, dtype=np.intp)
 
@@ -103,7 +101,6 @@ class IncompleteFactors:
         self._M = (mask @ matrix @ mask).tocsr()
         diagonal = np.abs(self._M.diagonal())
         self.weight.assign(np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0))
-        self.z.zero_()
         self._solve = self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
@@ -112,9 +109,11 @@ class IncompleteFactors:
 
     def apply(self) -> None:
         """Precondition on the host: z = the factors' inverse times r."""
+        z = np.zeros(self._A.unknowns)
         if self._solve is not None:
-            with np.errstate(over="ignore"):  # the method sees that its iterate is not finite
-                self.z.numpy()[self._free] = self._solve(self.r.numpy()[self._free].astype(np.float64))
+            z[self._free] = self._solve(self.r.numpy()[self._free].astype(np.float64))
+        with np.errstate(over="ignore"):  # the method sees that its iterate is not finite
+            self.z.assign(z)
 
     def _factor(self, block: Any) -> Any:
         """Return what applies the factors' inverse; nothing is done where they cannot be had."""

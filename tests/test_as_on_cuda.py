@@ -1,0 +1,52 @@
+"""Steps of every built-in scene in CUDA's form against the CPU's; only with the plugin `emulated_cuda`, see there."""
+
+import functools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_lcp.scene.scene_file import built_in_scenes, load_scene
+from warp_lcp.scene.simulator import simulators
+
+CELLS = {"jet": 128, "river": 256, "mesh-obstacle": 30, "retracting-wall": 50, "stirred-tank": 24, "water-labyrinth": 48, "wave-maker": 60}
+STEPS, DT = 3, 0.004
+PLAIN = "import json, test_as_on_cuda as t; print(json.dumps({name: t.stepped(name) for name in t.built_in_scenes()}))"
+
+
+def stepped(name: str) -> dict[str, list[float]]:
+    """Return the number of particles or bodies after some steps, where they are and how fast, in the middle and around it."""
+    scene = load_scene(name, [f"domain.resolution={CELLS.get(name, 32)}"])
+    simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+    for _ in range(STEPS):
+        simulation.step(min(simulation.stable_dt(), DT))
+    found = {}
+    for key, value in simulation.state().items():
+        rows = np.asarray(value)
+        if rows.ndim == 2 and rows.dtype.kind == "f" and len(rows):
+            found[key] = [float(len(rows)), *rows.mean(axis=0, dtype=np.float64), *rows.std(axis=0, dtype=np.float64)]
+    return {key: [float(v) for v in values] for key, values in found.items()}
+
+
+@functools.cache
+def on_the_cpu() -> dict[str, dict[str, list[float]]]:
+    """Return what another process finds without the plugin."""
+    keep = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
+    command = [sys.executable, "-c", PLAIN]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=600, env={**keep, "PYTHONPATH": paths})
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
+@pytest.mark.parametrize("name", built_in_scenes())
+def test_a_scene_goes_as_on_the_cpu(name: str) -> None:
+    found, expected = stepped(name), on_the_cpu()[name]
+    assert found.keys() == expected.keys()
+    for key, values in found.items():
+        assert values[0] == expected[key][0], key
+        np.testing.assert_allclose(values, expected[key], rtol=1e-3, atol=1e-3 * max(np.abs(expected[key][1:]).max(), 1e-3), err_msg=key)
