@@ -38,6 +38,8 @@ ADDRESS = 0x6F0000000000  # of the order, where compiled kernels look it up
 ORDER_MATTERS = {
     "warp_lcp.components.unite.*:unite": "trees differ, their roots do not",
     "warp_lcp.material.flight:unite": "trees differ, their roots do not",
+    "warp_lcp.material.flight:board_kernel": "a list in the order in which threads come; sums over it are rounded in that order",
+    "warp_lcp.grid.node_distance:claim_groups": "lists of nodes in the order in which threads come; each node is measured for itself",
     "warp_lcp.grid.transfer_*.scatter.*:scatter": "sums of atomic additions are rounded in their order",
     "warp_lcp.vectors:add_up_kernel": "a tile adds up by place in the block, and the emulation deals places out anew",
 }
@@ -135,6 +137,20 @@ class Finder(importlib.abc.MetaPathFinder):
         return spec
 
 
+meter = collections.Counter[str]()  # of launches, readbacks and allocations, to be cleared by whoever looks
+
+
+def counted(what, result):
+    """Count a call; return its result."""
+    meter[what] += 1
+    return result
+
+
+def counting(what, plain):
+    """Return a function that counts its calls."""
+    return lambda *args: counted(what, plain(*args))
+
+
 def emulate_decisions():
     """Have the package decide as on CUDA, and Warp launch as there."""
     if any(name.partition(".")[0] == PACKAGE for name in sys.modules):
@@ -148,7 +164,10 @@ def emulate_decisions():
         return plain(*args, block_dim=block_dim, **kwargs)
 
     wp.launch = launch
-    wp.array.numpy = lambda self: numpy(self).copy()
+    wp.array.numpy = lambda self: counted("readbacks", numpy(self).copy())
+    context.CpuDefaultAllocator.allocate = counting("allocations", context.CpuDefaultAllocator.allocate)
+    for name in ("invoke", "invoke_cpu_blocks"):
+        setattr(context, name, counting("launches", getattr(context, name)))
     replay = wp.capture_launch
     wp.capture_launch = lambda graph: [c.launch() for c in graph] if isinstance(graph, list) else replay(graph)
 

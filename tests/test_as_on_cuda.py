@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +19,15 @@ STEPS, DT = 3, 0.004
 PLAIN = "import json, test_as_on_cuda as t; print(json.dumps({name: t.stepped(name) for name in t.built_in_scenes()}))"
 
 
+def made(name: str) -> Any:
+    """Return the simulation of a built-in scene, small."""
+    scene = load_scene(name, [f"domain.resolution={CELLS.get(name, 32)}"])
+    return simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+
+
 def stepped(name: str) -> dict[str, list[float]]:
     """Return the number of particles or bodies after some steps, where they are and how fast, in the middle and around it."""
-    scene = load_scene(name, [f"domain.resolution={CELLS.get(name, 32)}"])
-    simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+    simulation = made(name)
     for _ in range(STEPS):
         simulation.step(min(simulation.stable_dt(), DT))
     found = {}
@@ -42,7 +48,10 @@ def on_the_cpu() -> dict[str, dict[str, list[float]]]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
+EMULATED = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
+
+
+@EMULATED
 @pytest.mark.parametrize("name", built_in_scenes())
 def test_a_scene_goes_as_on_the_cpu(name: str) -> None:
     found, expected = stepped(name), on_the_cpu()[name]
@@ -50,3 +59,17 @@ def test_a_scene_goes_as_on_the_cpu(name: str) -> None:
     for key, values in found.items():
         assert values[0] == expected[key][0], key
         np.testing.assert_allclose(values, expected[key], rtol=1e-3, atol=1e-3 * max(np.abs(expected[key][1:]).max(), 1e-3), err_msg=key)
+
+
+@EMULATED
+def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
+    """The host waits for the device at each readback, and graphs hold no allocations."""
+    from emulated_cuda import meter
+
+    simulation = made("dam-break")
+    for _ in range(4):
+        meter.clear()
+        simulation.step(min(simulation.stable_dt(), DT))
+    assert meter["allocations"] == 0
+    assert meter["readbacks"] <= 19  # three iterations of the solve
+    assert meter["launches"] <= 145

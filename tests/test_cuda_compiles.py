@@ -26,6 +26,7 @@ from warp_lcp.material.density_correction import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.rows import Rows
 from warp_lcp.rows.row_pass import Form
+from warp_lcp.rows.vectors import CUDA_BLOCK
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.principal_system import principal_system
 
@@ -170,13 +171,8 @@ def family(name):
     return package, module, *(re.match("[a-z]*", word)[0] for word in variant)
 
 
-@pytest.mark.parametrize(
-    ("reals", "archs"),
-    [((wp.float64,), [80]), pytest.param((wp.float32, wp.float64), [80, 90], marks=pytest.mark.slow)],
-    ids=["one", "all"],
-)
-def test_kernels_compile_for_cuda(reals, archs, tmp_path):
-    """One variant of each family of modules, or all of them."""
+def modules_of_every_kernel(reals):
+    """Instantiate all kernels; return the names of their modules."""
     for found in pkgutil.walk_packages(wl.__path__, "warp_lcp."):
         if not found.name.startswith("warp_lcp.benchmarks."):
             importlib.import_module(found.name)
@@ -208,10 +204,33 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
         assert form.kernel  # of the pass alone, which the CPU launches in waves
     from warp._src.context import user_modules
 
-    names = sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels)
+    return sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels)
+
+
+def compile_for_cuda(name, archs, folder):
+    """Compile a module for CUDA, its blocks as large as they are launched."""
+    from warp._src.context import user_modules
+
+    module = user_modules[name]
+    bounds = {kernel.options.get("launch_bounds", CUDA_BLOCK) for kernel in module.kernels.values()}
+    module.options["block_dim"], *others = bounds
+    assert not others, f"{name}: kernels of blocks of {bounds} threads"
+    wp.compile_aot_module(name, device=None, arch=archs, module_dir=folder, use_ptx=True)
+
+
+@pytest.mark.parametrize(
+    ("reals", "archs"),
+    [((wp.float64,), [80]), pytest.param((wp.float32, wp.float64), [80, 90], marks=pytest.mark.slow)],
+    ids=["one", "all"],
+)
+def test_kernels_compile_for_cuda(reals, archs, tmp_path):
+    """One variant of each family of modules, or all of them."""
+    names = modules_of_every_kernel(reals)
     assert len(names) > 15
     if len(archs) == 1:
         names = list({family(name): name for name in sorted(names, key=len)}.values())
+    from warp._src.context import user_modules
+
     known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"  # minutes for all modules, so each once while it stays as it is
     known.mkdir(exist_ok=True)
     for name in names:
@@ -219,7 +238,7 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
         if mark.exists():
             continue
         try:
-            wp.compile_aot_module(name, device=None, arch=archs, module_dir=tmp_path / name, use_ptx=True)
+            compile_for_cuda(name, archs, tmp_path / name)
         except (RuntimeError, OSError) as error:
             pytest.fail(f"{name} does not compile: {error}")
         mark.touch()

@@ -12,6 +12,7 @@ from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
+from warp_lcp.rows.vectors import Sums
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
@@ -110,11 +111,10 @@ class Bounds:
             return
         if self._memory is None:
             self._memory = self.layout.zeros(wp.uint8)
-            self._others = wp.zeros(Rows.of_fields(self.layout).places, dtype=wp.float64, device=self.device)
+            self._others = Sums(Rows.of_fields(self.layout))
         least, most = (0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True))
         given = {"lower": self.fields[0], "upper": self.fields[1], "least": least, "most": most, "code": self._memory}
-        ENCODE.bind(Rows.of_fields(self.layout), **given, out=self._others).launch()
-        self.code = self._no_code if self._others.numpy().any() else self._memory
+        self.code = self._no_code if self._others.of(ENCODE, **given)[0] else self._memory
 
     def as_field(self, side: int) -> wp.array[Any]:
         """Return a stored float64 field of the lower (0) or the upper bound (1)."""

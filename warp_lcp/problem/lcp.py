@@ -13,7 +13,7 @@ from warp_lcp.problem.pickling import OnHost, Pickled
 from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
-from warp_lcp.rows.vectors import ADD, rows_of
+from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 CHECK = RowPass(
     "problem.check", HEADERS / "check.h", wp.float64, bounds=True, reads={"b": wp.float64, "unknown": wp.int8},
@@ -129,10 +129,11 @@ class LCP(Pickled):
             b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
             faults = (~np.isfinite(b), np.isnan(lower), np.isnan(upper), lower > upper, lower == np.inf, upper == -np.inf)
             return self._totals(np.array([np.count_nonzero(fault) for fault in faults]))
-        rows = Rows.of_fields(self.layout)
-        counts = wp.zeros(len(CHECK.sums) * rows.places, dtype=wp.float64, device=self.device)
-        CHECK.bind(rows, bounds=bounds.operands, b=field, unknown=self.unknown, out=counts).launch()
-        return self._totals(counts.numpy().reshape(-1, rows.places).sum(axis=1))
+        return self._totals(self._counts.of(CHECK, bounds=bounds.operands, b=field, unknown=self.unknown))
+
+    @cached_property
+    def _counts(self) -> Sums:
+        return Sums(Rows.of_fields(self.layout), len(CHECK.sums))
 
     def _totals(self, found: np.ndarray) -> list[int]:
         return [int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))]

@@ -11,7 +11,7 @@ from warp_lcp.rows.layout import RowLayout, make_struct
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.row_pass import Bound, Form
 
-CUDA_THREADS = 1024  # of the block: latency is all there is to hide, and a block of a GPU holds no more
+CUDA_THREADS = 512  # of the block: with 1024 a thread has 64 registers, and passes spill up to 2 kB of what it holds
 MOST = 5  # forms
 
 

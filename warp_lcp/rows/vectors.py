@@ -82,7 +82,7 @@ class Reduction:
     ) -> None:  # fmt: skip
         self.scalars, self.columns, self._across = scalars, columns, across
         self.threads = threads or Rows.flat(n, device).places
-        self.block = min(CUDA_BLOCK, self.threads) if device.is_cuda else 1
+        self.block = CUDA_BLOCK if device.is_cuda else 1
         self.partials = wp.zeros(columns * self.threads, dtype=wp.float64, device=device)
         # one block of a GPU would take long over millions of partial sums: many blocks add them up first
         self._segments = CUDA_SEGMENTS if device.is_cuda and self.threads > CUDA_SEGMENTS * CUDA_BLOCK else 1

@@ -1,0 +1,116 @@
+"""Registers, stacks and spills of all kernels, as ptxas assembles them, which is in the extra `ptxas`.
+
+TABLE=path keeps the table, PTX=folder what was compiled.
+"""
+
+import fnmatch
+import importlib.util
+import itertools
+import os
+import re
+import subprocess
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import warp as wp
+
+from test_cuda_compiles import compile_for_cuda, modules_of_every_kernel
+
+ARCHS = ("sm_80", "sm_90", "sm_100")
+REGISTERS = 65536  # of a multiprocessor, on all of them
+# Kernels that may spill, and why.
+SPILLS = {
+    "warp_lcp.blocked_gauss_seidel.*_[456]:*": "a thread enumerates the sets of a block of 4 to 6 unknowns with its matrix at hand",
+    "warp_lcp.small_levels.coarsen.*": "a few hundred bytes once a solve, in one block",
+    "warp_lcp.small_levels.cycle.solve.*": "84 bytes of a level that is solved directly, all there is of it",
+    "warp_lcp.coarsest.invert_*": "20 bytes once a solve, in one block",
+}
+# Kernels that take more than 128 registers, so that fewer than 512 threads fit on a multiprocessor, and why that is how it is.
+LARGE = {
+    "warp_lcp.blocked_gauss_seidel.*_[23456]:*": "as above",
+    "granular.stress_*": "a step holds the stress and the rate of an edge and its cells, and projects it in principal axes",
+    "granular.interleaved_3d_*": "as a step",
+    "granular.bodies_*": "the same at cells that a body touches",
+    "granular.packing:contents_kernel": "once a run",
+    "warp_lcp.grid.mesh_crossings:find_crossings": "once a mesh",
+    "fluids.coupling:*": "bodies' cells only",
+}
+
+
+def known(kernel: str, among: dict[str, str]) -> bool:
+    """Return whether a kernel is one of those."""
+    return any(fnmatch.fnmatchcase(kernel, pattern) for pattern in among)
+
+
+def ptxas() -> Path | None:
+    """Return where the assembler of the package nvidia-cuda-nvcc is."""
+    spec = importlib.util.find_spec("nvidia")
+    places = [Path(p) for p in (spec.submodule_search_locations or [])] if spec else []
+    return next((found for place in places for found in place.glob("*/bin/ptxas")), None)
+
+
+class Cost(NamedTuple):
+    """What a kernel takes on an architecture [a thread: registers, bytes; shared: bytes a block]."""
+
+    kernel: str
+    arch: str
+    registers: int
+    stack: int
+    spilled: int
+    reloaded: int
+    shared: int
+    block: int
+
+
+def costs(ptx: Path, arch: str) -> list[Cost]:
+    """Assemble a module; return what its kernels take."""
+    tool = ptxas()
+    assert tool
+    text = ptx.read_text().rstrip("\0 \n") + "\n"  # Warp ends it with a NUL, which ptxas refuses
+    blocks = dict(re.findall(r"\.entry (\w+)\([^{]*?\)\s*(?:\.maxntid (\d+))?", text))
+    done = subprocess.run(
+        [tool, "-v", f"-arch={arch}", "/dev/stdin", "-o", "/dev/null"], input=text, capture_output=True, text=True, check=True
+    )
+    found = []
+    for part in re.split(r"Compiling entry function '", done.stderr)[1:]:
+        entry = part.partition("'")[0]
+        frame = re.search(r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", part)
+        registers, shared = re.search(r"Used (\d+) registers", part), re.search(r"(\d+) bytes smem", part)
+        assert frame and registers, part
+        name = re.sub(r"_[0-9a-f]{8}_cuda_kernel_forward", "", entry)
+        numbers = (int(registers[1]), *map(int, frame.groups()), int(shared[1]) if shared else 0, int(blocks.get(entry) or 256))
+        found.append(Cost(f"{ptx.parent.name}:{name}", arch, *numbers))
+    return found
+
+
+def table(rows: list[Cost]) -> str:
+    """Return a line a kernel: registers on each architecture, else what it takes on the one where that is most."""
+    lines = ["\t".join(["kernel", *ARCHS, *Cost._fields[3:]])]
+    for kernel, group in itertools.groupby(sorted(rows), key=lambda row: row.kernel):
+        by_arch = {row.arch: row for row in group}
+        most = (max(values) for values in zip(*(row[3:] for row in by_arch.values()), strict=True))
+        lines.append("\t".join(map(str, [kernel, *(by_arch[arch].registers for arch in ARCHS), *most])))
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(ptxas() is None, reason="nvidia-cuda-nvcc, which has ptxas, is not installed")
+def test_kernels_stay_within_their_budgets(tmp_path: Path) -> None:
+    folder = Path(os.environ.get("PTX", tmp_path))
+    for name in modules_of_every_kernel((wp.float32, wp.float64)):
+        if not (folder / name).exists():
+            compile_for_cuda(name, [80], folder / name)
+    modules = sorted(folder.glob("*/*.ptx"))
+    with ThreadPoolExecutor() as pool:
+        rows = [row for part in pool.map(lambda job: costs(*job), [(m, arch) for m in modules for arch in ARCHS]) for row in part]
+    if "TABLE" in os.environ:
+        Path(os.environ["TABLE"]).write_text(table(rows))
+    for row in rows:
+        assert row.registers * row.block <= REGISTERS, row
+    spilling, large = {row.kernel for row in rows if row.spilled}, {row.kernel for row in rows if row.registers > 128}
+    assert {kernel for kernel in spilling if not known(kernel, SPILLS)} == set()
+    assert {kernel for kernel in large if not known(kernel, LARGE)} == set()
+    for among, found in ((SPILLS, spilling), (LARGE, large)):
+        assert [pattern for pattern in among if not fnmatch.filter(found, pattern)] == []  # nobody is excused for nothing
