@@ -64,7 +64,7 @@ def test_a_scene_goes_as_on_the_cpu(name: str) -> None:
 @EMULATED
 def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
     """The host waits for the device at each readback, and graphs hold no allocations."""
-    from emulated_cuda import meter
+    from benchmarks.emulated_cuda import meter
 
     simulation = made("dam-break")
     for _ in range(4):
@@ -73,3 +73,17 @@ def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
     assert meter["allocations"] == 0
     assert meter["readbacks"] <= 19  # three iterations of the solve
     assert meter["launches"] <= 145
+
+
+@EMULATED
+def test_the_model_of_gpus_hears_what_is_launched() -> None:
+    command = [sys.executable, "-m", "benchmarks.gpu_model", "--cells", "16"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=300, cwd=Path(__file__).parents[1])
+    rows = [[float(cell) for cell in line.split("|")[2:-1]] for line in done.stdout.splitlines() if "^3 |" in line]
+    assert len(rows) == 8
+    for table in (np.array(rows[:4]), np.array(rows[4:])):
+        launches, gigabytes, *times = table.T
+        assert (launches > 50).all()
+        assert (gigabytes[1:] / gigabytes[:-1] > 6.0).all()
+        assert (np.diff(times, axis=1) > 0).all()
+        assert (times[1] <= times[0]).all()  # the faster memory

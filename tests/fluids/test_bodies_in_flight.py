@@ -114,6 +114,7 @@ def test_drops_that_collide_in_flight_keep_their_common_parabola() -> None:
     assert np.diff(energy).max() < 1e-5 * energy[0]
 
 
+@pytest.mark.cpu_form("particles are sorted in every step on CUDA")
 def test_a_drop_flies_over_a_pool_that_rests() -> None:
     """Each is a body of its own; the pool touches walls and is left alone."""
     pool = in_order(create(scene(size=[2.0, 2.0], resolution=40, liquid=[ball([1.0, 1.5], 0.2), box([0.0, 0.0], [2.0, 0.3])])))

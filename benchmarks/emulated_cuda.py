@@ -1,0 +1,222 @@
+"""What is done on CUDA, on the CPU: to be imported before the package. The plugin `tests/emulated_cuda.py` has tests run so.
+
+The package decides as on CUDA (`device.is_cuda`, `__CUDA_ARCH__`), blocks of threads run as cooperative fibers that meet at barriers,
+threads and blocks run in an order that is not the usual one (ORDER = forward, reversed, permuted), `.numpy()` gives a copy, so that what
+is written to it is lost, as it is there, and recorded programs launch what a graph would hold.
+
+With COMPARE=1 every launch runs in all three orders from equal memory; `differs` counts the kernels whose results depend on it and that are
+not in `ORDER_MATTERS`. `meter` counts launches, readbacks and allocations.
+
+What it cannot show: torn interleavings and the memory model (threads run one after another), graphs' own rules, the order of streams.
+"""
+
+import collections
+import ctypes
+import fnmatch
+import importlib.abc
+import importlib.machinery
+import os
+import re
+import sys
+from pathlib import Path
+
+import warp as wp
+from warp._src import codegen, context
+from warp._src.types import array_t
+
+ORDERS = ("forward", "reversed", "permuted")
+ORDER = ORDERS.index(os.environ.get("ORDER", "permuted"))
+COMPARE = os.environ.get("COMPARE") == "1"
+PACKAGE = "warp_lcp"
+REAL = ("warp_lcp.distributed.", "warp_lcp.run.devices", "warp_lcp.benchmarks.")  # these ask CUDA itself, or another process
+ADDRESS = 0x6F0000000000  # of the order, where compiled kernels look it up
+# Kernels (module:name) whose results depend on the order of threads, and why they may.
+ORDER_MATTERS = {
+    "warp_lcp.components.unite.*:unite": "trees differ, their roots do not",
+    "warp_lcp.material.flight:unite": "trees differ, their roots do not",
+    "warp_lcp.material.flight:board_kernel": "a list in the order in which threads come; sums over it are rounded in that order",
+    "warp_lcp.grid.node_distance:claim_groups": "lists of nodes in the order in which threads come; each node is measured for itself",
+    "warp_lcp.grid.transfer_*.scatter.*:scatter": "sums of atomic additions are rounded in their order",
+    "warp_lcp.vectors:add_up_kernel": "a tile adds up by place in the block, and the emulation deals places out anew",
+}
+
+libc = ctypes.CDLL(None)
+libc.mmap.restype = ctypes.c_void_p
+libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
+READ_WRITE, PRIVATE_FIXED_ANONYMOUS = 3, 0x02 | 0x10 | 0x20
+if libc.mmap(ADDRESS, 4096, READ_WRITE, PRIVATE_FIXED_ANONYMOUS, -1, 0) != ADDRESS:
+    raise RuntimeError(f"no memory at {ADDRESS:#x}, where kernels look up the order of threads")
+order = ctypes.c_int.from_address(ADDRESS)
+order.value = ORDER
+
+CUDA = """
+#define __CUDA_ARCH__ 900
+static inline void emulated_sync() { WP_TILE_SYNC(); }
+#define __syncthreads emulated_sync
+template <class T> static inline T emulated_add(T* p, T v) { T old = *p; *p = old + v; return old; }
+#define atomicAdd emulated_add
+"""
+ROUNDED = """
+static inline {type} __{kind}{name}_rn({type} a, {type} b) {
+#pragma clang fp contract(off) reassociate(off)
+return a {sign} b; }
+"""
+PERMUTED = """
+struct emulated_order {
+    size_t n, a; int order;
+    emulated_order(size_t size) : n(size), a(1), order(*(volatile int*)ADDRESSull) {
+        if (order != 2 || n < 3) return;
+        const auto divisor = [](size_t x, size_t y) { while (y) { const size_t t = x % y; x = y; y = t; } return x; };
+        for (a = (size_t)(0.6180339887*(double)n) | 1; divisor(a, n) != 1;) ++a; }
+    size_t operator()(size_t t) const { return order == 0 ? t : order == 1 ? n - 1 - t : (t*a + n/3) % n; }
+};
+"""
+
+
+def swap(template, *pairs):
+    """Replace pieces of one of Warp's templates of kernels."""
+    text = getattr(codegen, template)
+    for old, new in pairs:
+        if old not in text:
+            raise RuntimeError(f"Warp {wp.__version__}: {template} has no {old!r}")
+        text = text.replace(old, new)
+    setattr(codegen, template, text)
+
+
+def emulate_kernels():
+    """Have kernels compiled as on CUDA, with threads and blocks in another order."""
+    rounded = ""
+    for kind, type_ in (("f", "float"), ("d", "double")):
+        for name, sign in (("add", "+"), ("sub", "-"), ("mul", "*")):
+            of = {"{type}": type_, "{kind}": kind, "{name}": name, "{sign}": sign}
+            rounded += re.sub("|".join(map(re.escape, of)), lambda m, of=of: of[m[0]], ROUNDED)
+    added = CUDA + rounded + PERMUTED.replace("ADDRESS", hex(ADDRESS))
+    codegen.cpu_module_header += added.replace("{", "{{").replace("}", "}}")
+    loop = "    for (size_t task_index = 0; task_index < dim->size; ++task_index)\n    {{\n"
+    permuted = "    const emulated_order of(dim->size);\n    for (size_t task = 0; task < dim->size; ++task)\n    {{\n"
+    swap("cpu_module_template_forward", (loop, permuted + "        const size_t task_index = of(task);\n"))
+    lane = "const size_t task_index = payload->block_first + (size_t)lane;"
+    rest = "const size_t rest = dim->size - payload->block_first, active = rest < WP_TILE_BLOCK_DIM ? rest : WP_TILE_BLOCK_DIM;\n"
+    swap("cpu_block_module_template_forward", (lane, f"{rest}    {lane.replace('(size_t)lane', 'emulated_order(active)((size_t)lane)')}"))
+    blocks = "    const size_t blocks = (total + block_dim - 1) / block_dim; const emulated_order of(blocks);\n"
+    swap(
+        "cpu_block_entry_body_forward",
+        ("    while (block_first < total)\n", f"{blocks}    while (block_id < blocks)\n"),
+        ("        const size_t remaining", "        block_first = of(block_id)*block_dim;\n        const size_t remaining"),
+        ("        block_first += (size_t)active_count;\n", ""),
+    )
+    wp.config.enable_cpu_blocks = True
+    wp.config.kernel_cache_dir = str(Path(__file__).parents[1] / "build" / "emulated-cuda")  # of its own: Warp does not hash templates
+
+
+class Loader(importlib.machinery.SourceFileLoader):
+    """Modules that take the CPU for CUDA."""
+
+    def get_code(self, fullname):
+        """Compile the source, never what is cached."""
+        path = self.get_filename(fullname)
+        source = self.get_data(path).decode()
+        if not fullname.startswith(REAL):
+            source = source.replace(".is_cuda", ".is_cuda_like").replace(".is_cpu", ".is_cpu_like")
+        source = source.replace("block_dim: int = 256", "block_dim: int = 1")  # fibers only where threads meet
+        return compile(source, path, "exec", dont_inherit=True)
+
+
+class Finder(importlib.abc.MetaPathFinder):
+    """Finds modules of the package for `Loader`."""
+
+    def find_spec(self, name, path, target=None):
+        """Find a module of the package."""
+        spec = importlib.machinery.PathFinder.find_spec(name, path, target) if name.partition(".")[0] == PACKAGE else None
+        if spec and spec.origin and spec.origin.endswith(".py"):
+            spec.loader = Loader(name, spec.origin)
+        return spec
+
+
+meter = collections.Counter[str]()  # of launches, readbacks and allocations, to be cleared by whoever looks
+
+
+def counted(what, result):
+    """Count a call; return its result."""
+    meter[what] += 1
+    return result
+
+
+def counting(what, plain):
+    """Return a function that counts its calls."""
+    return lambda *args: counted(what, plain(*args))
+
+
+def emulate_decisions():
+    """Have the package decide as on CUDA, and Warp launch as there."""
+    if any(name.partition(".")[0] == PACKAGE for name in sys.modules):
+        raise RuntimeError(f"{PACKAGE} is imported already: give the plugin to pytest with -p")
+    context.Device.is_cuda_like = property(lambda self: True)
+    context.Device.is_cpu_like = property(lambda self: False)
+    sys.meta_path.insert(0, Finder())
+    plain, numpy = wp.launch, wp.array.numpy
+
+    def launch(*args, block_dim=1, **kwargs):
+        return plain(*args, block_dim=block_dim, **kwargs)
+
+    wp.launch = launch
+    wp.array.numpy = lambda self: counted("readbacks", numpy(self).copy())
+    context.CpuDefaultAllocator.allocate = counting("allocations", context.CpuDefaultAllocator.allocate)
+    for name in ("invoke", "invoke_cpu_blocks"):
+        setattr(context, name, counting("launches", getattr(context, name)))
+    replay = wp.capture_launch
+    wp.capture_launch = lambda graph: [c.launch() for c in graph] if isinstance(graph, list) else replay(graph)
+
+
+def arrays_of(value, kind, found):
+    """Collect the addresses of arrays in a parameter, in structs and in tables of structs, with their bytes and element types."""
+    if isinstance(value, array_t):
+        dtype, shape = getattr(kind, "dtype", None), [value.shape[i] for i in range(value.ndim)]
+        size = max((n * abs(value.strides[i]) for i, n in enumerate(shape)), default=0) if value.data and all(shape) else 0
+        if size > found.get(value.data, (0, None))[0]:
+            found[value.data] = size, dtype
+        if size and isinstance(dtype, codegen.Struct) and value.ndim == 1:
+            for i in range(shape[0]):
+                arrays_of(dtype.ctype.from_address(value.data + i * value.strides[0]), dtype, found)
+    elif isinstance(value, ctypes.Structure) and isinstance(kind, codegen.Struct):
+        for name, var in kind.vars.items():
+            arrays_of(getattr(value, name), var.type, found)
+
+
+def compared(invoke):
+    """Return what launches a kernel in all orders from equal memory, and notes what differs."""
+
+    def launch(kernel, hooks, params, adjoint):
+        found = {}
+        for argument, value in zip(kernel.adj.args, params[1:], strict=False):
+            arrays_of(value, argument.type, found)
+        before = {address: ctypes.string_at(address, size) for address, (size, _) in found.items()}
+        after = []
+        for order.value in (*({0, 1, 2} - {ORDER}), ORDER):
+            for address, data in before.items():
+                ctypes.memmove(address, data, len(data))
+            invoke(kernel, hooks, params, adjoint)
+            after.append({address: ctypes.string_at(address, size) for address, (size, _) in found.items()})
+        name = f"{kernel.module.name}:{kernel.key}"
+        if after[0] != after[2] or after[1] != after[2]:
+            if not any(fnmatch.fnmatchcase(name, known) for known in ORDER_MATTERS):
+                differs[name] += 1
+
+    return launch
+
+
+differs: collections.Counter[str] = collections.Counter()
+if COMPARE:
+    context.invoke, context.invoke_cpu_blocks = compared(context.invoke), compared(context.invoke_cpu_blocks)
+
+
+def replayed():
+    """Keep what a graph would record, to launch it; once the package can be imported."""
+    from warp_lcp.rows.program import Program
+
+    Program._captured = lambda self, commands: list(commands)
+
+
+emulate_kernels()
+emulate_decisions()
+replayed()

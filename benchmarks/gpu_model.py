@@ -1,0 +1,181 @@
+"""What solves and steps should take on GPUs, from what they launch: `python -m benchmarks.gpu_model`, in the source tree.
+
+Every launch of CUDA's form is heard on the CPU (`benchmarks/emulated_cuda.py`), with the bytes of the fields that its pass declares, each
+counted once. A launch takes as long as its bytes at `SHARE` of the memory's bandwidth, and no less than its latency; small levels take a
+barrier a stage; the host waits for each readback. The pass over 128^3 cells stands for larger grids, of which each has launches for another
+level. Nothing here has been measured on a GPU.
+"""
+
+from benchmarks import emulated_cuda  # before the package
+
+# ruff: isort: split
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.benchmarks.kernels import Heard
+from warp_lcp.benchmarks.problems import splash
+from warp_lcp.rows import RowPass
+from warp_lcp.rows.row_pass import Bound
+from warp_lcp.rows.sequence import Sequence
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.simulator import simulators
+
+SHARE = 0.8  # of the bandwidth of data sheets that streaming kernels reach
+RECORDED, LAUNCHED = 2.0, 12.0  # [us] a launch in a graph, and one from Python
+BARRIER, READBACK = 1.5, 15.0  # [us]
+GPUS = {"H100 SXM": 3350.0, "H200": 4800.0, "RTX 4090": 1008.0, "RTX 4070 laptop": 256.0}  # GB/s
+STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
+SIZES = (128, 256, 512, 1024)
+
+
+@dataclass
+class Work:
+    """What was launched.
+
+    Attributes:
+        bytes: of the fields that each launch declares.
+        graph: which launches were in a graph.
+        stages: of small levels, each with a barrier.
+        readbacks: how often the host waited.
+    """
+
+    bytes: list[float] = field(default_factory=list)
+    graph: list[bool] = field(default_factory=list)
+    stages: int = 0
+    readbacks: int = 0
+
+    def ms(self, bandwidth: float) -> float:
+        """Return the time [ms] at a bandwidth [GB/s]."""
+        least = np.where(self.graph, RECORDED, LAUNCHED)
+        moved = np.array(self.bytes) / (SHARE * bandwidth * 1e3)
+        return float(np.maximum(least, moved).sum() + BARRIER * self.stages + READBACK * self.readbacks) / 1e3
+
+    def grown(self, before: "Work", levels: int) -> "Work":
+        """Return the work on a grid 2^levels times as fine; `before`: on one half as fine."""
+        more = [b for b, g in zip(self.bytes, self.graph, strict=True) if g]
+        added = max(len(self.bytes) - len(before.bytes), 0) * levels
+        sizes = [b * 8.0**levels for b in self.bytes] + sorted(more)[len(more) // 2 :][:1] * added
+        return replace(self, bytes=sizes, graph=[*self.graph, *[True] * added])
+
+
+def heard(work: Callable[[], object]) -> Work:
+    """Return what a call launches; run it twice, for the first run makes what later ones replay."""
+    given: dict[int, tuple[Bound, Heard]] = {}
+    tags: dict[int, tuple[Any, float, int]] = {}
+    bind, launch_bound, launch_sequence = RowPass.bind, Bound.launch, Sequence.launch
+    plain, replay = wp.launch, wp.Launch.launch
+    current: list[tuple[float, int]] = []
+    found = Work()
+
+    def binding(declared: RowPass, rows: Any, *, stencil: Any = None, bounds: Any = None, **arguments: Any) -> Bound:
+        bound = bind(declared, rows, stencil=stencil, bounds=bounds, **arguments)
+        fields = {name: value for name, value in arguments.items() if isinstance(value, wp.array)}
+        if stencil is not None:
+            fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}
+        fields |= {name: value for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False) if name}
+        given[id(bound)] = bound, Heard(bound, fields)
+        return bound
+
+    def launching(bound: Bound, *args: Any) -> None:
+        known = given.get(id(bound))
+        current.append((sum(known[1].reads.values()) + sum(known[1].writes.values()) if known else 0.0, 0))
+        launch_bound(bound, *args)
+        current.pop()
+
+    def sequencing(sequence: Sequence, *args: Any) -> None:
+        current.append((0.0, len(sequence._stages)))
+        launch_sequence(sequence, *args)
+        current.pop()
+
+    def launch(kernel: Any, dim: Any, inputs: Any = (), *args: Any, record_cmd: bool = False, **options: Any) -> Any:
+        arrays = [a for a in inputs if isinstance(a, wp.array)]  # of a kernel that is no pass
+        cost = current[-1] if current else (float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays)), 0)
+        made = plain(kernel, dim, inputs, *args, record_cmd=record_cmd, **options)
+        if record_cmd:
+            tags[id(made)] = made, *cost
+        else:
+            note(*cost, graph=False)
+        return made
+
+    def replaying(command: Any, *args: Any) -> None:
+        replay(command, *args)
+        _, size, stages = tags.get(id(command), (None, 0.0, 0))
+        note(size, stages, graph=True)
+
+    def note(size: float, stages: int, *, graph: bool) -> None:
+        found.bytes.append(size)
+        found.graph.append(graph)
+        found.stages += stages
+
+    patches = (
+        mock.patch.object(RowPass, "bind", binding), mock.patch.object(Bound, "launch", launching),
+        mock.patch.object(Sequence, "launch", sequencing), mock.patch.object(wp, "launch", launch),
+        mock.patch.object(wp.Launch, "launch", replaying),
+    )  # fmt: skip
+    for patch in patches:
+        patch.start()
+    work()
+    found.bytes.clear()
+    found.graph.clear()
+    found.stages = 0
+    emulated_cuda.meter.clear()
+    work()
+    for patch in reversed(patches):
+        patch.stop()
+    found.readbacks = emulated_cuda.meter["readbacks"]
+    return found
+
+
+def solve(n: int) -> tuple[Work, int]:
+    """Return the work of a cold solve of a splash with separating walls to 1e-6, and its iterations."""
+    problem, method = splash(n).problem("walls", "cpu"), wl.ProjectedMultigrid()
+    workspace, found = method.init(problem), []
+    work = heard(lambda: found.append(wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace)))
+    assert found[-1], found[-1].status
+    return work, found[-1].iterations
+
+
+def step(n: int) -> Work:
+    """Return the work of some steps of the dam break."""
+    scene = load_scene("dam-break", [f"domain.resolution={n}"])
+    simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+    for _ in range(STEPS):
+        simulation.step(simulation.stable_dt())
+    return heard(lambda: [simulation.step(simulation.stable_dt()) for _ in range(HEARD)])
+
+
+def table(small: Work, large: Work, n: int, times: int = 1) -> str:
+    """Return a table of sizes and devices for one of some `times`, from the work at n / 2 and at n."""
+    lines = [f"| cells | launches | GB | {' | '.join(GPUS)} |", "|---|---|---|" + "---|" * len(GPUS)]
+    for size in SIZES:
+        work = large.grown(small, int(np.log2(size / n))) if size > n else large
+        columns = [f"{len(work.bytes) / times:.0f}", f"{sum(work.bytes) / times / 1e9:.2f}"]
+        columns += [f"{work.ms(bandwidth) / times:.1f}" for bandwidth in GPUS.values()]
+        lines.append(f"| {size}^3 | {' | '.join(columns)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=128, help="along an axis of what is heard")
+    n = parser.parse_args().cells
+    (small, _), (large, iterations) = solve(n // 2), solve(n)
+    print(f"A cold solve to 1e-6 [ms]: {iterations} iterations, {large.readbacks} readbacks, {large.stages} stages of small levels\n")
+    print(table(small, large, n))
+    before, after = step(n // 2), step(n)
+    print(f"\nA step of the dam break [ms]: {after.readbacks / HEARD:.0f} readbacks, {after.stages / HEARD:.0f} stages\n")
+    print(table(before, after, n, HEARD))
+
+
+if __name__ == "__main__":
+    main()
