@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """What is done on CUDA, on the CPU: to be imported before the package. The plugin `tests/emulated_cuda.py` has tests run so.
 
 The package decides as on CUDA (`device.is_cuda`, `__CUDA_ARCH__`), blocks of threads run as cooperative fibers that meet at barriers,

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, settings
 
 from dots import dots, scene_file  # noqa: F401  # fixtures of whatever runs scenes
 
+collect_ignore = ["emulated_cuda.py"]  # a plugin, which changes all that is imported after it
 wp.config.log_level = wp.LOG_ERROR
 if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):  # processes that test beside each other share the cores, as ranks do
     os.environ.setdefault("WARP_LCP_THREADS", str(max((os.cpu_count() or 1) // int(workers), 1)))
