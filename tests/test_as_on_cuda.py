@@ -87,3 +87,14 @@ def test_the_model_of_gpus_hears_what_is_launched() -> None:
         assert (gigabytes[1:] / gigabytes[:-1] > 6.0).all()
         assert (np.diff(times, axis=1) > 0).all()
         assert (times[1] <= times[0]).all()  # the faster memory
+
+
+@EMULATED
+def test_the_verdict_on_a_gpu_is_rehearsed(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "benchmarks.gpu", "--rehearse", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=Path(__file__).parents[1], check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    verdict = json.loads((tmp_path / "verdict.json").read_text())
+    assert len(verdict["claims"]) >= 7
+    assert all(claim["holds"] for claim in verdict["claims"])
+    assert "| PASS | answers equal the CPU's |" in (tmp_path / "verdict.md").read_text()

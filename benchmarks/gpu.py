@@ -1,0 +1,253 @@
+"""A verdict on a GPU from one command, in the source tree: `python -m benchmarks.gpu`; one page is left in out/gpu.
+
+What holds on the CPU must hold on the device: equal answers, the same bits in every run, graphs as launches, odd grids, hundreds of steps,
+memory that stays. Then times, beside what `benchmarks/gpu_model.py` foretold, and which share of the bandwidth kernels reach. A claim that
+fails is written down like one that holds. `--rehearse` does all of it on the CPU in CUDA's form (`benchmarks/emulated_cuda.py`).
+"""
+
+import importlib
+import sys
+
+if "--rehearse" in sys.argv:
+    importlib.import_module("benchmarks.emulated_cuda")  # before the package
+
+# ruff: isort: split
+
+import argparse
+import json
+import shutil
+import subprocess
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.benchmarks import gpu_cases, kernels
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Table
+from warp_lcp.benchmarks.harness.report import markdown
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.benchmarks.problems import natural, splash
+from warp_lcp.rows.program import Program
+
+CLOSE, ALIKE = 1e-5, 2e-2  # relative: solutions to 1e-8, and where particles are after many steps
+CAPTURE_LAUNCH = wp.capture_launch
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass
+class Claim:
+    """What was tried: whether it holds, and what was found."""
+
+    name: str
+    holds: bool
+    found: str
+
+
+class Verdict:
+    """All claims about a device, as they are tried.
+
+    Args:
+        device: Warp device.
+        rehearsal: whether the device is the CPU in CUDA's form, and everything is small.
+        out: folder of what is left.
+    """
+
+    def __init__(self, device: str, *, rehearsal: bool, out: Path) -> None:
+        self.device, self.rehearsal, self.out = device, rehearsal, out
+        self.claims: list[Claim] = []
+        self.tables: list[Table] = []
+        self.steps = 10 if rehearsal else gpu_cases.STEPS
+
+    def claim(self, name: str, found: Callable[[], str | None]) -> None:
+        """Try a claim: `found` returns what it saw, or raises AssertionError with what is wrong; None where it cannot be tried."""
+        start = time.perf_counter()
+        try:
+            text, holds = found(), True
+        except AssertionError as error:
+            text, holds = str(error), False
+        except Exception as error:  # whatever a strange machine does is what this is to find
+            text, holds = f"{type(error).__name__}: {error} ({traceback.extract_tb(error.__traceback__)[-1].name})", False
+        if text is not None:
+            self.claims.append(Claim(name, holds, text))
+            print(f"{'PASS' if holds else 'FAIL'}  {name}: {text} ({time.perf_counter() - start:.0f} s)", flush=True)
+
+    def all(self) -> None:
+        """Try everything."""
+        self.claim("answers equal the CPU's", self.agreement)
+        self.claim("residuals by NumPy", self.residuals)
+        self.claim("the same bits in every run", self.repeats)
+        self.claim("graphs do what launches do", self.graphs)
+        self.claim("grids without unknowns are refused", self.empty)
+        self.claim("memory stays", self.memory)
+        self.claim("compute-sanitizer finds nothing", self.sanitized)
+        self.claim("times", self.times)
+        self.claim("bandwidth of kernels", self.bandwidth)
+
+    def agreement(self) -> str:
+        """Compare all cases with those of a process on the CPU."""
+        path = self.out / "cpu.npz"
+        command = [sys.executable, "-m", "benchmarks.gpu_cases", str(path), "cpu", str(self.steps)]
+        subprocess.run(command, cwd=ROOT, check=True, timeout=900, stdout=subprocess.DEVNULL)
+        found, wrong, worst = gpu_cases.everything(self.device, self.steps), [], 0.0
+        with np.load(path) as expected:
+            wrong += [f"{name} only here" for name in found.keys() - expected.keys()]
+            for name, x in expected.items():
+                if name not in found:
+                    wrong.append(f"{name} not here")
+                    continue
+                scale, bound = np.abs(x).max() or 1.0, ALIKE if "steps" in name else CLOSE
+                off = float(np.abs(found[name] - x).max() / scale)
+                worst = max(worst, off / bound)
+                if not off <= bound:
+                    wrong.append(f"{name} is off by {off:.1e}")
+        assert not wrong, "; ".join(sorted(wrong))
+        assert worst > 0.0, "every bit is the CPU's: this was no other device"
+        return f"{len(found)} cases, at most {worst:.1g} of what is allowed"
+
+    def residuals(self) -> str:
+        """Evaluate residuals of a splash by no code of the solvers."""
+        scene, n = splash(32 if self.rehearsal else 128), 32 if self.rehearsal else 128
+        problem = scene.problem("walls", self.device)
+        result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-7))
+        lower = np.where(scene.wall, 0.0, -np.inf)
+        start, end = (np.linalg.norm(natural(scene.cells, scene.b, lower, x)) for x in (np.zeros(scene.cells.shape), result.x.numpy()))
+        assert end <= 1.1e-7 * start, f"{end / start:.1e} at {n}^3, where the solver says {result.relative_residual:.1e}"
+        return f"{end / start:.1e} of the start's at {n}^3 in {result.iterations} iterations"
+
+    def repeats(self) -> str:
+        """Solve and step twice."""
+        first, second = (gpu_cases.large(self.device, 32) for _ in range(2))
+        other = [name for name, x in first.items() if not np.array_equal(x, second[name])]
+        for name in ("dam-break", "column-collapse-2d"):
+            for step, (a, b) in enumerate(zip(*(gpu_cases.states(name, self.device, self.steps) for _ in range(2)), strict=True)):
+                if not all(np.array_equal(a[key], b[key]) for key in a):
+                    other.append(f"{name} from step {step} on")
+                    break
+        assert not other, f"differ: {', '.join(other)}"
+        return f"{len(first)} solves and {self.steps} steps of two scenes"
+
+    def graphs(self) -> str:
+        """Solve with launches one by one."""
+        recorded = gpu_cases.large(self.device, 32)
+        with mock.patch.object(Program, "_captured", lambda _, commands: list(commands)), mock.patch.object(wp, "capture_launch", launched):
+            alone = gpu_cases.large(self.device, 32)
+        other = [name for name, x in recorded.items() if not np.array_equal(x, alone[name])]
+        assert not other, f"differ: {', '.join(other)}"
+        return f"{len(alone)} solves, bit for bit"
+
+    def empty(self) -> str:
+        """Give problems without an unknown."""
+        for shape in ((3, 3), (4, 5, 6)):
+            try:
+                wl.LCP(wl.GridPoisson(np.full(shape, wl.AIR), device=self.device), np.zeros(shape))
+            except ValueError:
+                continue
+            raise AssertionError(f"{shape} of AIR is taken")
+        return "2-D and 3-D"
+
+    def memory(self) -> str | None:
+        """Step a liquid, and look at the memory in use after half of the steps and after all."""
+        if self.rehearsal:
+            return None
+        used = []
+        for step, _ in enumerate(gpu_cases.states("dam-break", self.device, 2 * self.steps)):
+            if step % self.steps == self.steps - 1:
+                used.append(wp.get_mempool_used_mem_current(self.device))
+        assert used[1] <= 1.05 * used[0], f"{used[0] / 1e6:.0f} MB after {self.steps} steps, {used[1] / 1e6:.0f} after {2 * self.steps}"
+        return f"{used[1] / 1e6:.0f} MB after {2 * self.steps} steps"
+
+    def sanitized(self) -> str | None:
+        """Run the small cases under NVIDIA's sanitizer, where it is installed."""
+        tool = shutil.which("compute-sanitizer")
+        if tool is None or self.rehearsal:
+            return None
+        cases = [sys.executable, "-m", "benchmarks.gpu_cases", str(self.out / "sanitized.npz"), self.device, "2"]
+        done = subprocess.run([tool, "--error-exitcode", "9", *cases], cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+        assert done.returncode == 0, done.stdout[-500:]
+        return "memcheck"
+
+    def times(self) -> str:
+        """Time cold solves, and put them beside the model's tables."""
+        rows = []
+        for n in (16, 32) if self.rehearsal else (128, 256, 512):
+            problem, method = splash(n).problem("walls", self.device), wl.ProjectedMultigrid()
+            workspace, taken = method.init(problem), []
+            for _ in range(4):  # the first loads kernels and captures graphs
+                wp.synchronize()
+                start = time.perf_counter()
+                result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace)
+                wp.synchronize()
+                taken.append(time.perf_counter() - start)
+            rows.append([f"{n}^3", f"{1e3 * min(taken[1:]):.1f}", str(result.iterations), result.status.name])
+        self.tables.append(Table("Cold solves of a splash to 1e-6", ["cells", "ms", "iterations", "status"], rows))
+        said = subprocess.run(
+            [sys.executable, "-m", "benchmarks.gpu_model", "--cells", "16" if self.rehearsal else "64"],
+            cwd=ROOT, check=True, capture_output=True, text=True, timeout=600,
+        ).stdout  # fmt: skip
+        (self.out / "model.md").write_text(said)
+        return ", ".join(f"{cells} {ms} ms" for cells, ms, *_ in rows)
+
+    def bandwidth(self) -> str:
+        """Measure the kernels on the finest grid against copying."""
+        n = 16 if self.rehearsal else 256
+        found = kernels.measure(Options(self.device, (n,), 1 if self.rehearsal else 5, lambda _: None), self.out)
+        self.tables += found.tables
+        return f"{sum(len(t.rows) for t in found.tables[1:])} kernels at {n}^3"
+
+    def write(self) -> None:
+        """Leave the page, and the file to send in."""
+        rows = [["PASS" if c.holds else "FAIL", c.name, c.found] for c in self.claims]
+        tables = [Table("Claims", ["", "claim", "found"], rows), *self.tables]
+        record = machine(self.device, elements=1 << 20)
+        lines = [
+            f"# Verdict on {self.device}{' (a rehearsal on the CPU)' if self.rehearsal else ''}",
+            "",
+            f"`{json.dumps(record.facts)}`",
+            "",
+        ]
+        for table in tables:
+            lines += [f"## {table.title}", "", *markdown(table), ""]
+        if (model := self.out / "model.md").exists():
+            lines += ["", "## What was foretold", "", model.read_text()]
+        (self.out / "verdict.md").write_text("\n".join(lines) + "\n")
+        kept = {"device": record.facts, "claims": [asdict(c) for c in self.claims], "tables": [asdict(t) for t in self.tables]}
+        (self.out / "verdict.json").write_text(json.dumps(kept, indent=1))
+
+
+def launched(graph: Any) -> None:
+    """Launch what a graph would hold; one that loops on the device stays a graph."""
+    if isinstance(graph, list):
+        for command in graph:
+            command.launch()
+    else:
+        CAPTURE_LAUNCH(graph)
+
+
+def main() -> int:
+    """Try everything; return 1 if a claim fails, 2 if there is no device."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rehearse", action="store_true", help="on the CPU in CUDA's form, small")
+    parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--out", type=Path, default=Path("out/gpu"))
+    given = parser.parse_args()
+    if not given.rehearse and not wp.is_cuda_available():
+        print("no CUDA device here: `--rehearse` shows what would be done", file=sys.stderr)
+        return 2
+    given.out.mkdir(parents=True, exist_ok=True)
+    verdict = Verdict("cpu" if given.rehearse else given.device, rehearsal=given.rehearse, out=given.out.resolve())
+    verdict.all()
+    verdict.write()
+    print(f"{given.out}/verdict.md, and verdict.json to send in")
+    return int(any(not c.holds for c in verdict.claims))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
