@@ -144,4 +144,4 @@ def test_kept_results_are_small():
     kept = Path(benchmarks.__file__).parent / "results"
     sizes = {path: path.stat().st_size for path in kept.rglob("*") if path.is_file()}
     assert sum(sizes.values()) < 2e6
-    assert {path.suffix for path in sizes} == {".json", ".md", ".png"}
+    assert {path.suffix for path in sizes} == {".json", ".md", ".png", ".tsv"}
