@@ -212,10 +212,12 @@ if COMPARE:
 
 
 def replayed():
-    """Keep what a graph would record, to launch it; once the package can be imported."""
+    """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
     from warp_lcp.rows.program import Program
 
+    wp.is_conditional_graph_supported = lambda: True
     Program._captured = lambda self, commands: list(commands)
+    Program._captured_loop = lambda self, condition: lambda: wp.capture_while(condition, self._launch)
 
 
 emulate_kernels()

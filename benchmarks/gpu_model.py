@@ -11,6 +11,7 @@ from benchmarks import emulated_cuda  # before the package
 # ruff: isort: split
 
 import argparse
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -44,12 +45,14 @@ class Work:
     Attributes:
         bytes: of the fields that each launch declares.
         graph: which launches were in a graph.
+        names: of the kernels.
         stages: of small levels, each with a barrier.
         readbacks: how often the host waited.
     """
 
     bytes: list[float] = field(default_factory=list)
     graph: list[bool] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
     stages: int = 0
     readbacks: int = 0
 
@@ -60,17 +63,35 @@ class Work:
         return float(np.maximum(least, moved).sum() + BARRIER * self.stages + READBACK * self.readbacks) / 1e3
 
     def grown(self, before: "Work", levels: int) -> "Work":
-        """Return the work on a grid 2^levels times as fine; `before`: on one half as fine."""
+        """Return the work on a grid 2^levels times as fine; `before`: on one half as fine. Launches and stages grow by as many a level."""
         more = [b for b, g in zip(self.bytes, self.graph, strict=True) if g]
         added = max(len(self.bytes) - len(before.bytes), 0) * levels
         sizes = [b * 8.0**levels for b in self.bytes] + sorted(more)[len(more) // 2 :][:1] * added
-        return replace(self, bytes=sizes, graph=[*self.graph, *[True] * added])
+        graph, names = [*self.graph, *[True] * added], [*self.names, *["coarse"] * added]
+        stages = self.stages + max(self.stages - before.stages, 0) * levels
+        return replace(self, bytes=sizes, graph=graph, names=names, stages=stages)
+
+    def passes(self, most: int = 12) -> str:
+        """Return a table of the kernels that move most."""
+        moved, launches = dict.fromkeys(self.names, 0.0), Counter[str](self.names)
+        for name, size in zip(self.names, self.bytes, strict=True):
+            moved[name] += size
+        rows = [
+            f"| `{name}` | {launches[name]} | {size / sum(self.bytes):.1%} |"
+            for name, size in sorted(moved.items(), key=lambda item: -item[1])[:most]
+        ]
+        return "\n".join(["| kernel | launches | share of the bytes |", "|---|---|---|", *rows])
 
 
-def heard(work: Callable[[], object]) -> Work:
-    """Return what a call launches; run it twice, for the first run makes what later ones replay."""
+def name_of(kernel: Any) -> str:
+    """Return a kernel's module, without the package, and its name."""
+    return f"{kernel.module.name.removeprefix('warp_lcp.')}:{kernel.key}"
+
+
+def heard(make: Callable[[], Callable[[], object]]) -> Work:
+    """Return what a call launches; `make` returns it, and is heard itself, for what is made in the first run is replayed by later ones."""
     given: dict[int, tuple[Bound, Heard]] = {}
-    tags: dict[int, tuple[Any, float, int]] = {}
+    tags: dict[int, tuple[Any, float, int, str]] = {}
     bind, launch_bound, launch_sequence = RowPass.bind, Bound.launch, Sequence.launch
     plain, replay = wp.launch, wp.Launch.launch
     current: list[tuple[float, int]] = []
@@ -101,19 +122,20 @@ def heard(work: Callable[[], object]) -> Work:
         cost = current[-1] if current else (float(sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in arrays)), 0)
         made = plain(kernel, dim, inputs, *args, record_cmd=record_cmd, **options)
         if record_cmd:
-            tags[id(made)] = made, *cost
+            tags[id(made)] = made, *cost, name_of(kernel)
         else:
-            note(*cost, graph=False)
+            note(*cost, name_of(kernel), graph=False)
         return made
 
     def replaying(command: Any, *args: Any) -> None:
         replay(command, *args)
-        _, size, stages = tags.get(id(command), (None, 0.0, 0))
-        note(size, stages, graph=True)
+        _, size, stages, name = tags.get(id(command), (None, 0.0, 0, ""))
+        note(size, stages, name, graph=True)
 
-    def note(size: float, stages: int, *, graph: bool) -> None:
+    def note(size: float, stages: int, name: str, *, graph: bool) -> None:
         found.bytes.append(size)
         found.graph.append(graph)
+        found.names.append(name)
         found.stages += stages
 
     patches = (
@@ -123,9 +145,10 @@ def heard(work: Callable[[], object]) -> Work:
     )  # fmt: skip
     for patch in patches:
         patch.start()
+    work = make()
     work()
-    found.bytes.clear()
-    found.graph.clear()
+    for kept in (found.bytes, found.graph, found.names):
+        kept.clear()
     found.stages = 0
     emulated_cuda.meter.clear()
     work()
@@ -137,9 +160,13 @@ def heard(work: Callable[[], object]) -> Work:
 
 def solve(n: int) -> tuple[Work, int]:
     """Return the work of a cold solve of a splash with separating walls to 1e-6, and its iterations."""
-    problem, method = splash(n).problem("walls", "cpu"), wl.ProjectedMultigrid()
-    workspace, found = method.init(problem), []
-    work = heard(lambda: found.append(wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace)))
+    problem, method, found = splash(n).problem("walls", "cpu"), wl.ProjectedMultigrid(), list[wl.SolveResult]()
+
+    def make() -> Callable[[], object]:
+        workspace = method.init(problem)
+        return lambda: found.append(wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-6), workspace=workspace))
+
+    work = heard(make)
     assert found[-1], found[-1].status
     return work, found[-1].iterations
 
@@ -147,10 +174,14 @@ def solve(n: int) -> tuple[Work, int]:
 def step(n: int) -> Work:
     """Return the work of some steps of the dam break."""
     scene = load_scene("dam-break", [f"domain.resolution={n}"])
-    simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
-    for _ in range(STEPS):
-        simulation.step(simulation.stable_dt())
-    return heard(lambda: [simulation.step(simulation.stable_dt()) for _ in range(HEARD)])
+
+    def make() -> Callable[[], object]:
+        simulation = simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
+        for _ in range(STEPS):
+            simulation.step(simulation.stable_dt())
+        return lambda: [simulation.step(simulation.stable_dt()) for _ in range(HEARD)]
+
+    return heard(make)
 
 
 def table(small: Work, large: Work, n: int, times: int = 1) -> str:

@@ -59,6 +59,10 @@ class SharedSurface:
         self._surface.mark(particles, window, kind)
         self._part.fill(kind, *([] if self.phi is None else [self.phi]))
 
+    def measure(self) -> None:
+        """Find the volume of this rank's liquid."""
+        self._surface.measure()
+
     def volume(self, cells: int) -> float:
         """Return the volume of all ranks' liquid, given the number of all FLUID cells."""
         mine = self._surface.volume(cells)
@@ -147,9 +151,9 @@ class DistributedLiquid(LiquidSimulation):
         self.particles.drop_ghosts()
         super().bring_to_particles(window, kind, dt)
 
-    def carry(self, dt: float) -> tuple[int, int, int]:
-        """Move particles by dt [s]. Return how many of all met a wall, and twice 0: no solid moves."""
-        met, pushed, stuck = self.part.ranks.sum(np.array(super().carry(dt)))
+    def met(self) -> tuple[int, int, int]:
+        """Return how many of all met a wall, and twice 0: no solid moves."""
+        met, pushed, stuck = self.part.ranks.sum(np.array(super().met()))
         return int(met), int(pushed), int(stuck)
 
     def checked_totals(self, when: str) -> ParticleTotals:

@@ -24,7 +24,7 @@ class DistributedPressure(PressureProjection):
 
     Its fields are of the part, with ghost cells; what is solved has the cells of the box. Right-hand side, bounds and coefficients of the
     box are those of a whole grid, bit for bit, if velocity, kinds of cells and surface are right a cell beyond the box. `prepare`, `solve`,
-    `project`, `unknowns` and `not_finite` are collective; what they return is of all ranks.
+    `project`, `counted` and `not_finite` are collective; what they return is of all ranks.
 
     Args:
         part: where this rank works.
@@ -48,11 +48,9 @@ class DistributedPressure(PressureProjection):
     def _look(self, window: Window | None) -> None:
         """Solve for the cells of the box, whatever the window."""
 
-    def project(
-        self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
-    ) -> Projection:
+    def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
         """Take a result, and the velocity, marks and contacts of the ghost layers from other ranks."""
-        found = super().project(velocity, window, result, criteria, unknowns)
+        found = super().project(velocity, window, result, criteria)
         self.part.fill(*velocity, *self.known, self.contact)
         return found
 
@@ -99,8 +97,12 @@ class DistributedPressure(PressureProjection):
         wp.copy(self.part.box_of(self.pressure), x.reshape(self._rhs.shape)[1:-1, 1:-1, 1:-1])
         self.part.fill(self.pressure)
 
+    def counted(self) -> int:
+        """Return the number of unknowns of all ranks."""
+        return int(self.part.ranks.sum(super().counted()))
+
     def _found(self) -> tuple[float, float]:
-        """Return the sum of what kernels have found in all ranks' rows, and the largest of what else they have."""
+        """Return the sum of what all ranks have found released, and the largest outflow of others."""
         every = self.part.ranks.gather(np.array(super()._found()))
         return float(every[:, 0].sum()), float(every[:, 1].max())
 

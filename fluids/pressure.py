@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,10 +17,12 @@ from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
+from warp_lcp.grid.tally import WindowTally
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import convert
 
@@ -30,7 +32,7 @@ THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cell
 F32, F64, I8, U8 = wp.float32, wp.float64, wp.int8, wp.uint8
 FACES = {f"{what}_{axis}": F32 for what in ("open", "solid") for axis in "xyz"}
 COUNT = RowPass(
-    "fluids.pressure.count_fluid", HEADERS / "count_fluid.h", F64, box={"kind": I8}, whole={"sums": F64}, constants={"FLUID": FLUID}
+    "fluids.pressure.count_fluid", HEADERS / "count_fluid.h", F64, box={"kind": I8}, constants={"FLUID": FLUID}, sums=("fluid",)
 )
 
 
@@ -58,7 +60,7 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
         prepare=made("prepare", liquid | problem, {"ratio": F64}),
         subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
         support=made("support", faces | {"weight": F32}, {"axis": int, "limit": F32}),
-        contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, whole={"sums": F64}),
+        contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, sums=("released",), largest=("worst",)),
     )
 
 
@@ -73,14 +75,26 @@ class Projection:
     Attributes:
         result: of the solve; `result.x` is kick_dt p / (rho dx) [m/s]. None: no cell holds liquid, there was nothing to solve.
         unknowns: FLUID cells.
-        released: wall cells that let go.
-        max_outflow: largest |y| of the other FLUID cells, recomputed from the projected velocities [m/s].
+        found: returns `released` and `max_outflow`, and waits for the device.
     """
 
     result: wl.SolveResult | None
     unknowns: int
-    released: int
-    max_outflow: float
+    found: Callable[[], tuple[float, float]]
+
+    @functools.cached_property
+    def _found(self) -> tuple[float, float]:
+        return self.found()
+
+    @property
+    def released(self) -> int:
+        """Wall cells that let go."""
+        return int(self._found[0])
+
+    @property
+    def max_outflow(self) -> float:
+        """Largest |y| of the other FLUID cells, recomputed from the projected velocities [m/s]."""
+        return self._found[1]
 
 
 class PressureProjection:
@@ -142,7 +156,7 @@ class PressureProjection:
         self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
         self._least: Any = -np.inf if self._lower is None else self._lower
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
-        self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
+        self._count, self._contacts = WindowTally(COUNT, grid), WindowTally(self._passes.contact, grid)
         self._trail, self._solved, self._rhs, self._guess = Trail(grid.domain), grid.domain, self._b, self._start  # what is solved for
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
@@ -151,8 +165,10 @@ class PressureProjection:
         """Show `kind` in frames though nothing has been projected yet."""
         wp.copy(self.cells, self.kind)
 
-    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> int:
-        """Set up the problem of the marked cells and return the number of unknowns. The first guess is the last pressure.
+    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> bool:
+        """Set up the problem of the marked cells; return whether there is one. The first guess is the last pressure.
+
+        It may have no unknowns: `counted` tells, and waits for the device.
 
         Args:
             velocity: u* of each component [m/s].
@@ -161,16 +177,16 @@ class PressureProjection:
             window: cells that hold all FLUID cells; None: all cells.
         """
         self._look(window)
-        unknowns = self.unknowns()
-        if self._problem is None and unknowns > 0:
+        self._count.take(self._solved, kind=self._unknown)
+        if self._problem is None and self.counted() > 0:
             self._make_problem()
         self._begin(kick_dt)
         if self._problem is None:
-            return 0
+            return False
         problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
         self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, ratio=self._ratio)
         self._update()
-        return unknowns
+        return True
 
     def _look(self, window: Window | None) -> None:
         """Solve for the cells of a window, and undo what is left of the last one."""
@@ -182,7 +198,7 @@ class PressureProjection:
             field.zero_()
         self.show()
         self._last = self._kick
-        return Projection(None, 0, 0, 0.0)
+        return Projection(None, 0, lambda: (0.0, 0.0))
 
     def _begin(self, kick_dt: float) -> None:
         """Note how long forces act: what pressures were as impulses in the last projection they are now by the ratio of these times."""
@@ -214,21 +230,21 @@ class PressureProjection:
         """Return what passes take of velocities and walls, and what `_faces` has."""
         return dict(zip("uvw", three(velocity), strict=True)) | {"touch": self.boundary.touch} | self._faces()
 
-    def solve(self, speed: float, unknowns: int) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
+    def solve(self, speed: float) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
 
         Args:
             speed: scale of u* [m/s].
-            unknowns: of `prepare`.
 
         Returns:
             The result and the criteria it was held to.
         """
-        criteria = self.criteria(speed, unknowns)
+        mean = self._criteria(speed)
         assert self._problem is not None, "prepare comes first"
-        result = wl.solve(self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work)
+        result = wl.solve(self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work)
+        criteria = mean.known()
         if self.automatic is not None and result:
-            self.automatic.measure(self._problem.A, result, criteria, [self._guess, self._rhs], unknowns)
+            self.automatic.measure(self._problem.A, result, criteria, [self._guess, self._rhs], self.counted())
         return result, criteria
 
     def push_bodies(self, result: wl.SolveResult) -> None:
@@ -236,29 +252,26 @@ class PressureProjection:
         if self.coupling is not None:
             self.coupling.push(result.x)
 
-    def criteria(self, speed: float, unknowns: int) -> wl.StoppingCriteria:
+    def _criteria(self, speed: float) -> MeanCriteria:
         """Return when a solve is done.
 
         The absolute tolerance is the rounding noise of b, so that a liquid at rest or in free fall is not iterated on it.
 
         Args:
             speed: scale of u* [m/s].
-            unknowns: of `prepare`.
         """
-        atol = ROUNDING * speed * unknowns**0.5
-        if self.automatic is not None:
-            return self.automatic.criteria(self._ratio, unknowns, atol=atol, max_iterations=self.max_iterations)
-        return wl.StoppingCriteria(rtol=float(self.tolerance), atol=atol, max_iterations=self.max_iterations)
+        atol = ROUNDING * speed
+        tolerances = {"rtol": self.tolerance, "atol": atol} if self.automatic is None else self.automatic.criteria(self._ratio, atol)
+        return MeanCriteria(**tolerances, max_iterations=self.max_iterations, count=self.counted, counted=self._count.on_device())
 
-    def recorded(self, speed: float, unknowns: int) -> dict[str, np.ndarray]:
+    def recorded(self, speed: float) -> dict[str, np.ndarray]:
         """Return the prepared problem as `warp_lcp.gallery.recorded` describes it, without what the simulation knows: step, time, dt.
 
         Args:
             speed: scale of u* [m/s].
-            unknowns: of `prepare`.
         """
         assert self._problem is not None, "prepare comes first"
-        criteria = self.criteria(speed, unknowns)
+        criteria = self._criteria(speed).known()
         numbers = {"tolerance": criteria.rtol, "absolute_tolerance": criteria.atol, "spacing": self.grid.spacing}
         return recorded.arrays(self._problem, self._start) | {name: np.array(value) for name, value in numbers.items()}
 
@@ -266,9 +279,7 @@ class PressureProjection:
         """Return the fields of the problem: its cells, right-hand side, lower bound and first guess."""
         return [self.kind, self._b, *([] if self._lower is None else [self._lower]), self._start]
 
-    def project(
-        self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
-    ) -> Projection:
+    def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
         """Take a result: subtract the gradient, mark valid faces, find the released cells.
 
         Args:
@@ -276,7 +287,6 @@ class PressureProjection:
             window: cells that hold all FLUID cells, with one to spare on each side.
             result: of `solve`.
             criteria: of `solve`.
-            unknowns: of `prepare`.
         """
         self._accept(result.x)
         for axis, field in enumerate(velocity):
@@ -284,18 +294,17 @@ class PressureProjection:
             faces = self._faces() | {"x": self.pressure, "field": field, "known": self.known[axis]}
             window.run(self._passes.subtract_gradient, axis=axis, **faces)
         self._support(velocity, window)
+        unknowns = self.counted()
         reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
         # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
         threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
-        found = {"contact": self.contact, "sums": self._sums}
-        self._solved.run(self._passes.contact, whole=True, **self._liquid(velocity), x=self.pressure, threshold=threshold, **found)
-        released, worst = self._found()
-        return Projection(result, unknowns, int(released), worst)
+        given = {"x": self.pressure, "contact": self.contact, "threshold": threshold}
+        self._contacts.take(self._solved, **self._liquid(velocity), **given)
+        return Projection(result, unknowns, self._found)
 
-    def unknowns(self) -> int:
-        """Return the number of unknowns."""
-        self._solved.run(COUNT, whole=True, kind=self._unknown, sums=self._sums)
-        return int(self._found()[0])
+    def counted(self) -> int:
+        """Return the number of unknowns of the prepared problem."""
+        return int(self._count.read()[0])
 
     def not_finite(self) -> np.ndarray:
         """Return the cells (x, y, z), counted from 0, whose right-hand side is not finite, shape (n, 3)."""
@@ -348,9 +357,9 @@ class PressureProjection:
         convert(x.flatten(), self.pressure.flatten())
 
     def _found(self) -> tuple[float, float]:
-        """Return the sum of what kernels have found in rows, and the largest of what else they have."""
-        rows = self._solved.rows_of(self._sums)
-        return float(rows[..., 0].sum()), float(rows[..., 1].max())
+        """Return how many cells the last projection released, and the largest outflow of the others."""
+        released, worst = self._contacts.read()
+        return released, worst
 
 
 def three(fields: Sequence[wp.array]) -> list[wp.array | None]:

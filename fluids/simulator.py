@@ -152,25 +152,21 @@ class LiquidSimulation(ParticleSimulation):
         window = self.window(before)
         self.bring_to_faces(window)
         projected = self._project(window, dt, self.top_speed(before))
-        measured = self._measured(projected)  # before solids move
+        if self.scene.output.diagnostics:
+            with self.watch.stage("diagnostics", self.projection.kind):
+                self.surface.measure()  # before solids move
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
         row = self.move(dt, window) | self.solve_row(projected.result)
+        if self.scene.output.diagnostics:
+            row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
         automatic = self.projection.automatic
         if automatic is not None and projected.result is not None:
             row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
-        return self.logged(row | {"active": projected.released} | measured)
-
-    def _measured(self, projected: Projection) -> Row:
-        """Return what the log alone wants to know of the liquid at the start of the step."""
-        if not self.scene.output.diagnostics:
-            return {}
-        with self.watch.stage("diagnostics", self.projection.kind):
-            volume = self.surface.volume(projected.unknowns)
-        return {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": volume}
+        return self.logged(row | {"active": projected.released})
 
     def known_density(self) -> wp.array | None:
         """Return the density that the surface lies in, if it is made of one."""
@@ -241,15 +237,20 @@ class LiquidSimulation(ParticleSimulation):
             self.boundary.begin_step(self.time, dt)
             if self.sources is not None:
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, projection.kind)
-            unknowns = projection.prepare(self.velocity, dt, self.kick_dt, window)
-        if unknowns == 0:
+            there = projection.prepare(self.velocity, dt, self.kick_dt, window)
+        if not there or (self.grid.device.is_cpu and projection.counted() == 0):
             return self._held(projection.leave())
+        if self.grid.device.is_cuda and self.flights is not None:
+            with watch.stage("bodies in flight", projection.kind):
+                self.flights.find(window, self.weights, projection.kind)
         if self.record is not None:
             with watch.stage("recording", *projection.fields()):
                 clock = {"step": np.array(self.step_count), "time": np.array(self.time), "dt": np.array(float(dt))}
-                self.record(projection.recorded(speed, unknowns) | clock)
+                self.record(projection.recorded(speed) | clock)
         with watch.stage("pressure solve", *projection.fields()):
-            result, criteria = projection.solve(speed, unknowns)
+            result, criteria = projection.solve(speed)
+        if projection.counted() == 0:  # which a GPU has not waited for
+            return self._held(projection.leave())
         if not result:
             self.restore_bodies()
             self._explain(result)
@@ -258,7 +259,7 @@ class LiquidSimulation(ParticleSimulation):
                 projection.push_bodies(result)
                 self.boundary.begin_step(self.time, dt)  # their velocities are others now
         with watch.stage("projection", *self.velocity, *projection.known, projection.pressure, projection.kind, projection.contact):
-            return self._held(projection.project(self.velocity, window, result, criteria, unknowns))
+            return self._held(projection.project(self.velocity, window, result, criteria))
 
     def _held(self, projected: Projection) -> Projection:
         """Give the sources' faces their velocity back, and show their cells as liquid."""

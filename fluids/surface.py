@@ -69,8 +69,11 @@ class FreeSurface(Protocol):
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Give u* to faces of FLUID cells that no particle gave weight; `known` is scratch memory."""
 
+    def measure(self) -> None:
+        """Find the liquid's volume, for `volume` to tell."""
+
     def volume(self, cells: int) -> float:
-        """Return the liquid's volume [m^3; m^2 in 2-D] when it was last marked, given the number of FLUID cells."""
+        """Return the liquid's volume [m^3; m^2 in 2-D] when it was last marked or measured, given the number of FLUID cells."""
 
 
 class WholeCellSurface:
@@ -100,6 +103,9 @@ class WholeCellSurface:
         if self._level_set is not None:
             complete(window, velocity, weights, known)
 
+    def measure(self) -> None:
+        """Do nothing: cells are counted."""
+
     def volume(self, cells: int) -> float:
         """Return the volume of the FLUID cells."""
         return cells * self.grid.cell_volume
@@ -128,6 +134,9 @@ class NoSurface:
         """Give u* to faces between particles."""
         complete(window, velocity, weights, known)
 
+    def measure(self) -> None:
+        """Do nothing: it stays."""
+
     def volume(self, cells: int) -> float:
         """Return the volume that solids leave."""
         return self._volume
@@ -153,11 +162,11 @@ class GhostFluidSurface:
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi
         self.density: wp.array | None = self.level_set.density
-        self._window, self._counted = grid.everywhere, counted or grid.domain
+        self._window, self._counted, self._measured = grid.everywhere, counted or grid.domain, False
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds: FLUID below the surface."""
-        self._window = window
+        self._window, self._measured = window, False
         self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
         wp.copy(kind, self.boundary.base)
         window.launch(mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
@@ -166,10 +175,16 @@ class GhostFluidSurface:
         """Give u* to FLUID faces between particles."""
         complete(window, velocity, weights, known)
 
+    def measure(self) -> None:
+        """Find the volume inside the surface."""
+        self.level_set.measure(self.boundary.distance, self._window.common(self._counted))
+        self._measured = True
+
     def volume(self, cells: int) -> float:
         """Return the volume inside the surface."""
-        window = self._window.common(self._counted)
-        return 0.0 if window is None else self.level_set.volume(self.boundary.distance, window)
+        if not self._measured:
+            self.measure()
+        return self.level_set.measured
 
 
 def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:

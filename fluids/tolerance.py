@@ -10,6 +10,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Across, Reduction, convert, rows_of
 
 f64 = wp.float64
@@ -44,32 +45,30 @@ class TimeErrorTolerance:
 
     Attributes:
         used: relative residual that the last solve was held to.
-        time_error: of the last step, root mean square over the cells [m/s]; None: no step came before it.
     """
 
     def __init__(self, size: int, device: wp.Device, across: Across | None = None) -> None:
         self.used = FIRST
-        self.time_error: float | None = None
-        self._warm = False
+        self._error: float | None = None
+        self._warm = self._change = False  # whether a step came before; whether `_sum` has an error that has not been asked for
+        self._unknowns = 1
         self._reference = 0.0  # residual of the last step at x = 0, root mean square [m/s]
-        self._sum = wp.zeros(1, dtype=wp.float64, device=device)
-        self._reduction = Reduction(size, device, self._sum, across=across)
+        self._sum = Reading(device)
+        self._reduction = Reduction(size, device, self._sum.array, across=across)
 
-    def criteria(self, ratio: float, unknowns: int, *, atol: float, max_iterations: int) -> wl.StoppingCriteria:
-        """Return when a solve is done.
+    def criteria(self, ratio: float, atol: float) -> dict[str, float]:
+        """Return when a solve is done: `rtol`, and `atol` of the root mean square over the unknowns [m/s].
 
         Args:
             ratio: kick_dt / kick_dt_last; 0 without a last step.
-            unknowns: of the problem.
-            atol: absolute tolerance for rounding [m/s].
-            max_iterations: of the method.
+            atol: for rounding, root mean square [m/s].
         """
         self._warm = ratio > 0.0
         if not self._warm or self.time_error is None:
-            return wl.StoppingCriteria(rtol=FIRST, atol=atol, max_iterations=max_iterations)
+            return {"rtol": FIRST, "atol": atol}
         shorter = min(ratio, 1.0)
         allowed = min(FRACTION * self.time_error * shorter**2, MOST * self._reference * shorter)
-        return wl.StoppingCriteria(rtol=LEAST, atol=max(atol, allowed * unknowns**0.5), max_iterations=max_iterations)
+        return {"rtol": LEAST, "atol": max(atol, allowed)}
 
     def measure(self, A: Any, result: wl.SolveResult, criteria: wl.StoppingCriteria, fields: list[wp.array], unknowns: int) -> None:
         """Find the step's error in time from a result.
@@ -84,8 +83,9 @@ class TimeErrorTolerance:
         reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
         self.used = criteria.tolerance(reference) / reference if reference > 0.0 else 0.0
         self._reference = reference / max(unknowns, 1) ** 0.5
+        self._unknowns, self._change = max(unknowns, 1), self._warm
         if not self._warm:  # from rest to motion is no change of an acceleration
-            self.time_error = None
+            self._error = None
             return
         change, product = (field.flatten() for field in fields)
         x = result.x.flatten()
@@ -95,7 +95,14 @@ class TimeErrorTolerance:
         CHANGE.bind(rows_of(x), x=x, guess=change).launch()
         A.apply(change, product)
         self._reduction.dot(change, product, 0)
-        self.time_error = 0.5 * float(np.sqrt(max(float(self._sum.numpy()[0]), 0.0) / max(unknowns, 1)))
+        self._sum.changed()
+
+    @property
+    def time_error(self) -> float | None:
+        """Of the last step, root mean square over the cells [m/s]; None: no step came before it."""
+        if self._change:
+            self._change, self._error = False, 0.5 * float(np.sqrt(max(float(self._sum.numpy()[0]), 0.0) / self._unknowns))
+        return self._error
 
     def state(self) -> np.ndarray:
         """Return what the next tolerance is made from, shape (2,); -1: there is no error yet."""
@@ -103,4 +110,4 @@ class TimeErrorTolerance:
 
     def restore(self, state: np.ndarray) -> None:
         """Continue from what `state` returned."""
-        self.time_error, self._reference = float(state[0]) if state[0] >= 0.0 else None, float(state[1])
+        self._error, self._reference, self._change = float(state[0]) if state[0] >= 0.0 else None, float(state[1]), False

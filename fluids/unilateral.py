@@ -69,6 +69,7 @@ class UnilateralPressure(PressureProjection):
     ) -> None:
         super().__init__(grid, boundary, solver, **settings)
         self._weights = list(weights)
+        self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         self._unknown, self._least = grid.field(wp.int8), 0.0
         wp.copy(self._unknown, boundary.base)  # the ring stays as it is
         if boundary.open and self._shift is None:  # pockets between solids that are too full
@@ -79,24 +80,24 @@ class UnilateralPressure(PressureProjection):
         setting.cells, setting.base = self._unknown, boundary.base
         self._setting = setting
 
-    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> int:
-        """Set up the problem of all cells that are not SOLID and return their number; arguments as of the base class."""
+    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> bool:
+        """Set up the problem of all cells that are not SOLID; return whether there are any; arguments as of the base class."""
         self._begin(kick_dt)
         self._setting.rate = wp.float64(self.grid.spacing / dt)
         self._setting.settling = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
         least = SHIFT if self.boundary.open else 0.0
         fields = [self.pressure, self._ratio, least, self._b, self._start, self._shift]
         self.grid.domain.launch(kernels.prepare_kernel, [self._at(velocity), self.kind, *fields])
-        unknowns = self.unknowns()
+        self._solved = self.grid.domain
+        self._count.take(self._solved, kind=self._unknown)
+        unknowns = self.counted()
         if unknowns and self._problem is None:
             self._make_problem()
         if unknowns:
             self._update()
-        return unknowns
+        return unknowns > 0
 
-    def project(
-        self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
-    ) -> Projection:
+    def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
         """Take a result: let the pressure act, mark valid faces, find the walls that liquid presses on; arguments as of the base class."""
         self._accept(result.x)
         for axis, field in enumerate(velocity):
@@ -106,8 +107,11 @@ class UnilateralPressure(PressureProjection):
             window.launch(kernels.push_kernel, inputs)
         inputs = [self._at(velocity), self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
         self.grid.domain.launch_rows(kernels.contact_kernel, inputs)
-        released, worst = self._found()
-        return Projection(result, unknowns, int(released), worst)
+        return Projection(result, self.counted(), self._found)
+
+    def _found(self) -> tuple[float, float]:
+        rows = self.grid.domain.rows_of(self._sums)
+        return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
     def fluid_cells(self) -> np.ndarray:
         """Return where there was liquid or pressure in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""

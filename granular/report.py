@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import warp as wp
 
-from warp_lcp.granular.report_kernels import REPORT_COLUMNS, contact_kernel, report_pass, take_kernel
+from warp_lcp.granular.report_kernels import contact_kernel, report_pass, take_kernel
 from warp_lcp.granular.stress import Stress
+from warp_lcp.grid.staggered import Window
+from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.particle_log import Row
 
@@ -28,11 +29,9 @@ class SandReport:
     def __init__(self, stress: Stress) -> None:
         grid, self.stress = stress.packing.grid, stress
         self.ratio, self.contact, self.known = grid.field(), grid.field(wp.uint8), grid.faces(wp.int8)
-        self._rows = int(np.prod(grid.shape[:2]))
-        self._sums = wp.zeros(REPORT_COLUMNS * self._rows, dtype=wp.float64, device=grid.device)
         cut = stress.packing.cut
         self._openings = None if cut is None else cut.openings
-        self._report = report_pass(grid.dimension, stress.rate, cut is not None)
+        self._report = WindowTally(report_pass(grid.dimension, stress.rate, cut is not None), grid)
         self._base = stress.packing.base if cut is None else grid.field(wp.int8)  # no face inside a solid that cuts cells is left unknown
 
     def take(self, velocity: Sequence[wp.array]) -> None:
@@ -55,7 +54,6 @@ class SandReport:
         """
         stress, p = self.stress, self.stress.packing
         fields = p.cells | stress.checked.fields | {"now": stress.now, "openings": self._openings, "ratio": self.ratio}
-        p.grid.domain.run(self._report, whole=True, numbers=stress.numbers, sums=self._sums, **fields)
-        cells, yielded, taken, most = self._sums.numpy().reshape(REPORT_COLUMNS, self._rows)
-        share = float(yielded.sum() / max(cells.sum(), 1.0))
-        return {"yielded": share, "dissipation": float(taken.sum()) * mass, "predicted_excess": float(most.max())}
+        self._report.take(p.grid.domain, numbers=stress.numbers, **fields)
+        cells, yielded, taken, most = self._report.read(Window((0, 0, 0), p.grid.shape, p.grid.device))
+        return {"yielded": yielded / max(cells, 1.0), "dissipation": taken * mass, "predicted_excess": most}

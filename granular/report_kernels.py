@@ -12,9 +12,6 @@ from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import RowPass
 
 RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
-REPORT_COLUMNS = (
-    4  # of a row's sums: cells that carry shear, yielded ones, dissipation, largest fraction that the pressure's solution predicts
-)
 
 
 @functools.cache
@@ -22,9 +19,10 @@ def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> RowPas
     """Return the pass for 2 or 3 dimensions; friction grows with the rate of shear; solids cut cells."""
     vectors = xyz("share", "mass", "inverse", edge=[wp.float64] * 3, u=[wp.float64] * 3)
     fields = {"flags": wp.uint8, **dict.fromkeys(("now", "drive", "stiff", "ratio", "openings"), wp.float32), **vectors}
-    whole, words = {"numbers": wp.float32, "sums": wp.float64}, {"REPORT_COLUMNS": REPORT_COLUMNS, "RATIO_YIELDS": RATIO_YIELDS}
+    found = {"sums": ("cells", "yielded", "taken"), "largest": ("most",)}
     module = f"report_{dimension}d{'_rate' * rate}{'_cut' * cut}"
-    return sand_pass(module, "report", dimension, wp.float64, fields, whole=whole, RATE=rate, CUT=cut, **words)
+    whole, words = {"numbers": wp.float32}, {"RATE": rate, "CUT": cut, "RATIO_YIELDS": RATIO_YIELDS}
+    return sand_pass(module, "report", dimension, wp.float64, fields, whole=whole, **found, **words)
 
 
 @cell_kernel("granular.report")

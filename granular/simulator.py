@@ -117,12 +117,11 @@ class SandSimulation(ParticleSimulation):
             self.sides.average(self.velocity, self.weights, self._saved or ())
         complete(window, self.velocity, self.weights, self.outcome.known, self._join)  # faces have mass farther out than weight
 
-    def carry(self, dt: float) -> tuple[int, int, int]:
-        """Move particles and solids by dt [s]. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
-        met = super().carry(dt)
+    def carry(self, dt: float) -> None:
+        """Move particles and solids by dt [s]."""
+        super().carry(dt)
         if self.sides is not None:
             self.sides.carry(self.particles.position)
-        return met
 
     def step(self, dt: float) -> Row:
         """Advance by dt [s].

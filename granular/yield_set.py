@@ -58,6 +58,8 @@ def sand_pass(
     *,
     numbers: Mapping[str, Any] | None = None,
     whole: Mapping[str, Any] | None = None,
+    sums: tuple[str, ...] = (),
+    largest: tuple[str, ...] = (),
     listed: str = "",
     **words: Any,
 ) -> RowPass:
@@ -71,11 +73,15 @@ def sand_pass(
         box: fields of cells.
         numbers: given by the host.
         whole: arrays.
-        listed: which of these has the cells.
+        sums: what it sums.
+        largest: what it takes the largest of.
+        listed: which of the arrays has the cells.
         words: constants: BOX, Narain's box instead of the cone; RATE, friction grows with the rate of shear; CUT, solids cut cells; others.
     """
     constants = CONSTANTS | {"DIM": dimension, "BOX": 0, "RATE": 0, "CUT": 0} | words
     fields: dict[str, Any] = {"box": box, "whole": whole or {}, "numbers": numbers or {}}
     absent = tuple(n for n in (*box, *fields["whole"]) if n[-2:] in ("_y", "_z") or n == "openings")
     path = Path(__file__).parent / "headers" / f"{name}.h"
-    return RowPass(f"granular.{module}.{name}", path, real, optional=absent, constants=constants, listed=listed, **fields)
+    return RowPass(
+        f"granular.{module}.{name}", path, real, optional=absent, constants=constants, listed=listed, sums=sums, largest=largest, **fields
+    )

@@ -66,13 +66,15 @@ def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
     """The host waits for the device at each readback, and graphs hold no allocations."""
     from benchmarks.emulated_cuda import meter
 
-    simulation = made("dam-break")
-    for _ in range(4):
+    simulation, counts = made("dam-break"), []
+    for _ in range(6):
         meter.clear()
         simulation.step(min(simulation.stable_dt(), DT))
-    assert meter["allocations"] == 0
-    assert meter["readbacks"] <= 19  # three iterations of the solve
-    assert meter["launches"] <= 145
+        counts.append([meter["readbacks"], meter["launches"], meter["allocations"]])
+    readbacks, launches, allocations = np.array(counts[2:]).max(axis=0)  # of steps after the kernels have been loaded
+    assert allocations == 0
+    assert readbacks <= 2  # what the solve has come to, and what the step has
+    assert launches <= 155
 
 
 @EMULATED

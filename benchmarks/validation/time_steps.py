@@ -90,12 +90,12 @@ def _push_liquid_apart(simulation: Any) -> None:
     projection = simulation.projection
     prepare = projection.prepare
 
-    def pushed(velocity: Any, dt: float, *given: Any) -> int:
-        unknowns: int = prepare(velocity, dt, *given)
+    def pushed(velocity: Any, dt: float, *given: Any) -> bool:
+        there: bool = prepare(velocity, dt, *given)
         excess = np.maximum(simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0)
         inside = projection._unknown.numpy() == FLUID
         projection._b.assign(projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt)
-        return unknowns
+        return there
 
     projection.prepare = pushed
 

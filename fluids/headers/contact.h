@@ -1,7 +1,7 @@
-// Find the released cells; a row's sums are [0] their number and [1] the largest |outflow| of the other FLUID cells [m/s].
+// Find the released cells, their number, and the largest |outflow| of the other FLUID cells [m/s], `worst`.
 #include "pressure_face.h"
 if (planes != 2) w = u;
-int released = 0; double worst = 0.0, rest[M]; unsigned char leaves[M];
+int found = 0; double rest[M]; unsigned char leaves[M];
 for (int from = first; from < last; from += M) {
     const int n = last - from < M ? last - from : M;
     SIMD8 for (int m = 0; m < n; ++m) {
@@ -12,7 +12,6 @@ for (int from = first; from < last; from += M) {
         leaves[m] = leaving;
         rest[m] = (fluid & !leaving) ? size : 0.0;
     }
-    for (int m = 0; m < n; ++m) { released += leaves[m]; worst = rest[m] > worst ? rest[m] : worst; }
+    for (int m = 0; m < n; ++m) { found += leaves[m]; worst = rest[m] > worst ? rest[m] : worst; }
 }
-double* out = sums + 2*((long long)k*given.kind.shape[1] + j);
-out[0] = released; out[1] = worst;
+released = found;

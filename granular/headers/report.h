@@ -1,10 +1,9 @@
-// How near each cell is to yielding; a row's sums: cells that carry shear, yielded ones, dissipation, the most of a fraction predicted.
+// How near each cell is to yielding; found: cells that carry shear, yielded ones, what friction takes, the most of a fraction predicted.
 #include "shape.h"
 #include "rate_bound.h"
 const float* share[3] = XYZ(share); const float* mass[3] = XYZ(mass); const double* rate[3] = XYZ(edge); const double* u[3] = XYZ(u);
 const float* inverse[3] = XYZ(inverse);
 #include "divergence.h"
-double cells = 0, yielded = 0, taken = 0, most = 0;
 for (int i = first; i < last; ++i) {
     if (!flags[i]) { ratio[i] = 0; continue; }  // no sand, no stress
     float size = 0; double e[3], mean = 0, fast2 = 0, diagonal = 0;
@@ -34,5 +33,3 @@ for (int i = first; i < last; ++i) {
     cells += carries; yielded += carries && ratio[i] > (float)RATIO_YIELDS;
     if (flags[i] & HOLDS) { const double over = -w*numbers[STEP_OF_CELL]; most = over > most ? over : most; }
 }
-const long long rows = given.sums.shape[0]/REPORT_COLUMNS, at = k*(long long)given.flags.shape[1] + j;
-sums[at] = cells; sums[rows + at] = yielded; sums[2*rows + at] = taken; sums[3*rows + at] = most;

@@ -9,6 +9,7 @@ import pytest
 from small_liquids import box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
+from warp_lcp.grid.tally import WindowTally
 
 TABLES: dict[str, dict[str, Any]] = {
     "apic": {},
@@ -45,13 +46,21 @@ def test_windows_leave_what_passes_over_all_do(tables, monkeypatch):
 def test_pressure_and_flight_cost_what_the_liquid_does(monkeypatch):
     """Cells that passes visit in a domain eight times as wide."""
     visited = [Counter[str]()]
-    run = Window.run
+    run, take = Window.run, WindowTally.take
+
+    def count(passed: Any, window: Window) -> None:
+        visited[-1][passed.name.rpartition(".")[2]] += int(np.prod(np.subtract(window.high, window.low)))
 
     def counted(window: Window, passed: Any, **given: Any) -> None:
-        visited[-1][passed.name.rpartition(".")[2]] += int(np.prod(np.subtract(window.high, window.low)))
+        count(passed, window)
         run(window, passed, **given)
 
+    def tallied(tally: WindowTally, window: Window, **given: Any) -> None:
+        count(tally, window)
+        take(tally, window, **given)
+
     monkeypatch.setattr(Window, "run", counted)
+    monkeypatch.setattr(WindowTally, "take", tallied)
     for width in (1.0, 8.0):
         simulation = thrown({}, round(64 * width), width)
         simulation.step(0.001)

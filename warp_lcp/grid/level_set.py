@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
 import warp as wp
 
 from warp_lcp.grid import level_set_kernels as kernels
@@ -13,6 +12,7 @@ from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.particle_loops import on_grid, scatter, touched_planes
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.tally import WindowTally
 
 REACH = 1.5  # half the width of a cell's kernel, in cells: beyond it a plane leaves no trace
 QUANTILE = 3.7191  # of the normal distribution at 1 - level_set_kernels.TAIL
@@ -58,7 +58,8 @@ class LevelSet:
         self.phi, self.density, self._known = grid.field(), grid.field(), grid.field(wp.int8)
         self.phi.fill_(self.limit)
         self._scratch = [grid.field() for _ in range(3)] if smoothing else []
-        self._sums = wp.zeros(grid.shape[:2], dtype=wp.float64, device=grid.device)
+        self._volume: WindowTally | None = None  # made when it is first asked for
+        self._measured = False
         self._filled: Window | None = None
 
     def update(self, particles: Particles, window: Window, capacity: wp.array | None, base: wp.array, *, fill: Fill | None = None) -> None:
@@ -105,13 +106,25 @@ class LevelSet:
                 cells that were SOLID in the last update.
             window: that of the last update.
         """
+        self.measure(distance, window)
+        return self.measured
+
+    def measure(self, distance: wp.array | None, window: Window | None) -> None:
+        """Find the volume that `volume` returns, without waiting for it; None: of no cells."""
         grid = self.grid
-        box = window.common(grid.domain)
+        box = window.common(grid.domain) if window is not None else None
+        self._measured = box is not None
         if box is None:
-            return 0.0
-        found = {"phi": self.phi, "known": self._known, "distance": distance, "sums": self._sums}
-        box.run(kernels.VOLUME, whole=True, **found, planes=grid.planes, parts=PARTS[grid.dimension])
-        return float(np.sum(box.rows_of(self._sums))) * grid.cell_volume
+            return
+        if self._volume is None:
+            self._volume = WindowTally(kernels.VOLUME, grid)
+        found = {"phi": self.phi, "known": self._known, "distance": distance}
+        self._volume.take(box, **found, planes=grid.planes, parts=PARTS[grid.dimension])
+
+    @property
+    def measured(self) -> float:
+        """The volume that was measured [m^3; m^2 in 2-D]."""
+        return self._volume.read()[0] * self.grid.cell_volume if self._volume is not None and self._measured else 0.0
 
     def _smoothed(self, window: Window, source: wp.array, first: wp.array, second: wp.array) -> wp.array:
         """Return the source after the binomial passes; in one of two scratch fields."""

@@ -26,8 +26,8 @@ DISTANCE = cell_pass(
     numbers={"spread": wp.float32, "limit": wp.float32}, optional=("capacity", "smooth"), constants=_CONSTANTS,
 )  # fmt: skip
 VOLUME = cell_pass(  # in a module of its own: few runs ask for it
-    "warp_lcp.grid.volume.volume", "phi distance", {"known": wp.int8}, whole={"sums": wp.float64},
-    numbers={"planes": int, "parts": int}, optional=("distance",),
+    "warp_lcp.grid.volume.volume", "phi distance", {"known": wp.int8}, numbers={"planes": int, "parts": int}, optional=("distance",),
+    sums=("volume",),
 )  # fmt: skip
 SCATTER = scatter_pass("grid.density.scatter_density", {"position": wp.vec3, "density": wp.float32}, numbers={"each": wp.float32})
 GATHER = particle_pass(

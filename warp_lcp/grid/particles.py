@@ -12,9 +12,11 @@ from warp_lcp.grid.particle_loops import MARGIN, launch, on_grid
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
+from warp_lcp.rows.vectors import Tally
 
 CHUNK = 256  # the fewest particles that one thread adds up
-THREADS = 1024  # the most threads of a sum, each a partial result that the host reads
+THREADS = 1024  # the most threads of a sum, each a partial result that the host adds up
+CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
 GROWTH = 1.5  # of the storage when it is full: n appended particles are copied 2 n times at most, a third of it lies idle at most
 SORT_EVERY = 8  # steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL 2, a sort costs 25 ns
 
@@ -117,7 +119,9 @@ class Particles:
         indexed = grid.device.is_cuda if indexed is None else indexed
         self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device) if indexed else None
         self._names = ["position", "velocity", *(f"affine_{c}" for c in range(grid.dimension if affine else 0))]
-        self._partials = wp.zeros((THREADS, kernels.COLUMNS), dtype=wp.float64, device=grid.device)
+        self._totals = Tally(kernels.TOTAL, grid.device, max(THREADS, CUDA_THREADS * grid.device.is_cuda))
+        self._last: ParticleTotals | None = None
+        self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
         self._grow(0)
         self.append(position, velocity)
@@ -214,7 +218,7 @@ class Particles:
 
     def _resize(self, count: int) -> None:
         """Use `count` places; those beyond the particles there were hold anything."""
-        before, self.count = self.count, count
+        before, self.count, self._known = self.count, count, None
         if count > self._capacity:
             self._grow(before)
         for column in (*self._columns.values(), self._spare):
@@ -270,26 +274,35 @@ class Particles:
 
     def totals(self) -> ParticleTotals:
         """Return sums over the particles as they are now; the same bits on every run. Without particles all are 0."""
+        if self._known is not None:
+            return self._known
         if self.count == 0:
             return ParticleTotals()
-        chunk = max(CHUNK, -(-self.count // THREADS))
-        rows = Rows.entries(self.count, self.grid.device, chunk)
-        given = {"position": self.position, "velocity": self.velocity, "sums": self._partials}
-        kernels.TOTAL.bind(rows, **given, **on_grid(self.grid)).launch()
-        part = self._partials.numpy()[: rows.places]
-        with np.errstate(invalid="ignore"):  # sums of values that are not finite: counted in the last two columns
-            total = part.sum(axis=0)
-        return ParticleTotals(
+        device = self.grid.device
+        chunk = max(CUDA_CHUNK if device.is_cuda else CHUNK, -(-self.count // (CUDA_THREADS if device.is_cuda else THREADS)))
+        rows = Rows.entries(self.count, device, chunk)
+        self._totals.take(rows, position=self.position, velocity=self.velocity, **on_grid(self.grid))
+        with np.errstate(invalid="ignore"):  # sums of values that are not finite, which are counted
+            total = self._totals.read(in_order)
+        self._last = found = ParticleTotals(
             count=self.count,
             mean_square_speed=float(total[0]) / self.count,
-            velocity=total[13:16] / self.count,
             center=total[1:4] / self.count,
-            low=part[:, 4:7].min(axis=0),
-            high=part[:, 7:10].max(axis=0),
-            max_speed=float(np.sqrt(part[:, 10].max())),
-            bad_positions=int(total[11]),
-            bad_velocities=int(total[12]),
+            velocity=total[4:7] / self.count,
+            bad_positions=int(total[7]),
+            bad_velocities=int(total[8]),
+            max_speed=float(np.sqrt(total[9])),
+            high=total[10:13],
+            low=-total[13:16],
         )
+        return found
+
+    def totals_stay(self, stay: bool) -> None:
+        """Say whether positions and velocities stay as they were when `totals` last found them: a GPU then is not waited for again.
+
+        On a GPU those who write to them between steps say that they do not stay.
+        """
+        self._known = self._last if stay and self.count and self.grid.device.is_cuda else None
 
     def cells_of(self, positions: np.ndarray) -> np.ndarray:
         """Return the interior cell (x, y, z), counted from 0, of positions [m], shape (n, 3); in a part of a grid it may lie outside."""
@@ -300,6 +313,12 @@ class Particles:
     def arrays(self) -> dict[str, wp.array]:
         """Return the particles' arrays by name."""
         return {name: column.view for name, column in self._columns.items()}
+
+
+def in_order(parts: np.ndarray) -> np.ndarray:
+    """Return what threads have found of particles, shape (columns, threads), added up one after another, shape (columns, 1)."""
+    sums = len(kernels.TOTAL.sums)
+    return np.append(np.ascontiguousarray(parts[:sums].T).sum(axis=0), parts[sums:].max(axis=1))[:, None]
 
 
 def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:

@@ -6,11 +6,12 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import list_kernel
 from warp_lcp.grid.particle_loops import particle_pass
 
-COLUMNS = 16  # of a partial result, see `total.h`
-
 _PARTICLES, _COUNTS = "warp_lcp.grid.particles", {"nx": int, "ny": int, "nz": int}
 NUMBER = particle_pass(f"{_PARTICLES}.number", {"position": wp.vec3}, whole={"key": wp.int32}, numbers=_COUNTS)
-TOTAL = particle_pass(f"{_PARTICLES}.total", {"position": wp.vec3, "velocity": wp.vec3}, whole={"sums": wp.float64})
+TOTAL = particle_pass(
+    f"{_PARTICLES}.total", {"position": wp.vec3, "velocity": wp.vec3}, sums=("energy", "x", "y", "z", "u", "v", "w", "lost", "wild"),
+    largest=("top", "high_x", "high_y", "high_z", "low_x", "low_y", "low_z"),
+)  # fmt: skip
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")

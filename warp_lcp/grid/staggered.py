@@ -139,11 +139,22 @@ class Window:
 
         Args:
             passed: with fields of a `box`.
-            whole: a thread takes a whole row, for sums that are the same on every run.
+            whole: a thread takes a whole row, for counts of a row.
             launch: of a program.
             given: fields and numbers by name.
         """
         passed.bind(self._whole if whole else self._shared, **given).launch(launch)
+
+    def rows_of_sums(self, planes: int) -> Rows:
+        """Return the rows for a pass that sums, of which a GPU's thread takes a column of so many `planes`, and a CPU's whole ones."""
+        if self.near is None and self.device.is_cuda:
+            return Rows.box(self.low, self.high, self.device, slab=planes)
+        return self._whole
+
+    @property
+    def rows_visited(self) -> np.ndarray:
+        """(k, j) of the rows that are visited, where only a part of the box is, shape (n, 2)."""
+        return self._hulls.numpy()[:, 0]
 
     @cached_property
     def _shared(self) -> Rows:

@@ -20,6 +20,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.wall import Join, extend_velocity, extend_velocity_cut
+from warp_lcp.rows.readings import Reading
 
 Faces = list[wp.array]  # one field a component
 
@@ -65,8 +66,11 @@ class Boundary(Protocol):
     def placed(self) -> list[wp.array]:
         """Return the fields of solids that stand still: beyond its cuts a part of a grid takes them from the other parts."""
 
-    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
-        """Move particles, then the solids to `time`. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
+        """Move particles, then the solids to `time`."""
+
+    def met(self) -> tuple[int, int, int]:
+        """Return how many met a wall, were pushed by a solid, and are stuck inside one when they were last moved."""
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by the displacement [m] on the faces of each axis; walls stop them, solids stay where they are."""
@@ -124,7 +128,7 @@ class WholeCells:
             for axis, field in enumerate(self.velocity):
                 grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, *walls, field])
         self._room = clearance(grid, self.base)
-        self._stopped = wp.zeros(1, dtype=wp.int32, device=grid.device)
+        self._stopped = Reading(grid.device, dtype=wp.int32)
 
     def top_speed(self, time: float, span: float) -> float:
         """Return 0: cells stay where they are."""
@@ -145,15 +149,19 @@ class WholeCells:
         """Return the fields of solids that stand still."""
         return [self.base, self.touch, self.capacity, self._room]
 
-    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Move particles, never into a SOLID cell."""
-        self._stopped.zero_()
-        advect(self.grid, fields, self._room, dt, position, self._stopped, self._endless)
+        self._stopped.array.zero_()
+        advect(self.grid, fields, self._room, dt, position, self._stopped.array, self._endless)
+        self._stopped.changed()
+
+    def met(self) -> tuple[int, int, int]:
+        """Return how many met a wall."""
         return int(self._stopped.numpy()[0]), 0, 0
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m], never into a SOLID cell."""
-        advect(self.grid, fields, self._room, 1.0, position, self._stopped, self._endless)
+        advect(self.grid, fields, self._room, 1.0, position, self._stopped.array, self._endless)
 
     def place(self, time: float) -> None:
         """Do nothing: the cells stay."""
@@ -191,7 +199,7 @@ class CutBoundary:
         self.touch = grid.field(wp.uint8)
         self._scratch = grid.faces()
         self._reachable = grid.field() if cut.moves else cut.distance  # distance where particles may go within a step
-        self._counts = wp.zeros(3, dtype=wp.int32, device=grid.device)
+        self._counts = Reading(grid.device, 3, wp.int32)
         self._moving = [(solid.motion, solid.geometry.bounds()) for solid in cut.solids if solid.motion is not None]
         self.kinks = tuple(time for motion, _ in self._moving for time in kinks(motion))
         self._find_walls()
@@ -219,9 +227,10 @@ class CutBoundary:
         """Return the fields of solids that stand still."""
         return [self.base, self.touch, self.cut.distance, *self.open, *self.cut.wall, *([] if self.capacity is None else [self.capacity])]
 
-    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
-        """Move particles, then the solids to `time`. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
-        self._counts.zero_()
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
+        """Move particles, then the solids to `time`."""
+        counts = self._counts.array
+        counts.zero_()
         if self.moves:
             wp.copy(self._reachable, self.cut.distance)
             self.place(time)
@@ -229,16 +238,20 @@ class CutBoundary:
                 kernels.larger_kernel, self.grid.size, [self.cut.distance.flatten(), self._reachable.flatten()], device=self.grid.device
             )
         sides, ways = self.open_sides, {"open_sides": self.open_sides, "endless": self._endless}
-        advect_with_distance(self.grid, fields, self._reachable, dt, position, self._counts[0:1], **ways)
+        advect_with_distance(self.grid, fields, self._reachable, dt, position, counts[0:1], **ways)
         if self.moves:
-            push_out(self.grid, self.cut.distance, position, self._counts[1:2], self._counts[2:3], open_sides=sides)
+            push_out(self.grid, self.cut.distance, position, counts[1:2], counts[2:3], open_sides=sides)
+        self._counts.changed()
+
+    def met(self) -> tuple[int, int, int]:
+        """Return how many met a wall, were pushed by a solid, and are stuck inside one."""
         met, pushed, stuck = (int(n) for n in self._counts.numpy())
         return met, pushed, stuck
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m] among the solids where they are now."""
         ways = {"open_sides": self.open_sides, "endless": self._endless}
-        advect_with_distance(self.grid, fields, self.cut.distance, 1.0, position, self._counts[0:1], **ways)
+        advect_with_distance(self.grid, fields, self.cut.distance, 1.0, position, self._counts.array[0:1], **ways)
 
     def place(self, time: float) -> None:
         """Put the solids where they are at `time` [s]."""

@@ -14,6 +14,7 @@ import warp_lcp as wl
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
+from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
@@ -22,8 +23,7 @@ from warp_lcp.rows.vectors import convert
 
 HEADERS = Path(__file__).parent / "headers"
 F32, F64, U8 = wp.float32, wp.float64, wp.uint8
-COLUMNS = 3  # of a row's sums, see `prepare` and `crowd`
-CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "COLUMNS": COLUMNS, "RELEASED": RELEASED} | {
+CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
     "LEAST_DENSITY": 0.5,  # that displacements are divided by: thin spray need not carry off what a full cell has too much
     "LEAST_CAPACITY": 0.1,  # that densities are divided by there
     "HALF": 0.5,  # of what a cell holds: with less it is at the surface
@@ -31,17 +31,19 @@ CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "COLUMNS": COLUMNS, "RE
 FILLED, PROBLEM = {"density": F32, "capacity": F32}, {"kind": wp.int8, "b": F64, "x": F64}
 
 
-def _made(name: str, box: dict[str, Any], numbers: dict[str, Any], module: str = "density_correction", cut: bool = False) -> RowPass:
-    sums = {} if name == "displace" else {"sums": F64}
+def _made(
+    name: str, box: dict[str, Any], numbers: dict[str, Any], module: str = "density_correction", cut: bool = False, **found: Any
+) -> RowPass:
     path, constants, absent = HEADERS / f"{name}.h", CONSTANTS | {"CUT": cut}, ("contact", "inside", "open")
-    return RowPass(
-        f"warp_lcp.material.{module}.{name}", path, F64, box=box, whole=sums, numbers=numbers, optional=absent, constants=constants
-    )
+    return RowPass(f"warp_lcp.material.{module}.{name}", path, F64, box=box, numbers=numbers, optional=absent, constants=constants, **found)
 
 
-PREPARE = _made("prepare_correction", PROBLEM | FILLED | {"base": wp.int8, "contact": U8, "inside": U8}, {"most": F32, "gain": F32})
-EVEN = _made("even", PROBLEM | FILLED | {"inside": U8, "lower": F64}, {"least": F32, "planes": int})
-CROWD = _made("crowd", FILLED | {"base": wp.int8}, {"most": F32}, "crowding")
+PREPARE = _made(
+    "prepare_correction", PROBLEM | FILLED | {"base": wp.int8, "contact": U8, "inside": U8}, {"most": F32, "gain": F32},
+    sums=("full",), largest=("densest",),
+)  # fmt: skip
+EVEN = _made("even", PROBLEM | FILLED | {"inside": U8, "lower": F64}, {"least": F32, "planes": int}, sums=("lacks",))
+CROWD = _made("crowd", FILLED | {"base": wp.int8}, {"most": F32}, "crowding", sums=("above", "all"), largest=("densest",))
 
 
 @functools.cache
@@ -68,12 +70,12 @@ class Crowding:
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, max_density: float) -> None:
         self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
-        self._sums = wp.zeros((*grid.shape[:2], COLUMNS), dtype=wp.float64, device=grid.device)
+        self._crowd = WindowTally(CROWD, grid)
         self._density: wp.array | None = None
         self._trail = Trail(grid.domain)
 
-    def measure(self, density: wp.array | None, particles: Particles, window: Window) -> tuple[float, float]:
-        """Return which share of the material is beyond what cells may hold, and the largest density, that at rest being 1.
+    def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:
+        """Look at the material as it is; `found` then tells.
 
         Args:
             density: of the particles, in units of that at rest, float32; None: it is found here.
@@ -85,10 +87,12 @@ class Crowding:
             particle_density(self.grid, particles, window, self.particles_a_cell, density)
         b = self.boundary
         filled = {"base": b.base, "density": density, "capacity": b.capacity}
-        self._trail.through(window).run(CROWD, whole=True, **filled, most=self.max_density, sums=self._sums)
-        sums = self.grid.domain.rows_of(self._sums)
-        held = float(sums[..., 2].sum())
-        return (float(sums[..., 0].sum()) / held if held > 0.0 else 0.0), float(sums[..., 1].max())
+        self._crowd.take(self._trail.through(window), **filled, most=self.max_density)
+
+    def found(self) -> tuple[float, float]:
+        """Return which share of the material is beyond what cells may hold, and the largest density, that at rest being 1."""
+        above, held, densest = self._crowd.read(self.grid.domain)
+        return above / held if held > 0.0 else 0.0, densest
 
 
 @dataclass(frozen=True)
@@ -160,7 +164,7 @@ class DensityCorrection:
         self.density, self.displacement, self._kind = grid.field(), grid.faces(), grid.field(wp.int8)
         wp.copy(self._kind, boundary.base)
         self._displace = displacement_pass(bool(boundary.open))
-        self._sums = wp.zeros((*grid.shape[:2], COLUMNS), dtype=wp.float64, device=grid.device)
+        self._over, self._lacking = WindowTally(PREPARE, grid), WindowTally(EVEN, grid)
         self._inside = self._lower = None
         if even:  # the ring stays as it is
             self._inside = wp.array(boundary.base.numpy() == SOLID, dtype=wp.uint8, device=grid.device)
@@ -213,13 +217,14 @@ class DensityCorrection:
             "capacity": b.capacity,
             "inside": self._inside,
         }
-        fields["sums"], run = self._sums, self.grid.domain.run
-        run(PREPARE, whole=True, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
+        domain, lacking = self.grid.domain, 0.0
+        self._over.take(domain, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
         if self._inside is not None:
             numbers: dict[str, Any] = {"least": min(most, 2.0 - most), "planes": self.grid.planes - 1}
-            run(EVEN, whole=True, **fields, **numbers, lower=self._lower)
-        sums = self.grid.domain.rows_of(self._sums)
-        return int(sums[..., [0, 2]].sum()), float(sums[..., 1].max())
+            self._lacking.take(domain, **fields, **numbers, lower=self._lower)
+            (lacking,) = self._lacking.read()
+        full, densest = self._over.read()
+        return int(full + lacking), densest
 
     def _solve(self, over_full: int) -> wl.SolveResult:
         if self._problem is None:

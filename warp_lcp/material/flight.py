@@ -14,6 +14,7 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import flight_kernels as kernels
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.rows.readings import Reading
 
 NARROW = 1.0  # [cells^2] the least second moment about an axis, a particle, of a body whose turning the grid resolves
 Sums = np.ndarray  # of `kernels.add_up`, float64, shape (bodies, COLUMNS)
@@ -47,12 +48,23 @@ class Flights:
         self.grid, self.boundary, self._settles = grid, boundary, settles
         self._parent, self._number = (wp.zeros(grid.size, dtype=wp.int32, device=grid.device) for _ in range(2))
         self._held, self._several = (wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2))
-        self._count = wp.zeros(2, dtype=wp.int32, device=grid.device)
+        self._count, self._found = Reading(grid.device, 2, wp.int32), False
         self._flight = kernels.Flight()
         self._flight.straight = not coheres
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
         self._flight.origin = wp.vec3i(*grid.origin)
         self._before: Sums = np.zeros((0, kernels.COLUMNS))
+
+    def find(self, window: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
+        """Look for bodies, without waiting for their number; arguments as of `begin`, which does it where nobody has."""
+        named = {"parent": self._parent, "held": self._held, "several": self._several}
+        window.run(kernels.ALONE, kind=kind, **named)
+        window.run(kernels.UNITE, **dict(zip("uvw", [*weights, None], strict=False)), parent=self._parent)
+        window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, **named)
+        self._count.array.zero_()
+        window.run(kernels.NUMBER, kind=kind, **named, number=self._number, count=self._count.array)
+        self._count.changed()
+        self._found = True
 
     def begin(
         self, particles: Particles, window: Window, weights: Sequence[wp.array], kind: wp.array, dt: float, change: np.ndarray
@@ -67,19 +79,17 @@ class Flights:
             dt: time step [s].
             change: of the velocity by gravity in this step [m/s], shape (3,).
         """
-        named, device = {"parent": self._parent, "held": self._held, "several": self._several}, self.grid.device
-        window.run(kernels.ALONE, kind=kind, **named)
-        window.run(kernels.UNITE, **dict(zip("uvw", [*weights, None], strict=False)), parent=self._parent)
-        window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, **named)
-        self._count.zero_()
-        window.run(kernels.NUMBER, kind=kind, **named, number=self._number, count=self._count)
+        if not self._found:
+            self.find(window, weights, kind)
+        self._found, device = False, self.grid.device
         bodies = int(self._count.numpy()[0])
         self._before = np.zeros((bodies, kernels.COLUMNS))
         if bodies == 0:
             return 0
         who, body = (wp.empty(particles.count, dtype=wp.int32, device=device) for _ in range(2))
-        listed = [particles.key, self._parent, self._number, who, body, self._count]
+        listed = [particles.key, self._parent, self._number, who, body, self._count.array]
         wp.launch(kernels.board_kernel, particles.count, listed, device=device)
+        self._count.changed()
         flying = int(self._count.numpy()[1])
         self._flight.who, self._flight.body, self._flight.rate = who[:flying], body[:flying], dt / self.grid.spacing
         self._take(particles)

@@ -54,7 +54,7 @@ class Rearrangement:
             self.correction = self._made()
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
-        self._crowded: tuple[float, float] | None = None  # share and largest density at the start of the step
+        self._looked = False  # whether this step has measured the crowding
 
     def look(self, step: int, density: wp.array | None, particles: Particles, window: Window) -> None:
         """Measure the crowding at the start of a step, before anything moves, if that is what decides.
@@ -65,14 +65,14 @@ class Rearrangement:
             particles: the material.
             window: cells that hold all of it, with two to spare on each side.
         """
-        self._crowded = None
-        if self.crowding is not None and step % self._every == 0:
-            self._crowded = self.crowding.measure(density, particles, window)
+        self._looked = self.crowding is not None and step % self._every == 0
+        if self.crowding is not None and self._looked:
+            self.crowding.measure(density, particles, window)
 
     @property
     def max_density(self) -> float | None:
         """Return the largest density at the start of the step, if it was measured."""
-        return None if self._crowded is None else self._crowded[1]
+        return self.crowding.found()[1] if self.crowding is not None and self._looked else None
 
     def due(self, step: int) -> bool:
         """Return whether a step moves anything."""
@@ -113,7 +113,7 @@ class Rearrangement:
 
     def _parts(self, step: int) -> bool:
         if self.crowding is not None:
-            return self._crowded is not None and self._crowded[0] > self._most
+            return self._looked and self.crowding.found()[0] > self._most
         return self.correction is not None and step % self.correction.every == 0
 
     def _share(self, dt: float) -> float:

@@ -212,6 +212,7 @@ class ParticleSimulation(ParticleFrames):
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
         totals = self.checked_totals("at the start of")
+        self.particles.totals_stay(False)
         if self.spray.active:
             with self.watch.stage("spray", self.particles.position):
                 totals = self.spray.exchange(self.particles, totals, self.step_count, self.time, dt)
@@ -306,12 +307,13 @@ class ParticleSimulation(ParticleFrames):
         with self.watch.stage("crowding", self.particles.position):
             self.rearrangement.look(self.step_count, self.known_density(), self.particles, window)
         with self.watch.stage("advection", self.particles.position, *self.velocity):
-            stopped, pushed, stuck = self.carry(dt)
+            self.carry(dt)
         if self.band is not None:
             with self.watch.stage("narrow band", self.band.depth, *self.velocity):
                 self.band.carry(self.velocity, dt)
         exchanged = self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
         after = self.checked_totals("after")
+        stopped, pushed, stuck = self.met()
         rearranged: Row = {"max_density": self.rearrangement.max_density}
         if self.rearrangement.due(self.step_count):
             fill = self.band.fill_interior if self.band is not None else None
@@ -320,27 +322,27 @@ class ParticleSimulation(ParticleFrames):
             if self.outlets is not None:  # the density correction may push particles out through open sides
                 exchanged["departed"] += self.outlets.remove_departed(self.particles)
             after = self.checked_totals("after the density correction of")
+        self.particles.totals_stay(True)
         self.time += dt
         self.step_count += 1
         self.last_dt = dt
         return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
 
-    def carry(self, dt: float) -> tuple[int, int, int]:
-        """Move particles and solids by dt [s]; bodies in flight keep their momenta.
-
-        Returns:
-            How many met a wall, were pushed by a solid, and are stuck inside one.
-        """
+    def carry(self, dt: float) -> None:
+        """Move particles and solids by dt [s]; bodies in flight keep their momenta."""
         if self.bodies is not None:
             self.bodies.end_step(dt)
             if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
                 raise SimulationFailed(f"step {self.step_count}: {trouble}")
-        met = self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
+        self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
         self.spray.fly(self.gravity * self.kick_dt, dt)
         if self.flights is not None:
             with self.watch.stage("bodies in flight", self.particles.position):
                 self.flights.end(self.particles, self.velocity)
-        return met
+
+    def met(self) -> tuple[int, int, int]:
+        """Return how many particles met a wall, were pushed by a solid, and are stuck inside one when `carry` moved them."""
+        return self.boundary.met()
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
         """Return what the log says of a step's solve; nothing if there was none."""

@@ -20,7 +20,7 @@ UNBOUNDED = 1e30  # stands for an infinite bound of a correction; corrections ar
 BOUNDS = {"lower": "S", "upper": "S"}
 
 SWEEP = RowPass(
-    "cycle.sweep", HEADERS / "sweep.h", "S", stencil=("F", "S"), reads={"x": "S", "b": "S", **BOUNDS}, optional=("upper",),
+    "cycle.sweep", HEADERS / "sweep.h", "S", stencil=("F", "S"), reads={"x": "S", "b": "S", **BOUNDS}, optional=("lower", "upper"),
     writes={"y": "S"}, numbers={"omega": "S", "from_zero": bool, "projected": bool},
 )  # fmt: skip
 SWEEP_INTO_RING = replace(SWEEP, name="cycle.into_ring", header=HEADERS / "sweep_into_ring.h", ring=("y",))
@@ -29,8 +29,17 @@ RESTRICT = RowPass(
     "cycle.restrict", HEADERS / "restrict.h", "S", stencil=("F", "S"), finer=True, other={"x": "S", "b": "S"}, writes={"coarse": "S"}
 )
 CORRECT = RowPass(
-    "cycle.correct", HEADERS / "correct.h", "S", stencil=("F", "S"), reads=BOUNDS, optional=("upper",), writes={"x": "S"},
+    "cycle.correct", HEADERS / "correct.h", "S", stencil=("F", "S"), reads=BOUNDS, optional=("lower", "upper"), writes={"x": "S"},
     other={"coarse": "S"}, numbers={"scale": "S", "projected": bool},
+)  # fmt: skip
+# On CUDA, where nothing stays in a cache from pass to pass, what is cheap to compute again is not stored.
+FIRST_PAIR = RowPass(
+    "cycle.first_pair", HEADERS / "first_pair.h", "S", stencil=("F", "S"), reads={"b": "S"}, writes={"y": "S"},
+    numbers={"omega": "S", "second": "S"},
+)  # fmt: skip
+CORRECTED_SWEEP = RowPass(
+    "cycle.corrected_sweep", HEADERS / "corrected_sweep.h", "S", stencil=("F", "S"), reads={"x": "S", "b": "S"}, writes={"y": "S"},
+    other={"coarse": "S"}, numbers={"omega": "S", "scale": "S"},
 )  # fmt: skip
 COARSE_BOUNDS = RowPass(
     "cycle.bounds", HEADERS / "coarse_bounds.h", "S", stencil=("F", "S"), finer=True, other={"x": "S", **BOUNDS},

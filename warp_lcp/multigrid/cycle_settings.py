@@ -34,6 +34,9 @@ class CycleSettings(Smoothing):
     Args:
         gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle. Where one axis is coarsened at a time, every second level
             is visited once.
+        revisited_cpu: the most levels below the finest that are visited `gamma` times by each visit of the level above; those further down
+            once.
+        revisited_cuda: the same on a GPU, where small levels take as long as large ones: a W-cycle doubles their launches with each level.
         over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
         excess: factor on what AIR and held unknowns add to an aggregate's diagonal: they are nearer than the next aggregate, so the
             over-correction applies to them in part only.
@@ -48,6 +51,8 @@ class CycleSettings(Smoothing):
     """
 
     gamma: Count = 2
+    revisited_cpu: CountOrZero = 64
+    revisited_cuda: CountOrZero = 3
     over_correction: Positive = 1.8
     excess: Positive = 1.5
     interval: tuple[Positive, Positive] = (0.5, 2.0)

@@ -89,9 +89,8 @@ class Level:
 
     def correcting(self, coarse: Level, scale: float, *, projected: bool, rows: Rows | None = None) -> Bound:
         """Return the pass that adds `scale` times the coarse correction to x, clipped if projected."""
-        fx, fy, fz = coarse.factors
-        there = rows or self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
-        fields = {"x": self.x, "coarse": coarse.x, "lower": self.lower, "upper": self.upper}
+        there = rows or self._finer_rows(coarse)
+        fields = {"x": self.x, "coarse": coarse.x, **self._sides(projected)}
         given: dict[str, Any] = {"stencil": self.stencil, "scale": scale, "projected": projected, **fields}
         return self._once((coarse, projected, id(rows)), lambda: passes.CORRECT.bind(there, **given))  # which keeps the rows
 
@@ -113,14 +112,37 @@ class Level:
 
     def descending(self, coarse: Level, settings: CycleSettings, *, projected: bool, from_zero: bool) -> Iterator[Stage]:
         """Yield a leg of a cycle down: a pair of Chebyshev-Jacobi sweeps, and the residual on the next level."""
-        yield from self.pair(settings.weights, projected=projected, from_zero=from_zero)
+        if from_zero and not projected and self.computes_again:
+            yield self._first_pair(settings.weights)
+        else:
+            yield from self.pair(settings.weights, projected=projected, from_zero=from_zero)
         yield from self.filling("x")
         yield self.restricting(coarse)
 
     def ascending(self, coarse: Level, settings: CycleSettings, *, projected: bool) -> Iterator[Stage]:
         """Yield a leg up: the correction and the reverse pair, which keeps the cycle symmetric."""
+        weights = settings.weights[::-1]
+        if not projected and self.computes_again:
+            yield self._corrected_sweep(coarse, settings.over_correction, weights[0])
+            yield self.sweeping(self.x, self.t, weights[1], projected=False)
+            return
         yield self.correcting(coarse, settings.over_correction, projected=projected)
-        yield from self.pair(settings.weights[::-1], projected=projected)
+        yield from self.pair(weights, projected=projected)
+
+    @property
+    def computes_again(self) -> bool:
+        """Whether a pass computes what another one would store: on CUDA, unless ghost cells would have to be filled between."""
+        return bool(self.stencil.device.is_cuda and not self.stencil.has_ghosts)
+
+    def _first_pair(self, weights: tuple[float, float]) -> Bound:
+        numbers: dict[str, Any] = {"omega": weights[0], "second": weights[1]}
+        fields = {"b": self.b, "y": self.x}
+        return self._once("first", lambda: passes.FIRST_PAIR.bind(self.stencil.rows, stencil=self.stencil, **fields, **numbers))
+
+    def _corrected_sweep(self, coarse: Level, scale: float, omega: float) -> Bound:
+        given: dict[str, Any] = {"x": self.x, "b": self.b, "y": self.t, "coarse": coarse.x, "omega": omega, "scale": scale}
+        rows = self._finer_rows(coarse)
+        return self._once(("corrected", coarse), lambda: passes.CORRECTED_SWEEP.bind(rows, stencil=self.stencil, **given))
 
     def coarsened(self, coarse: Level, settings: CycleSettings) -> Iterator[Stage]:
         """Yield the making of the next level."""
@@ -135,8 +157,15 @@ class Level:
             made = self._bound[key] = make()
         return made
 
+    def _sides(self, projected: bool) -> dict[str, Any]:
+        return {"lower": self.lower, "upper": self.upper} if projected else {"lower": None, "upper": None}
+
     def _coarser_rows(self, coarse: Level) -> Rows:
         return coarse.stencil.rows.beside(self.stencil.rows, coarse.factors)
+
+    def _finer_rows(self, coarse: Level) -> Rows:
+        fx, fy, fz = coarse.factors
+        return self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
 
     def sweeping(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False,
@@ -146,7 +175,7 @@ class Level:
 
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.
         """
-        fields = {"x": x, "y": y, "b": self.b, "lower": self.lower, "upper": self.upper}
+        fields = {"x": x, "y": y, "b": self.b, **self._sides(projected)}
         numbers: dict[str, Any] = {"omega": omega, "projected": projected, "from_zero": from_zero}
         key = kind, id(rows), y is self.x, *numbers.values()
         return self._once(key, lambda: kind.bind(rows or self.stencil.rows, stencil=self.stencil, **numbers, **fields))
@@ -262,10 +291,11 @@ class Hierarchy:
 
         Whoever writes the finest diagonal marks the rows: `hold` does. The result is that of a complete rebuild, to the last bit.
         """
-        self._coarsening.run()
+        self.rebuilding.run()
 
     @cached_property
-    def _coarsening(self) -> Program:
+    def rebuilding(self) -> Program:
+        """What `rebuild_changed` launches."""
         program = Program(self.device)
         alone = len(self.levels) if self.device.is_cpu else self._first_small + 1
         for fine, coarse in zip(self.levels, self.levels[1:alone], strict=False):
@@ -427,7 +457,9 @@ class Hierarchy:
         # visiting levels of half the cells twice would cost as much on each of them: only every second one is
         level.shrunk = fine.shrunk * math.prod(whole) / math.prod(whole_counts(stencil))
         if level.shrunk >= 3:
-            level.visits, level.shrunk = self.settings.gamma, 1.0
+            most = self.settings.revisited_cuda if self.device.is_cuda else self.settings.revisited_cpu
+            again = sum(above.visits > 1 for above in self.levels) < most
+            level.visits, level.shrunk = self.settings.gamma if again else 1, 1.0
         return level
 
     def _factors(self, counts: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -62,7 +62,7 @@ class TurningHierarchy(Hierarchy):
         wp.copy(self._marks, self.finest.changed)
         for part in (self, *self.companions):
             wp.copy(self.finest.changed, self._marks)
-            part._coarsening.run()
+            part.rebuilding.run()
 
     @cached_property
     def cycle(self) -> Program:

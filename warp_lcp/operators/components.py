@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, no_type_check
 
@@ -10,6 +11,7 @@ import warp as wp
 
 from warp_lcp.problem.protocol import FLUID
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.readings import Reading
 
 options: dict[str, Any] = {"enable_backward": False, "module": "warp_lcp.components"}
 F64, I32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
@@ -190,18 +192,28 @@ class ComponentFinder:
         self._A, device = A, A.device
         self._own: Scratch | None = None
         self._none_at = -1  # the operator's version that had no floating components
-        self._count = wp.zeros(1, dtype=wp.int32, device=device)
+        self._count = Reading(device, dtype=wp.int32)
 
     def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the floating components, or None if there are none; `scratch` as in GridPoisson.floating_components."""
-        A = self._A
-        if self._none_at == A.version:
+        tell = self.look(scratch)
+        if tell():
             return None
-        parent, grounded = self._grow(scratch, A.cells_around)
-        if self._count.numpy()[0]:
-            return self._label(parent.numpy(), grounded.numpy())
-        self._none_at = A.version
-        return None
+        parent, grounded = self._scratch
+        return self._label(parent.numpy(), grounded.numpy())
+
+    def look(self, scratch: Scratch | None = None) -> Callable[[], bool]:
+        """Launch the search; return what tells whether there are none, and waits for the device; `scratch` as of `find`."""
+        version = self._A.version
+        if self._none_at != version:
+            self._scratch = self._grow(scratch, self._A.cells_around)
+
+        def none() -> bool:
+            if self._none_at != version and not self._count.numpy()[0]:
+                self._none_at = version
+            return self._none_at == version
+
+        return none
 
     def _grow(self, scratch: Scratch | None, joined: wp.array[Any]) -> Scratch:
         """Return each cell's parent in the tree of its component, and which roots something holds; their number is `_count`.
@@ -219,13 +231,14 @@ class ComponentFinder:
                 )
             scratch = self._own
         parent, grounded = scratch[0].view(wp.int32), scratch[1]
-        self._count.zero_()
+        self._count.array.zero_()
         cells, coefficients = A.cells_around.flatten(), dict(zip(UNIFORM, A.uniform, strict=True))
         given = coefficients | {name: face.flatten() for name, face in zip(FACES, A.faces, strict=True)}
         SINGLETONS.bind(rows, parent=parent, grounded=grounded).launch()
         UNITE.bind(rows, cells=joined.flatten(), parent=parent, **given).launch()
         GROUND.bind(rows, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded, **given).launch()
-        COUNT.bind(rows, cells=cells, parent=parent, grounded=grounded, count=self._count).launch()
+        COUNT.bind(rows, cells=cells, parent=parent, grounded=grounded, count=self._count.array).launch()
+        self._count.changed()
         return parent, grounded
 
     def _label(self, parent: np.ndarray, grounded: np.ndarray) -> FloatingComponents:

@@ -209,9 +209,14 @@ class GridPoisson(Pickled):
         Args:
             scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten on the rows' spans; saves as much memory.
         """
+        return self.component_finder.find(scratch)
+
+    @property
+    def component_finder(self) -> ComponentFinder:
+        """What finds floating components."""
         if self._finder is None:
             self._finder = self._component_finder()
-        return self._finder.find(scratch)
+        return self._finder
 
     def _component_finder(self) -> ComponentFinder:
         return ComponentFinder(self)

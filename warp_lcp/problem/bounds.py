@@ -107,6 +107,12 @@ class Bounds:
 
     def refresh(self) -> None:
         """Code fields again that the caller may have changed, where all their finite values are 0."""
+        if self.in_place:
+            self.encode()
+            self.code = self._no_code if self._other_values() else self._memory
+
+    def encode(self) -> None:
+        """Launch the coding of fields that are in place; `stays` then tells, and waits for the device."""
         if not self.in_place:
             return
         if self._memory is None:
@@ -114,7 +120,16 @@ class Bounds:
             self._others = Sums(Rows.of_fields(self.layout))
         least, most = (0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True))
         given = {"lower": self.fields[0], "upper": self.fields[1], "least": least, "most": most, "code": self._memory}
-        self.code = self._no_code if self._others.of(ENCODE, **given)[0] else self._memory
+        self._others.launch(ENCODE, **given)
+
+    @property
+    def stays(self) -> bool:
+        """Whether there is a code now if there was one before, and none if there was none."""
+        return not self.in_place or bool(self._other_values()) == (self.code is not self._memory)
+
+    def _other_values(self) -> float:
+        """Return how many finite values other than 0 the last coding has met."""
+        return float(self._others.reading.numpy()[0])
 
     def as_field(self, side: int) -> wp.array[Any]:
         """Return a stored float64 field of the lower (0) or the upper bound (1)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property, singledispatch
 from typing import Any
 
@@ -121,6 +122,11 @@ class LCP(Pickled):
     def not_finite(self, field: wp.array[Any]) -> int:
         """Return how many unknowns of a stored field are not finite."""
         return self._faults(field, Bounds(self.layout, *INFINITE))[0]
+
+    def look_at(self, field: wp.array[Any]) -> Callable[[], int]:
+        """Launch what `not_finite` does for a problem in one process; return what tells, and waits for the device."""
+        self._counts.launch(CHECK, bounds=Bounds(self.layout, *INFINITE).operands, b=field, unknown=self.unknown)
+        return lambda: int(self._counts.reading.numpy()[0])
 
     def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
         """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""

@@ -19,6 +19,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.problem.scale import scale_by_products
 from warp_lcp.rows import Known, RowPass, Rows
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Sums
 
 HEADERS = Path(__file__).parent / "headers"
@@ -139,7 +140,17 @@ class NaturalResidual:
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
-        return float(np.sqrt(self._sums.of(UNKNOWN_SQUARE, b=self.problem.b, unknown=self.problem.unknown)[0]))
+        self.launch_square_of_b()
+        return float(np.sqrt(self.square_of_b.numpy()[0]))
+
+    @property
+    def square_of_b(self) -> Reading:
+        """||b||^2 over the unknowns as launched last, in the first place."""
+        return self._sums.reading
+
+    def launch_square_of_b(self) -> None:
+        """Launch the evaluation of `square_of_b`."""
+        self._sums.launch(UNKNOWN_SQUARE, b=self.problem.b, unknown=self.problem.unknown)
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
         """Return an estimate of the residual that rounding x to `epsilon` leaves: epsilon || 2 |d x| + |b| ||."""

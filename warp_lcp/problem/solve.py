@@ -18,7 +18,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import NamesComponents, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows.fields import Array
 from warp_lcp.rows.vectors import convert
 
@@ -136,6 +136,17 @@ class Workspace(Protocol):
         """Make x the best iterate again."""
 
 
+@runtime_checkable
+class BeginsAhead(Protocol):
+    """A workspace whose device may begin a solve, and go on, before the host knows of it."""
+
+    def allow(self, steps: int) -> None:
+        """Say how many steps of the next solve may be taken without the host."""
+
+    def begin_ahead(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria) -> float | None:
+        """Begin at a guess; return the residual at clip(0, l, u), None where nothing has begun. `start` comes next, then steps."""
+
+
 class IterateMemory:
     """What workspaces have in common: x, moved in place and rounded to its precision, the residual there, the best iterate by a copy.
 
@@ -200,7 +211,7 @@ class Solver(Protocol):
 
 
 def solve(
-    problem: LCP | ConvexSetProblem, solver: Solver, *, stopping: StoppingCriteria | None = None, x0: Array | None = None,
+    problem: LCP | ConvexSetProblem, solver: Solver, *, stopping: StoppingCriteria | MeanCriteria | None = None, x0: Array | None = None,
     workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None,
 ) -> SolveResult:  # fmt: skip
     """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
@@ -209,7 +220,7 @@ def solve(
     if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
         kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"
         raise ValueError(f"solver is {kind}: expected a method with its settings, say MinimumMapNewton()")
-    if not (stopping is None or isinstance(stopping, StoppingCriteria)):
+    if not (stopping is None or isinstance(stopping, (StoppingCriteria, MeanCriteria))):
         raise ValueError(f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)")
     taken: type = getattr(solver, "problems", LCP)
     if not isinstance(problem, taken):
@@ -222,7 +233,7 @@ def solve(
         if across is not None and not getattr(solver, "distributed", False):
             raise ValueError(f"{type(solver).__name__} does not work on several ranks: take ProjectedMultigrid or MinimumMapNewton")
     stopping = stopping or StoppingCriteria()
-    deadline = Deadline(stopping.max_seconds, across)
+    deadline = Deadline(stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, across)
     work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
     return loop(problem, solver, stopping, deadline, work, callback).run(x0)
 
@@ -255,10 +266,11 @@ class _Loop:
     """The state of one solve."""
 
     def __init__(
-        self, problem: Any, solver: Solver, stopping: StoppingCriteria, deadline: Deadline, work: Workspace,
+        self, problem: Any, solver: Solver, stopping: StoppingCriteria | MeanCriteria, deadline: Deadline, work: Workspace,
         callback: Callable[[Record], None] | None,
     ) -> None:  # fmt: skip
-        self.problem, self.solver, self.stopping, self.work, self.callback = problem, solver, stopping, work, callback
+        self.problem, self.solver, self.criteria, self.work, self.callback = problem, solver, stopping, work, callback
+        self.stopping = stopping if isinstance(stopping, StoppingCriteria) else StoppingCriteria(max_iterations=stopping.max_iterations)
         self.deadline = deadline
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
@@ -289,8 +301,11 @@ class _Loop:
         self._keep(0)
         return None if math.isfinite(self.reference) else SolveStatus.NON_FINITE
 
-    def _refer(self) -> None:
-        self.reference = self.residual.evaluate(self.work.x)
+    def _refer(self, reference: float | None = None) -> None:
+        """Take the residual at the start that tolerances refer to; None: that of the iterate."""
+        self.reference = self.residual.evaluate(self.work.x) if reference is None else reference
+        if isinstance(self.criteria, MeanCriteria):
+            self.stopping = self.criteria.known()
         self.tolerance = self.stopping.tolerance(self.reference)
 
     def _iterate(self, status: SolveStatus | None) -> SolveResult:
@@ -369,6 +384,8 @@ class _LoopInBox(_Loop):
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
         """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
+        if isinstance(self.work, BeginsAhead) and self._begin_ahead(self.work, x0):
+            return None
         x, residual = self.work.x, self.residual
         guess = None if x0 is None else self._guess(x0)
         self.warm = guess is not None
@@ -393,6 +410,20 @@ class _LoopInBox(_Loop):
         self._record(0, Step("start", 0))
         self._keep(0)
         return SolveStatus.INFEASIBLE if lost > self.tolerance else None
+
+    def _begin_ahead(self, work: BeginsAhead, x0: Array | None) -> bool:
+        """Let the device begin; return whether it has."""
+        work.allow(self.stopping.max_iterations if self.deadline.ends == math.inf else 0)
+        if x0 is None or self.deadline.ends != math.inf:
+            return False
+        reference = work.begin_ahead(self.problem.layout.load(x0, wp.float64, "x0"), self.criteria)
+        if reference is None:
+            return False
+        self.warm = True
+        self._refer(reference)
+        self._record(0, Step("start", 0))
+        self._keep(0)
+        return True
 
     def _trivial(self) -> SolveStatus | None:
         """Return how a solve ends whose data are not finite or solved by the start; refuse what would seem so."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
+import warp as wp
 from annotated_types import Gt
 
 from warp_lcp.problem.result import SolveStatus
@@ -66,3 +68,26 @@ class StoppingCriteria(Settings):
         if steps >= self.max_iterations:
             return SolveStatus.MAX_ITERATIONS
         return SolveStatus.STAGNATED if not interim and idle >= self.patience else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeanCriteria:
+    """Criteria by the root mean square over the unknowns, which a device may still be counting when the solve begins.
+
+    Args:
+        rtol: as of `StoppingCriteria`.
+        atol: of the root mean square of the residual over the unknowns, units of y.
+        max_iterations: as of `StoppingCriteria`.
+        count: returns the number of unknowns, and waits for the device.
+        counted: where it will be on the device, shape (1,), float64.
+    """
+
+    rtol: float
+    atol: float
+    max_iterations: int
+    count: Callable[[], float]
+    counted: wp.array[Any] | None = None
+
+    def known(self) -> StoppingCriteria:
+        """Return the criteria for the unknowns as counted."""
+        return StoppingCriteria(rtol=self.rtol, atol=self.atol * self.count() ** 0.5, max_iterations=self.max_iterations)

@@ -244,8 +244,10 @@ class Rows:
         return layout.rows
 
     @staticmethod
-    def box(low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, cells: int | None = None) -> "Rows":
-        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes some `cells` of one.
+    def box(
+        low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, cells: int | None = None, slab: int | None = None
+    ) -> "Rows":
+        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes some `cells`, of `slab` planes if it sums.
 
         Raises:
             ValueError: low is not between 0 and high.
@@ -253,7 +255,7 @@ class Rows:
         if not all(0 <= begin <= end for begin, end in zip(low, high, strict=True)):
             raise ValueError(f"box: from {low} to {high}: expected 0 <= low <= high")
         counts = tuple(end - begin for begin, end in zip(low, high, strict=True))
-        made = Rows.strided(0, device, (0, 0, 0), counts, cells=cells)
+        made = Rows.strided(0, device, (0, 0, 0), counts, cells=cells, slab=slab)
         return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)), ends=high)
 
     @staticmethod

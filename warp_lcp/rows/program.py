@@ -41,6 +41,18 @@ class Task:
         perform(self.function, launch)
 
 
+@dataclass(frozen=True)
+class Conditional:
+    """A program that is launched if a number on the device is not 0: in a graph without the host."""
+
+    condition: wp.array[Any]
+    program: Program
+
+    def launch(self) -> None:
+        """Launch it, or record that in the graph that is being captured."""
+        wp.capture_if(self.condition, self.program._launch)
+
+
 def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
     """Call a function, or have the team do an operation, now if `launch` launches now; else record it among the launches."""
     program = getattr(launch, "__self__", None)
@@ -99,7 +111,7 @@ class Program:
         self._arguments: list[Any] = []  # a recorded launch holds addresses only
         self._runs = 0
         self._stretches: list[Callable[[], object]] | None = None
-        self._loops: dict[int, Any] = {}  # graphs by the address of their condition
+        self._loops: dict[int, Callable[[], object]] = {}  # what launches their graph, by the address of their condition
 
     def __len__(self) -> int:
         """Return the number of launches."""
@@ -115,6 +127,11 @@ class Program:
         """Record a recorded launch, an operation of the team or a task of the host."""
         self._commands.append(Task(what) if callable(what) else what)
         self._stretches = None
+
+    @property
+    def has_run(self) -> bool:
+        """Whether it has run, so that all of its kernels are loaded."""
+        return self._runs > 0
 
     def extend(self, other: Program) -> None:
         """Append the launches of another program."""
@@ -145,10 +162,14 @@ class Program:
             wp.capture_while(condition, self._run_in_time)
             return
         if condition.ptr not in self._loops:
-            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-                wp.capture_while(condition, self._launch)
-            self._loops[condition.ptr] = capture.graph
-        wp.capture_launch(self._loops[condition.ptr])
+            self._loops[condition.ptr] = self._captured_loop(condition)
+        self._loops[condition.ptr]()
+
+    def _captured_loop(self, condition: wp.array[Any]) -> Callable[[], object]:
+        """Return what launches a graph that repeats the launches."""
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            wp.capture_while(condition, self._launch)
+        return partial(wp.capture_launch, capture.graph)
 
     def _run_in_time(self) -> None:
         check_time()

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from warp_lcp.rows.layout import BoundFields, Known, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
-from warp_lcp.rows.native import shared, text
+from warp_lcp.rows.native import HEADERS, shared, text
 from warp_lcp.rows.program import Launch, perform
 from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Stage, get_threads, ranges, team
 
@@ -59,11 +59,12 @@ class RowPass:
         whole: small arrays: pointers to the first element.
         box: fields of all cells of a grid, of `Rows.box`: pointers to the first stored cell of row j of plane k, null where there is none;
             of one that has layers, in its first. The piece is first <= i < last; the planes of the first field are s1 elements apart, its
-            rows s2. Such a pass has no letters, no sums and one form, in the Warp module that its name begins with. Lists, too, are fields.
+            rows s2. Such a pass has no letters and one form, in the Warp module that its name begins with. Lists, too, are fields.
         listed: int32 array of `whole` with the flat indices of the cells that are visited; the box is then that of the list's entries.
         optional: which arrays may be None, or empty: their pointers are null then.
         numbers: given by the host.
-        sums: variables of the row function that are summed over the cells.
+        sums: variables of the row function that are summed over the cells. Those of a pass over a box are doubles, and 0 before a piece.
+        largest: likewise, of which the largest counts; after the sums.
         ordered: whether tasks write what others read or write: on the CPU one thread takes them, in order.
         constants: numbers that are known when the kernel is made, with their usual values; those that are given are integers, and macros.
 
@@ -87,6 +88,7 @@ class RowPass:
     optional: tuple[str, ...] = ()
     numbers: Mapping[str, Any] = field(default_factory=dict)
     sums: tuple[str, ...] = ()
+    largest: tuple[str, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
     box: Mapping[str, Any] = field(default_factory=dict)
     listed: str = ""
@@ -103,7 +105,7 @@ class RowPass:
         """Check the declaration, in whose place a compiler would complain, or nobody."""
         numbers = {n: kind for n, kind in self.numbers.items() if not (self.box and n in PLACE)}
         fields = (self.reads, self.writes, self.other, self.by_row, {**self.whole, **self.box})
-        groups = (*fields, numbers, self.constants, self.sums and ("out",))
+        groups = (*fields, numbers, self.constants, self.found and ("out", *(self.found if self.box else ())))
         names = [name for group in groups for name in group]
         wrong = {name for name in names if names.count(name) > 1 or not name.isidentifier() or name in OWN}
         wrong |= {*self.ring} - {*self.reads, *self.writes} | {*self.optional} & {*[*self.box][:1]}
@@ -117,9 +119,14 @@ class RowPass:
             raise TypeError(f"{self.name}: {sorted(others)}: expected numbers of the types {', '.join(t.__name__ for t in PACKED)}")
 
     @functools.cached_property
+    def found(self) -> tuple[str, ...]:
+        """What is summed, and what the largest is taken of."""
+        return (*self.sums, *self.largest)
+
+    @functools.cached_property
     def arrays(self) -> dict[str, Any]:
-        """Types of all arrays by name; `out` receives the sums, a column each."""
-        out = {"out": wp.float64} if self.sums else {}
+        """Types of all arrays by name; `out` receives what is found, a column each."""
+        out = {"out": wp.float64} if self.found else {}
         return {**self.reads, **self.writes, **self.other, **self.by_row, **self.whole, **self.box, **out}
 
     def bind(self, rows: Rows, *, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> "Bound":
@@ -207,7 +214,7 @@ class RowPass:
     def _lengths(self) -> list[tuple[str | None, tuple[str, ...]]]:
         """Names of the arrays of each length, with the attribute of rows that it is; None: of any."""
         sized = (("size", {**self.reads, **self.writes}), ("other_size", self.other), ("count", self.by_row))
-        groups = (*sized, (None, {**self.whole, **self.box, **dict.fromkeys(("out",) * bool(self.sums))}))
+        groups = (*sized, (None, {**self.whole, **self.box, **dict.fromkeys(("out",) * bool(self.found))}))
         return [(length, tuple(names)) for length, names in groups if names]
 
     def _check_memory(self, rows: Rows, given: dict[str, Any]) -> None:
@@ -226,8 +233,8 @@ class RowPass:
                     raise ValueError(f"{self.name}: {name} is {why}")
         if self.box:
             self._check_box(rows, {tuple(given[n].shape[-3:]) for n in self.box if given[n] is not None})
-        if self.sums and given["out"].size < len(self.sums) * rows.places:
-            least = f"fewer than {len(self.sums) * rows.places}: {rows.places} threads for each sum"
+        if self.found and given["out"].size < len(self.found) * rows.places:
+            least = f"fewer than {len(self.found) * rows.places}: {rows.places} threads for each sum"
             raise ValueError(f"{self.name}: out has {given['out'].size} elements, {least}")
 
     def _check_box(self, rows: Rows, shapes: set[tuple[int, ...]]) -> None:
@@ -281,7 +288,7 @@ class Form:
         into = not {*d.ring}.isdisjoint(d.writes)
         levels = d.finer or bool(d.other)
         switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOX": bool(d.box)}
-        switches |= {"BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
+        switches |= {"BOUNDS": ord(self.bounds[0]), "STENCIL": stencil, "FOUND": len(d.found), "SUMS": len(d.sums)}
         macros = {n: v for n, v in constants.items() if hasattr(v, "__index__")}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
@@ -294,12 +301,13 @@ class Form:
         if levels:
             each += ["const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2;"]
             each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
-        for n in (n for n in d.arrays if n not in d.box and not (d.sums and n == "out")):
+        for n in (n for n in d.arrays if n not in d.box and not (d.found and n == "out")):
             pointer = f"given.{n}.data{at.get(n, '')}"
             pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
             each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
         each += [f"const auto {n} = given.{n};" for n in d.numbers]
         if d.box:
+            each += [f"double {n} = 0;" for n in d.found]
             each += [f"const long long s2 = given.{next(iter(d.box))}.shape[2], s1 = s2*given.{next(iter(d.box))}.shape[1];"]
             listed = [f"for (int m_ = P.first; m_ < P.first + n; ++m_) {{ const int at_ = {d.listed}[m_], k = at_ / (int)s1;"]
             listed += ["const int j = (at_ - k*(int)s1) / (int)s2, first = at_ % (int)s2, last = first + 1;"]
@@ -308,13 +316,14 @@ class Form:
         if d.stencil:
             each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz", "known")]
             each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
-        sums = [f"const double all_[] = {{{', '.join(f'(double){s}' for s in d.sums)}}}; double* sums_ = given.out.data + P.t;"]
-        sums += [f"for (int s = 0; s < {len(d.sums)}; ++s, sums_ += places_) *sums_ = P.more ? all_[s] + *sums_ : all_[s];"]
+        sums = [f"const double all_[] = {{{', '.join(f'(double){s}' for s in d.found)}}}; double* sums_ = given.out.data + P.t;"]
+        sums += [text(HEADERS / "sums.h")]
         common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
         before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', *each]
         body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass
-        tail = ['#line 1 "end"', "}}}", *["}"] * bool(d.listed), *(f"#undef {n}" for n in macros), ""]
-        return "\n".join(["", *before, *common, *body, '#line 1 "sums"', *(sums if d.sums else []), *tail])
+        closed = ["}"] * bool(d.listed)
+        tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
+        return "\n".join(["", *before, *common, *body, *closed, '#line 1 "sums"', *(sums if d.found else []), *tail])
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
         """Return the struct of arguments."""
@@ -372,7 +381,7 @@ class Bound(NamedTuple):
     @property
     def layout(self) -> Any:
         """Where the rows are, for a pass that sums or one that does not."""
-        return self.rows.summed if self.form.declared.sums else self.rows.single
+        return self.rows.summed if self.form.declared.found else self.rows.single
 
     def launch(self, launch: Launch | None = None) -> None:
         """Launch the pass, or record it."""

@@ -5,6 +5,7 @@ Every operator stores its fields as flat arrays (see `warp_lcp.rows.fields`), so
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol, no_type_check
 
@@ -14,6 +15,7 @@ import warp as wp
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.native import HEADERS, text
 from warp_lcp.rows.program import Launch, perform
+from warp_lcp.rows.readings import Reading
 
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
@@ -48,6 +50,22 @@ def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, se
         out[slot + block] = total[0]
 
 
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.vectors")
+def largest_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int):
+    """The same for the largest of them."""
+    t = wp.tid()
+    block = t // threads
+    column = block // segments
+    segment = block - column * segments
+    most = -wp.float64(wp.inf)
+    for i in range(segment * threads + t - block * threads, n, threads * segments):
+        most = wp.max(most, partials[column * n + i])
+    total = wp.tile_max(wp.tile(most))
+    if t == block * threads:
+        out[slot + block] = total[0]
+
+
 class Across(Protocol):
     """Who else has a part of the unknowns: the ranks of a distributed problem. All methods are collective, with one answer for all."""
 
@@ -62,6 +80,35 @@ class Across(Protocol):
 
     def join(self, key: bytes) -> bytes:
         """Return a key that stands for the keys of all parts."""
+
+
+def segments_of(n: int) -> int:
+    """Return how many blocks of a GPU add up a column first: one would take long over very many partial sums."""
+    return CUDA_SEGMENTS if n > CUDA_SEGMENTS * CUDA_BLOCK else 1
+
+
+def fold(
+    kernel: wp.Kernel, partials: wp.array[wp.float64], n: int, columns: int, out: wp.array[wp.float64], slot: int,
+    between: wp.array[wp.float64], launch: Launch = wp.launch,
+) -> None:  # fmt: skip
+    """Write to out[slot], out[slot + 1], ... what `add_up_kernel` or `largest_kernel` makes of columns of n partial results, on CUDA.
+
+    Args:
+        kernel: one of the two.
+        partials: of one column after another.
+        n: of each.
+        columns: how many.
+        out: receives a number a column.
+        slot: of the first.
+        between: memory of columns * segments_of(n) numbers, where these are more than the columns.
+        launch: of a program.
+    """
+    device, segments = partials.device, segments_of(n)
+    if segments > 1:
+        blocks = columns * segments * CUDA_BLOCK
+        launch(kernel, blocks, [partials, n, CUDA_BLOCK, segments, between, 0], device=device, block_dim=CUDA_BLOCK)
+        partials, n = between, segments
+    launch(kernel, columns * CUDA_BLOCK, [partials, n, CUDA_BLOCK, 1, out, slot], device=device, block_dim=CUDA_BLOCK)
 
 
 class Reduction:
@@ -82,25 +129,17 @@ class Reduction:
     ) -> None:  # fmt: skip
         self.scalars, self.columns, self._across = scalars, columns, across
         self.threads = threads or Rows.flat(n, device).places
-        self.block = CUDA_BLOCK if device.is_cuda else 1
         self.partials = wp.zeros(columns * self.threads, dtype=wp.float64, device=device)
-        # one block of a GPU would take long over millions of partial sums: many blocks add them up first
-        self._segments = CUDA_SEGMENTS if device.is_cuda and self.threads > CUDA_SEGMENTS * CUDA_BLOCK else 1
-        self._folded = wp.zeros(columns * self._segments, dtype=wp.float64, device=device)
+        self._folded = wp.zeros(columns * segments_of(self.threads) if device.is_cuda else 0, dtype=wp.float64, device=device)
 
     def add_up(self, slot: int, columns: int = 1, *, launch: Launch = wp.launch) -> None:
         """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
-        source, n, device = self.partials, self.threads, self.partials.device
+        device = self.partials.device
         if device.is_cpu:  # Warp's tiles are not for several threads at a time
-            given: dict[str, Any] = {"partials": source, "count": n, "scalars": self.scalars, "slot": slot}
+            given: dict[str, Any] = {"partials": self.partials, "count": self.threads, "scalars": self.scalars, "slot": slot}
             ADD_UP.bind(Rows.flat(columns, device), **given).launch(launch)
         else:
-            if self._segments > 1:
-                inputs = [source, n, self.block, self._segments, self._folded, 0]
-                launch(add_up_kernel, columns * self._segments * self.block, inputs, device=device, block_dim=self.block)
-                source, n = self._folded, self._segments
-            inputs = [source, n, self.block, 1, self.scalars, slot]
-            launch(add_up_kernel, columns * self.block, inputs, device=device, block_dim=self.block)
+            fold(add_up_kernel, self.partials, self.threads, columns, self.scalars, slot, self._folded, launch)
         if self._across is not None:
             perform(partial(_add_across, self._across, self.scalars, slice(slot, slot + columns)), launch)
 
@@ -121,14 +160,71 @@ class Sums(Reduction):
     """
 
     def __init__(self, rows: Rows, columns: int = 1, *, slots: int = 0, across: Across | None = None) -> None:
-        self.rows, scalars = rows, wp.zeros(max(columns, slots), dtype=wp.float64, device=rows.device)
-        super().__init__(rows.size, rows.device, scalars, columns=columns, threads=rows.places, across=across)
+        self.rows, self.reading = rows, Reading(rows.device, max(columns, slots))
+        super().__init__(rows.size, rows.device, self.reading.array, columns=columns, threads=rows.places, across=across)
 
     def of(self, declared: RowPass, slot: int = 0, **given: Any) -> np.ndarray:
         """Launch a pass; return its sums, which are in `scalars` from a slot on."""
+        self.launch(declared, slot, **given)
+        return self.reading.numpy()[slot : slot + len(declared.sums)]
+
+    def launch(self, declared: RowPass, slot: int = 0, **given: Any) -> None:
+        """Launch a pass, whose sums `reading` will have from a slot on."""
         declared.bind(self.rows, **given, out=self.partials).launch()
         self.add_up(slot, columns=len(declared.sums))
-        return self.scalars.numpy()[slot : slot + len(declared.sums)]
+        self.reading.changed()
+
+
+class Tally:
+    """What a pass finds in the rows that it is given each time: sums, and the largest of something; the same bits on every run.
+
+    Args:
+        declared: the pass.
+        device: where.
+        places: of the most rows that it is given, else memory is made when they come.
+    """
+
+    def __init__(self, declared: RowPass, device: wp.Device, places: int = 0) -> None:
+        self._declared, self._columns = declared, len(declared.found)
+        self._reading = Reading(device, self._columns) if device.is_cuda else None
+        self._partials = wp.empty(self._columns * places, dtype=wp.float64, device=device)
+        self._between = wp.empty(self._columns * CUDA_SEGMENTS if device.is_cuda else 0, dtype=wp.float64, device=device)
+        self._places = 0
+
+    @property
+    def found(self) -> wp.array[Any] | None:
+        """What is found, a number a column, where it is on a GPU; None on the CPU."""
+        return None if self._reading is None else self._reading.array
+
+    def take(self, rows: Rows, **given: Any) -> None:
+        """Launch the pass over rows; what it finds replaces what was found."""
+        self._places, device = rows.places, rows.device
+        if self._partials.size < self._columns * self._places:
+            self._partials = wp.empty(self._columns * self._places, dtype=wp.float64, device=device)
+        self._declared.bind(rows, **given, out=self._partials).launch()
+        if self._reading is None:
+            return
+        sums, largest = len(self._declared.sums), len(self._declared.largest)
+        if not self._places:
+            self._reading.array.zero_()
+        elif sums:
+            fold(add_up_kernel, self._partials, self._places, sums, self._reading.array, 0, self._between)
+        if self._places and largest:
+            rest = self._partials[sums * self._places :]
+            fold(largest_kernel, rest, self._places, largest, self._reading.array, sums, self._between)
+        self._reading.changed()
+
+    def read(self, arrange: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
+        """Return what was found, a number a column.
+
+        Args:
+            arrange: gives what threads have found, shape (columns, threads), the shape in which the host adds it up, columns first.
+        """
+        if self._reading is not None:
+            return self._reading.numpy()
+        parts = arrange(self._partials.numpy()[: self._columns * self._places].reshape(self._columns, self._places))
+        sums = len(self._declared.sums)
+        return np.array([part.sum() if c < sums else part.max(initial=-np.inf) for c, part in enumerate(parts)])
 
 
 def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> None:

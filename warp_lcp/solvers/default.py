@@ -10,7 +10,7 @@ from warp_lcp.problem.protocol import HasStencil, has, takes
 from warp_lcp.problem.result import Record, SolveResult
 from warp_lcp.problem.solve import ConvexSetProblem, Solver, Workspace
 from warp_lcp.problem.solve import solve as solve_by
-from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_direct import suits
@@ -31,8 +31,8 @@ def default_method(problem: LCP) -> Solver:
 
 
 def solve(
-    problem: LCP | ConvexSetProblem, solver: Solver | None = None, *, stopping: StoppingCriteria | None = None, x0: Array | None = None,
-    workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None, **misplaced: Never,
+    problem: LCP | ConvexSetProblem, solver: Solver | None = None, *, stopping: StoppingCriteria | MeanCriteria | None = None,
+    x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None, **misplaced: Never,
 ) -> SolveResult:  # fmt: skip
     """Solve a problem by a method.
 

@@ -31,13 +31,14 @@ class Descent:
         epsilon: rounding unit of the iterate.
 
     Attributes:
+        noise: what rounding may pretend, in parts of the energy.
         sinks: whether the last step set a new least energy.
         safe: whether a projected cycle that was due has raised the energy.
         runs: runs of projected steps that were due.
     """
 
     def __init__(self, epsilon: float) -> None:
-        self._noise = NOISE * epsilon
+        self.noise = NOISE * epsilon
         self.start(0.0, 0.0)
 
     def start(self, energy: float, norm: float) -> None:
@@ -47,10 +48,15 @@ class Descent:
         self._vain, self.runs, self._left = 0, 0, 1.0
         self._fell, self._owed, self._pause, self._wait = math.inf, 0.0, 0, 1
 
+    @property
+    def standing(self) -> tuple[float, float, float, float, float]:
+        """Residual norm, the least one, energy and the least one, and by how much the last step lowered it."""
+        return self._norm, self._least, self._energy, self._lowest, self._fell
+
     def record(self, energy: float, norm: float) -> float:
         """Take note of where a step ends; return by how much it has lowered the energy, 0 if that is within rounding."""
         fell, left = self._energy - energy, norm / self._norm if self._norm > 0 else 0.0
-        margin = self._noise * (abs(self._energy) + abs(energy))
+        margin = self.noise * (abs(self._energy) + abs(energy))
         above = energy - self._lowest
         self._left, self._energy, self._norm, self.sinks, self._least = left, energy, norm, above < -margin, min(norm, self._least)
         if self.sinks:

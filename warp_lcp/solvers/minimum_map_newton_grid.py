@@ -109,7 +109,7 @@ class GridNewtonWorkspace(MultigridWorkspace):
             iterations += 1
             if residual.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations or time_is_up():
                 break
-        sinks = self._descent.sinks and self._rounded is None  # then the residual may rise
+        sinks = self.descent.sinks and self._rounded is None  # then the residual may rise
         if sinks or not residual.norm > (1 - DECREASE) * limit or not math.isfinite(residual.norm) or not self.bounded:
             return Step("newton", iterations, active, interim=sinks)
         return self._shorten(limit, iterations, active)
@@ -137,8 +137,8 @@ class GridNewtonWorkspace(MultigridWorkspace):
             length *= 0.5
             if residual.evaluate(self.x) <= (1 - DECREASE * length) * limit:
                 self._judge()
-                return Step("newton", iterations, active, interim=self._descent.sinks)
-        self._begin_cycles(self._descent.due(0))
+                return Step("newton", iterations, active, interim=self.descent.sinks)
+        self._begin_cycles(self.descent.due(0))
         return Step("monotone cycle", iterations + self.monotone_step().linear_iterations, active)
 
     def _set_length(self, old: float, new: float, whole: float) -> None:

@@ -124,6 +124,11 @@ class Pace:
         self._least.append(min(self._least[-1], norm) if self._least else norm)
 
     @property
+    def taken(self) -> int:
+        """How many residuals have been noted."""
+        return len(self._least)
+
+    @property
     def crawls(self) -> bool:
         """Whether the tolerance, or what float64 can tell from 0, is more than MOST steps away at the pace of the last ones."""
         if len(self._least) <= FIRST:

@@ -94,7 +94,7 @@ class CoupledWorkspace(MultigridWorkspace):
     @property
     def _fails(self) -> bool:
         """Whether truncated steps go round in circles or hardly move."""
-        return self._searches or self._descent.runs >= RELAPSES or self._pace.crawls
+        return self._searches or self.descent.runs >= RELAPSES or self._pace.crawls
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is none of truncated multigrid."""

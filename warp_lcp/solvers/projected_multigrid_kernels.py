@@ -9,6 +9,7 @@ import warp as wp
 from warp_lcp.multigrid.cycle_passes import ASCEND, SWEEP
 from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.rows import Bound, RowPass, Wave
+from warp_lcp.solvers.descent import CREEP, STALL
 
 # Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, and so are ZAZ ... GP.
 NORM = wp.constant(0)  # squared norm of the natural residual
@@ -128,3 +129,125 @@ def plan_whole_step_kernel(scalars: f64, searched: bool):
     scalars[STEP] = share * scalars[SIZE]
     scalars[CARRY] = wp.float64(0.0)
     rescale(scalars)
+
+
+# A row that is kept of each evaluation: NORM ... ENERGY, then these.
+ROW_STEP = wp.constant(4)
+ROW_SIZE = wp.constant(5)
+ROW = wp.constant(6)
+# Slots of what the device judges its steps by, as `descent.Descent` and the outer loop do.
+TAKEN = wp.constant(0)  # rows written
+MOST = wp.constant(1)  # rows that may be
+TOLERANCE = wp.constant(2)
+BEST = wp.constant(3)  # least norm
+LAST_NORM = wp.constant(4)
+LAST_ENERGY = wp.constant(5)
+LOWEST = wp.constant(6)  # energy
+FELL = wp.constant(7)  # by how much the last step lowered it
+NOISE = wp.constant(8)  # of the energy, relative
+JUDGED = 9
+CREEPS, STALLS = wp.constant(wp.float64(CREEP)), wp.constant(wp.float64(STALL))
+SAFELY = wp.constant(wp.float64(1.0 + 1e-9))  # what the host computes again must not come out the other way
+LEAST_RATIO, MOST_RATIO = wp.constant(wp.float64(1e-6)), wp.constant(wp.float64(1e6))
+
+
+@wp.func
+def keep_row(scalars: f64, rows: f64, n: int):
+    """Keep what an evaluation has found as row n."""
+    for c in range(4):
+        rows[n * ROW + c] = scalars[c]
+    rows[n * ROW + ROW_STEP] = scalars[STEP]
+    rows[n * ROW + ROW_SIZE] = scalars[SIZE]
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+def take_unit_kernel(scalars: f64, square: f64):
+    """Take ||b|| as the unit of right-hand sides, 1 if it is 0; no step has been taken."""
+    size = wp.sqrt(square[0])
+    scalars[SIZE] = size
+    if size == wp.float64(0.0):
+        scalars[SIZE] = wp.float64(1.0)
+    scalars[STEP] = wp.float64(0.0)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+def keep_row_kernel(scalars: f64, rows: f64, n: int):
+    """Keep what an evaluation has found as row n."""
+    keep_row(scalars, rows, n)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+def begin_kernel(
+    scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int,
+    rtol: wp.float64, atol: wp.float64, counted: f64, noise: wp.float64,
+):  # fmt: skip
+    """Begin with the guess that has been evaluated, if it misses the tolerance and is as large as b; row 0 has the reference.
+
+    The tolerance is absolute, or of the root mean square if unknowns are counted.
+    """
+    keep_row(scalars, rows, 1)
+    norm = wp.sqrt(scalars[NORM])
+    energy = wp.float64(0.5) * scalars[ENERGY]
+    absolute = atol
+    if counted:
+        absolute = atol * wp.sqrt(counted[0])
+    judged[TAKEN] = wp.float64(2.0)
+    judged[MOST] = wp.float64(most)
+    judged[TOLERANCE] = wp.max(absolute, rtol * wp.sqrt(rows[NORM]))
+    judged[BEST] = norm
+    judged[LAST_NORM] = norm
+    judged[LAST_ENERGY] = energy
+    judged[LOWEST] = energy
+    judged[FELL] = wp.float64(wp.inf)
+    judged[NOISE] = noise
+    ratio = norm / scalars[SIZE]
+    go = norm > judged[TOLERANCE] * SAFELY and ratio > LEAST_RATIO and ratio < MOST_RATIO and most > 2
+    going[0] = wp.where(go, 1, 0)
+    stale[0] = wp.where(scalars[MOVED] + rows[MOVED] > wp.float64(0.0), 1, was_stale)
+    scalars[CARRY] = wp.float64(0.0)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+def resume_kernel(
+    judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int, tolerance: wp.float64,
+    norm: wp.float64, best: wp.float64, energy: wp.float64, lowest: wp.float64, fell: wp.float64, noise: wp.float64,
+):  # fmt: skip
+    """Begin with a step, from where the host has judged."""
+    judged[TAKEN] = wp.float64(0.0)
+    judged[MOST] = wp.float64(most)
+    judged[TOLERANCE] = tolerance
+    judged[BEST] = best
+    judged[LAST_NORM] = norm
+    judged[LAST_ENERGY] = energy
+    judged[LOWEST] = lowest
+    judged[FELL] = fell
+    judged[NOISE] = noise
+    going[0] = 1
+    stale[0] = was_stale
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+def judge_kernel(scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32)):
+    """Keep what a truncated step has led to; go on if the host would take another one without a thought.
+
+    That is where the residual and the energy are the least yet, the tolerance is missed, and the free set does not creep.
+    """
+    zero = wp.float64(0.0)
+    n = int(judged[TAKEN])
+    keep_row(scalars, rows, n)
+    norm = wp.sqrt(scalars[NORM])
+    energy = wp.float64(0.5) * scalars[ENERGY]
+    fell = judged[LAST_ENERGY] - energy
+    margin = judged[NOISE] * (wp.abs(judged[LAST_ENERGY]) + wp.abs(energy))
+    go = n + 1 < int(judged[MOST]) and wp.isfinite(scalars[STEP])
+    go = go and norm > judged[TOLERANCE] * SAFELY and norm < judged[BEST] and judged[LOWEST] - energy > margin * SAFELY
+    if scalars[MOVED] > zero:
+        go = go and fell * SAFELY < CREEPS * judged[FELL] and norm * SAFELY < STALLS * judged[LAST_NORM]
+    judged[TAKEN] = wp.float64(n + 1)
+    judged[BEST] = wp.min(judged[BEST], norm)
+    judged[LAST_NORM] = norm
+    judged[LAST_ENERGY] = energy
+    judged[LOWEST] = wp.min(judged[LOWEST], energy)
+    judged[FELL] = fell
+    going[0] = wp.where(go, 1, 0)
+    stale[0] = wp.where(scalars[MOVED] > zero, 1, 0)

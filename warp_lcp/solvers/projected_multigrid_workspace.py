@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -17,12 +18,15 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.program import Launch, Program, perform
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.descent import Descent
-from warp_lcp.solvers.phases import AlgebraicSteps, Pace
+from warp_lcp.solvers.phases import FIRST, AlgebraicSteps, Pace
+from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -45,16 +49,16 @@ class AssessedResidual(NaturalResidual):
         self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
         self._rounded, self._b = rounded, problem.b
         self._away: wp.array[Any] | None = None
-        self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
+        self._reading = Reading(A.device, kernels.SLOTS)
+        self.scalars = self._reading.array
         places = A.stencil.rows.places
         self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=places, across=problem.layout.across)
         self.classify, self.stale, self.active, self.energy, self._norm_of_b = False, True, 0, 0.0, 0.0
+        self.size = 1.0  # what the right-hand side is divided by
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u); a guess is classified, a cold start is not."""
-        if self._version != self._A.version:
-            self._version, self.stale = self._A.version, True
-            self._hierarchy.refresh()
+        self.renew()
         super().start(x, keep=keep)
         ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
         for bound in (lower, upper, code):
@@ -65,6 +69,12 @@ class AssessedResidual(NaturalResidual):
             self._norm_of_b = super().norm_of_b()
             self.set(kernels.SIZE, self._norm_of_b or 1.0)
             self.set(kernels.STEP, 0.0)
+
+    def renew(self) -> None:
+        """Take the operator again if it has changed."""
+        if self._version != self._A.version:
+            self._version, self.stale = self._A.version, True
+            self._hierarchy.refresh()
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
@@ -114,13 +124,20 @@ class AssessedResidual(NaturalResidual):
 
     def read(self) -> float:
         """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number."""
-        scalars = self.scalars.numpy()
-        square, moved, active, twice = scalars[:4]
-        self.energy = 0.5 * float(twice)
+        self._reading.changed()
+        scalars = self._reading.numpy()
+        return self.take([*scalars[:4], scalars[int(kernels.STEP)], scalars[int(kernels.SIZE)]])
+
+    def take(self, row: Iterable[float], norm_of_b: float | None = None) -> float:
+        """Take what an evaluation has found, see `projected_multigrid_kernels.keep_row`; return the norm."""
+        square, moved, active, twice, step, size = map(float, row)
+        self.energy, self.size = 0.5 * twice, size
         self.norm, self.current, self.active = float(np.sqrt(square)), True, int(active)
-        if not math.isfinite(scalars[int(kernels.STEP)]):
+        if not math.isfinite(step):
             self.norm = math.nan
         self.stale = self.stale or moved > 0
+        if norm_of_b is not None:
+            self._norm_of_b = norm_of_b
         return self.norm
 
     def set(self, slot: int, value: float) -> None:
@@ -146,14 +163,39 @@ class MultigridWorkspace(IterateMemory):
         options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
         self.hierarchy = make_hierarchy(A.stencil, real, **options)
         super().__init__(problem, precision, residual=self._residual(problem, precision is Precision.SINGLE))
-        self._flat = Rows.of_fields(problem.layout)
+        self.flat = Rows.of_fields(problem.layout)
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
-        self._cycles_left, self._descent = 0, Descent(self.precision.epsilon)
+        self._cycles_left, self.descent = 0, Descent(self.precision.epsilon)
         self._tolerance, self._pace = 0.0, Pace(0.0)
         self._algebraic: AlgebraicSteps | None = None
+        self._ahead = RunAhead(self) if type(self) is MultigridWorkspace and RunAhead.suits(self) else None
+        self._allowed, self._begun = 0, False  # steps without the host; whether the device has begun the solve
+
+    def allow(self, steps: int) -> None:
+        """Say how many steps of the next solve may be taken without the host."""
+        self._allowed = steps
+
+    def begin_ahead(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria) -> float | None:
+        """Begin a solve, and take steps, without the host; return the residual at clip(0, l, u), None where nothing has begun.
+
+        Args:
+            guess: stored field.
+            criteria: of the solve.
+        """
+        if self._ahead is None or guess.ptr == self.x.ptr or self._allowed <= 0:
+            return None
+        self.floating = None
+        reference = self._ahead.begin(guess, criteria, min(self._allowed, FIRST))
+        self._begun = reference is not None
+        return reference
+
+    @property
+    def exact(self) -> bool:
+        """Whether x is no more than a step from where it was before one."""
+        return self.floating is None and self._rounded is None
 
     def _residual(self, problem: LCP, rounded: bool) -> AssessedResidual:
         return AssessedResidual(problem, self.A, self.hierarchy, rounded=rounded)
@@ -178,15 +220,13 @@ class MultigridWorkspace(IterateMemory):
 
     def _leave(self) -> None:
         """Store the best iterate before x leaves it behind: it was x, or one step ago."""
-        exact = self.floating is None and self._rounded is None  # else x is more than a step from it
-        if not self._stored and self._past == (1 if exact else 0):
-            self._keep_stored(by_undoing=exact)
+        if not self._stored and self._past == (1 if self.exact else 0):
+            self._keep_stored(by_undoing=self.exact)
         self._past += 1
 
     def _store(self) -> None:
         """Keep the best iterate in memory of its own: x is about to change by more than can be taken back."""
-        exact = self.floating is None and self._rounded is None
-        if not self._stored and self._past <= (1 if exact else 0):
+        if not self._stored and self._past <= (1 if self.exact else 0):
             self._keep_stored(by_undoing=self._past == 1)
 
     def _keep_stored(self, *, by_undoing: bool) -> None:
@@ -203,18 +243,20 @@ class MultigridWorkspace(IterateMemory):
         """Write where the last step began."""
         p, scalars = self.problem, self.residual.scalars
         fields = {"x": self.x, "q": self._p, "unknown": p.unknown, "before": out}
-        kernels.UNDO.bind(self._flat, bounds=p.bounds.operands, scalars=scalars, **fields).launch(wp.launch)
+        kernels.UNDO.bind(self.flat, bounds=p.bounds.operands, scalars=scalars, **fields).launch(wp.launch)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; the operator may have changed."""
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
-        self._descent.start(self.residual.energy, self.residual.norm)
+        self.descent.start(self.residual.energy, self.residual.norm)
         self._tolerance, self._pace, self._algebraic = tolerance, Pace(tolerance), None
+        if self._begun:
+            self._begun = False
+            return
         self._forget()
         if self.scratch is not None:
-            UNMARK.bind(self._flat, changed=self.scratch[1]).launch()
-        size = float(self.residual.scalars.numpy()[int(kernels.SIZE)])
-        rescale = not 1e-6 < self.residual.norm / size < 1e6  # corrections in float32 would overflow, or vanish
+            UNMARK.bind(self.flat, changed=self.scratch[1]).launch()
+        rescale = not 1e-6 < self.residual.norm / self.residual.size < 1e6  # corrections in float32 would overflow, or vanish
         if rescale:
             self.residual.set(kernels.SIZE, self.residual.norm)
         if self.floating is not None:
@@ -233,8 +275,7 @@ class MultigridWorkspace(IterateMemory):
         if self._algebraic is not None:
             return True
         self._pace.record(self.residual.norm)
-        exact = self.floating is None and self._rounded is None
-        if not self._pace.crawls or not exact or self.problem.layout.across is not None:
+        if not self._pace.crawls or not self.exact or self.problem.layout.across is not None:
             return False
         return self.residual.norm > FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
 
@@ -253,7 +294,7 @@ class MultigridWorkspace(IterateMemory):
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
         if self._cycles_left == 0 and self.bounded:
-            due = self._descent.due(self.settings.patience)  # an active set can go round in a circle
+            due = self.descent.due(self.settings.patience)  # an active set can go round in a circle
             if due:
                 self._begin_cycles(due)
         return self._cycles_left > 0
@@ -267,14 +308,15 @@ class MultigridWorkspace(IterateMemory):
 
     def monotone_step(self) -> Step:
         """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
-        p, finest, descent = self.problem, self.hierarchy.finest, self._descent
+        p, finest, descent = self.problem, self.hierarchy.finest, self.descent
         self._rebuild()
         self._leave()
         fields = {"x": self.x, "unknown": p.unknown, "lo": finest.lower, "hi": finest.upper, "scalars": self.residual.scalars}
-        kernels.GAPS.bind(self._flat, bounds=p.bounds.operands, **fields).launch(wp.launch)
+        kernels.GAPS.bind(self.flat, bounds=p.bounds.operands, **fields).launch(wp.launch)
         (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
         self._plan_monotone_step()
         self._cycles_left -= 1
+        self._allowed -= 1
         self._classify_next()
         self._advance()
         self.residual.read()
@@ -292,42 +334,55 @@ class MultigridWorkspace(IterateMemory):
     def truncated_step(self) -> Step:
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
         active = self.residual.active
-        self._rebuild()
         self._leave()
         self.residual.classify = True
-        if self.floating is None and self._rounded is None:
-            self._program().run()
-        else:
-            self._cycle()
-            self._measure()
-            self._advance(settle=True)
-        self.residual.read()
+        self._allowed -= 1
+        if not self._has_run_ahead():
+            self._rebuild()
+            if self.exact:
+                self.step_program().run()
+            else:
+                self._cycle()
+                self._measure()
+                self._advance(settle=True)
+            self.residual.read()
         if self.floating is not None:
             self._project()
         if self._creeps():
             self._begin_cycles(1)
-        return Step("truncated cycle", 1, active, interim=self._descent.sinks)
+        return Step("truncated cycle", 1, active, interim=self.descent.sinks)
+
+    def _has_run_ahead(self) -> bool:
+        """Let the device take a step, and those that follow it; return whether it has, and take over what came of one."""
+        ahead, left = self._ahead, min(self._allowed + 1, FIRST - self._pace.taken)
+        if ahead is None or not self.exact or not (ahead.rows or (left > 0 and ahead.steps(self._tolerance, left))):
+            return False
+        self.residual.stale = False
+        self.residual.take(ahead.rows.popleft())
+        return True
 
     def _creeps(self) -> bool:
         """Judge a truncated step; return whether a projected cycle should follow."""
-        return self._descent.creeps(self._judge(), moved=self.bounded and self.residual.stale)
+        return self.descent.creeps(self._judge(), moved=self.bounded and self.residual.stale)
 
     def _judge(self) -> float:
         """Let the energy judge the step that has been evaluated; return by how much it has lowered it."""
-        return self._descent.record(self.residual.energy, self.residual.norm)
+        return self.descent.record(self.residual.energy, self.residual.norm)
 
     def _cycle(self) -> None:
         """Run a cycle on the right-hand side."""
         self.hierarchy.cycle.run()
 
-    def _program(self) -> Program:
+    def step_program(self) -> Program:
         """Return the launches of a truncated cycle; bounds in place may be coded now and not in the next solve."""
         key = self._program_key()
         program = self._programs.get(key)
         if program is None:
-            program = self._programs[key] = Program(self.A.device)
+            program, before = Program(self.A.device), self.residual.classify
+            self._programs[key], self.residual.classify = program, True
             self._correct(program)
             self.residual.advance(self.x, self._p, launch=program.launch)
+            self.residual.classify = before
         return program
 
     def _program_key(self) -> tuple[Any, ...]:
@@ -383,7 +438,7 @@ class MultigridWorkspace(IterateMemory):
 
     def _advance(self, *, settle: bool = False) -> None:
         """Take the planned step and evaluate the residual there."""
-        if self.floating is None and self._rounded is None:
+        if self.exact:
             self.residual.advance(self.x, self._p)
             return
         self.residual.update(self.x, self._p)
@@ -408,5 +463,5 @@ class MultigridWorkspace(IterateMemory):
         free = self.hierarchy.finest.stencil.d
         if self._mask is None:
             self._mask = self.problem.layout.zeros(wp.uint8)
-        kernels.MASK.bind(self._flat, free=free, mask=self._mask).launch()
+        kernels.MASK.bind(self.flat, free=free, mask=self._mask).launch()
         self.floating.project(self.hierarchy.finest.b, self._mask)

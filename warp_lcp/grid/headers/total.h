@@ -1,18 +1,23 @@
-// Add up particles: [0] |v|^2, [1-3] x, [4-6] lowest, [7-9] highest x, [10] largest |v|^2, [11-12] bad x and v, [13-15] v.
+// Add up particles: |v|^2, x, bad x and v, v; the largest |v|^2, highest x and lowest x with the other sign. On CUDA a thread takes every
+// `chunks`-th, its neighbor the next.
 #ifdef __CUDA_ARCH__
 enum { LANES = 1 };
 #else
 enum { LANES = 16 };
 #endif
 const T* position = (const T*)given.position.data; const T* velocity = (const T*)given.velocity.data;
-double* sums = given.sums.data + 16*c_;
+#ifdef __CUDA_ARCH__
+const int begin = c_, end = L.nx, stride = L.chunks;
+#else
+const int begin = first, end = last, stride = LANES;
+#endif
 double squares[LANES], sum[3][LANES], way[3][LANES]; T low[3][LANES], high[3][LANES], fastest[LANES]; int bad_x[LANES], bad_v[LANES];
 for (int m = 0; m < LANES; ++m) {
     squares[m] = 0; fastest[m] = 0; bad_x[m] = 0; bad_v[m] = 0;
-    for (int d = 0; d < 3; ++d) { sum[d][m] = way[d][m] = 0; low[d][m] = high[d][m] = position[3*(long long)first + d]; }
+    for (int d = 0; d < 3; ++d) { sum[d][m] = way[d][m] = 0; low[d][m] = high[d][m] = position[3*(long long)begin + d]; }
 }
-for (int start = first; start < last; start += LANES) {
-    const int n = last - start < LANES ? last - start : (int)LANES;
+for (int start = begin; start < end; start += stride) {
+    const int n = end - start < LANES ? end - start : (int)LANES;
     const T* X = position + 3*(long long)start; const T* V = velocity + 3*(long long)start;
     SIMD for (int m = 0; m < n; ++m) {
         const T x = X[3*m], y = X[3*m + 1], z = X[3*m + 2], u = V[3*m], v = V[3*m + 1], w = V[3*m + 2];
@@ -36,5 +41,6 @@ for (int m = 1; m < LANES; ++m) {
         low[d][0] = low[d][m] < low[d][0] ? low[d][m] : low[d][0]; high[d][0] = high[d][m] > high[d][0] ? high[d][m] : high[d][0];
     }
 }
-sums[0] = squares[0]; sums[10] = fastest[0]; sums[11] = bad_x[0]; sums[12] = bad_v[0];
-for (int d = 0; d < 3; ++d) { sums[1 + d] = sum[d][0]; sums[4 + d] = low[d][0]; sums[7 + d] = high[d][0]; sums[13 + d] = way[d][0]; }
+energy = squares[0]; top = fastest[0]; lost = bad_x[0]; wild = bad_v[0];
+x = sum[0][0]; y = sum[1][0]; z = sum[2][0]; u = way[0][0]; v = way[1][0]; w = way[2][0];
+high_x = high[0][0]; high_y = high[1][0]; high_z = high[2][0]; low_x = -low[0][0]; low_y = -low[1][0]; low_z = -low[2][0];

@@ -5,7 +5,6 @@ const bool walls = distance != nullptr, deep = planes == 2;
 auto smaller = [](T a, T b) { return a < b ? a : b; };
 auto larger = [](T a, T b) { return a < b ? b : a; };
 T low[M + 2], high[M + 2], near[M + 1], far[M + 1];
-double total = 0;
 for (int start = first; start < last; start += M) {
     const int n = last - start < M ? last - start : (int)M;
     SIMD for (int m = 0; m < n + 2; ++m) { low[m] = phi[start + m - 1]; high[m] = phi[start + m - 1]; }
@@ -24,7 +23,7 @@ for (int start = first; start < last; start += M) {
         const bool shut = walls ? larger(far[m], far[m + 1]) <= 0 : known[i] != 1;
         if (least >= 0 || shut) continue;
         const bool clear = smaller(near[m], near[m + 1]) >= 0;
-        if (most < 0 && clear) { total += 1; continue; }
+        if (most < 0 && clear) { volume += 1; continue; }
         const T step = (T)1/(T)parts;
         T sum = 0;
         for (int c = 0; c < (deep ? parts : 1); ++c) for (int b = 0; b < parts; ++b) for (int a = 0; a < parts; ++a) {
@@ -43,7 +42,6 @@ for (int start = first; start < last; start += M) {
             const T open = clear ? (T)1 : (T)0.5 + between(node + i, x, y, z)*(T)parts;
             sum += smaller(larger(wet, 0), 1)*smaller(larger(open, 0), 1);
         }
-        total += (double)(sum*step*step*(deep ? step : (T)1));
+        volume += (double)(sum*step*step*(deep ? step : (T)1));
     }
 }
-sums[k*given.phi.shape[1] + j] = total;

@@ -1,5 +1,5 @@
-// A row's sums: [0] of what cells hold too much, [1] 1 and the most above what fits, [2] of all that they hold.
-double above = 0.0, all = 0.0; float worst = -1.0f, over[M];
+// What cells hold too much, `above`, all that they hold, and 1 and the most above what fits, `densest`.
+float worst = -1.0f, over[M];
 for (int start = first; start < last; start += M) {
     const int n = last - start < M ? last - start : M;
     SIMD8 for (int m = 0; m < n; ++m) {
@@ -11,5 +11,4 @@ for (int start = first; start < last; start += M) {
     }
     for (int m = 0; m < n; ++m) worst = over[m] > worst ? over[m] : worst;
 }
-double* out = sums + COLUMNS*(k*(long long)given.base.shape[1] + j);
-out[0] = above; out[1] = 1.0 + (double)worst; out[2] = all;
+densest = 1.0 + (double)worst;

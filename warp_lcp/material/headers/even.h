@@ -1,4 +1,4 @@
-// Equations instead of bounds for cells with material all around them; a row's sums: [2] such cells that hold too little.
+// Equations instead of bounds for cells with material all around them; `lacks`: such cells that hold too little.
 int lacking = 0; unsigned char around[M];
 for (int start = first; start < last; start += M) {
     const int n = last - start < M ? last - start : M;
@@ -17,4 +17,4 @@ for (int start = first; start < last; start += M) {
         lacking += (int)(fills > 0.0);
     }
 }
-sums[COLUMNS*(k*(long long)given.kind.shape[1] + j) + 2] = lacking;
+lacks = lacking;

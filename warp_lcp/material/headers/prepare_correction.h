@@ -1,6 +1,6 @@
-// Unknowns, right-hand side and guess; a row's sums: [0] over-full cells, [1] 1 and the most above what fits, [2] 0.
+// Unknowns, right-hand side and guess; over-full cells, and 1 and the most above what fits, `densest`.
 const int even = inside != nullptr;
-int full = 0; float worst = -1.0f, over[M];
+int fuller = 0; float worst = -1.0f, over[M];
 for (int start = first; start < last; start += M) {
     const int n = last - start < M ? last - start : M;
     SIMD8 for (int m = 0; m < n; ++m) {
@@ -10,12 +10,11 @@ for (int start = first; start < last; start += M) {
         b[i] = has ? (double)free : 0.0;
         x[i] = has & (even | (int)(x[i] > 0.0)) ? x[i] : 0.0;
         over[m] = has ? density[i] - capacity[i] : -1.0f;
-        full += has & (int)(free < 0.0f);
+        fuller += has & (int)(free < 0.0f);
     }
     for (int m = 0; m < n; ++m) worst = over[m] > worst ? over[m] : worst;
 }
 if (even) SIMD for (int i = first; i < last; ++i)
     inside[i] = (unsigned char)((base[i] == SOLID) | (int)(density[i] >= (float)HALF*capacity[i]));
 if (even & (int)(contact != nullptr)) SIMD for (int i = first; i < last; ++i) inside[i] &= contact[i] != RELEASED;
-double* out = sums + COLUMNS*(k*(long long)given.kind.shape[1] + j);
-out[0] = full; out[1] = 1.0 + (double)worst; out[2] = 0.0;
+full = fuller; densest = 1.0 + (double)worst;

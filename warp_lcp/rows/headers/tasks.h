@@ -1,6 +1,9 @@
 // Tasks, a row's chunk each in a slab of planes, from (i_, j_, c_) on: one a thread on CUDA, as many as a team's thread takes on the CPU.
 // The body that follows ends with three braces.
 const int per_plane_ = L.rows*L.chunks; int i_ = slab_, at_ = row_*L.chunks + chunk_;
+#ifdef __CUDA_ARCH__
+double total_[FOUND ? FOUND : 1];
+#endif
 for (int left_ = count_, here_; left_ > 0; left_ -= here_, ++i_, at_ = 0) {
     here_ = left_ < per_plane_ - at_ ? left_ : per_plane_ - at_;
     for (int k_i = i_*L.slab; k_i < (i_ + 1)*L.slab && k_i < L.planes; ++k_i) {
