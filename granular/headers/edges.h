@@ -1,6 +1,6 @@
 // What edges read and change of the velocity.
 #include "light.h"
-const float* share[3] = XYZ(share); T* u[3] = XYZ(u);
+const float* share[3] = FIELDS(share); T* u[3] = FIELDS(u);
 auto rate = [&](int d, long long o) {
     const int a = ALPHA[d], b = BETA[d];
     return (u[a][o] - u[a][o - s[b]]) + (u[b][o] - u[b][o - s[a]]);

@@ -13,8 +13,9 @@ for (int c = 0; c < COLUMNS; ++c) partial[c*columns] = 0;
 #include "span.h"
 #include "rate_bound.h"
 #include "yield.h"
-const float* share[3] = XYZ(share); const float* mass[3] = XYZ(mass); const float* inverse[3] = XYZ(inverse);
-const T* rate[3] = XYZ(edge); const T* u[3] = XYZ(u);
+const float* share[3] = FIELDS(share); const float* mass[3] = FIELDS(mass); const float* inverse[3] = FIELDS(inverse);
+const T* rate[3] = FIELDS(edge); const T* u[3] = FIELDS(u);
+FIELD(flags) FIELD(now) FIELD(before) FIELD(point) FIELD(drive) FIELD(stiff) FIELD(openings)
 #include "divergence.h"
 const T beta_x = RESIDUAL ? (T)0 : (T)momentum[NOW_X], beta_s = RESIDUAL ? (T)0 : (T)momentum[NOW_S];
 const T ahead_x = (T)momentum[NEXT_X]*(T)numbers[LOOKAHEAD], ahead_s = (T)momentum[NEXT_S]*(T)numbers[LOOKAHEAD];
@@ -26,7 +27,7 @@ auto start = [&](int c, long long i, T beta) INLINE {
     return RESIDUAL ? x : x + beta*(x - (T)before[c*layer + i]);
 };
 T x_es = 0, x_ee = 0, x_ss = 0, s_es = 0, s_ee = 0, s_ss = 0, x_residual = 0, s_residual = 0;
-MASKED for (int i = begin; i < end; ++i) {
+MASKED for (int i = begin + ROW; i < END + ROW; ++i) {
     const int sand = flags[i] & HOLDS, dense = flags[i] & SHEARS_HERE, firm = flags[i] & FIRM;
     T diagonal = 0, e[DIM], mean = 0;
     const T w = divergence(i, diagonal);
@@ -59,9 +60,10 @@ MASKED for (int i = begin; i < end; ++i) {
         sums(m[0], m[1], m[2], m[3], largest[d]);
     }
     const T shrink = yield(normal2, largest, r, gain_at(x), half_at(x), soft, cap), keep = sheared ? shrink : (T)0;
+    const int cell = AGAIN(keep, i);
     T es = 0, ee = 0, ss = 0;
     auto put = [&](int c, T value, T from, T weight, T ahead, int held) INLINE {  // held: the copies on walls are the walls'
-        const long long at = c*layer + i;
+        const long long at = c*layer + cell;
         const float old = now[at], earlier = before[at], ahead_of = point[at];
         const T s_ = value - (T)old, e_ = value - from, share_ = held ? (T)0 : weight;
         es += share_*e_*s_; ee += share_*e_*e_; ss += share_*s_*s_;
@@ -72,12 +74,12 @@ MASKED for (int i = begin; i < end; ++i) {
             point[at] = held ? ahead_of : (float)(value + ahead*s_);
         }
     };
-    UNROLL for (int c = 0; c < NORMALS; ++c) put(1 + c, n[c]*keep, start(1 + c, i, beta_s), DIM == 2 ? (T)1 : (T)0.5, ahead_s, 0);
+    UNROLL for (int c = 0; c < NORMALS; ++c) put(1 + c, n[c]*keep, start(1 + c, cell, beta_s), DIM == 2 ? (T)1 : (T)0.5, ahead_s, 0);
     UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int q = 0; q < 4; ++q) {
-        const long long o = i + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]];
+        const long long o = cell + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]];
         const int c = FIRST + 4*d + q;
         const T limit = sheared ? cap[d] : (T)0, cut = larger(smaller(b[d][q], limit), -limit);
-        put(c, cut, start(c, i, beta_s), (T)0.25, ahead_s, share[d][o] < 0.0f);
+        put(c, cut, start(c, cell, beta_s), (T)0.25, ahead_s, share[d][o] < 0.0f);
     }
     s_es += (T)stiff[i]*es; s_ee += (T)stiff[i]*ee; s_ss += (T)stiff[i]*ss;
     s_residual += RESIDUAL ? ss : ee;

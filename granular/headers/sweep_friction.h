@@ -3,7 +3,8 @@
 #include "rate_bound.h"
 #include "yield.h"
 #include "edges.h"
-for (int i = first; i < last; ++i) {
+FIELD(flags) FIELD(now) FIELD(stiff)
+for (int i = first + ROW; i < last + ROW; ++i) {
     if (!(flags[i] & SHEARS_HERE) || !(stiff[i] > 0.0f)) continue;
     float* stress = now + i;
     const T x = (T)stress[0], radius = larger((T)numbers[FRICTION]*x + (T)numbers[COHESION], (T)0);
@@ -30,22 +31,26 @@ for (int i = first; i < last; ++i) {
         sums(m[0], m[1], m[2], m[3], largest[d]);
     }
     const T shrink = yield(normal2, largest, r, gain_at(x), half_at(x), soft, cap), keep = radius > (T)LEAST_RADIUS ? shrink : (T)0;
+    const int cell = AGAIN(keep, i);
+    float* again = now + cell;
     for (int m = 0; m < NORMALS; ++m) {
-        const float fresh = (float)(n[m]*keep); const T by = (T)fresh - (T)stress[(1 + m)*layer];
-        stress[(1 + m)*layer] = fresh;
+        const float fresh = (float)(n[m]*keep); const T by = (T)fresh - (T)again[(1 + m)*layer];
+        again[(1 + m)*layer] = fresh;
         for (int axis = 0; axis < DIM; ++axis) {
             if (DIM == 3 && axis != m) continue;
             const T sign = DIM == 2 && axis == 1 ? (T)-1 : (T)1;
-            u[axis][i + s[axis]] -= sign*(T)inverse[axis][i + s[axis]]*by;
-            u[axis][i] += sign*(T)inverse[axis][i]*by;
+            u[axis][cell + s[axis]] -= sign*(T)inverse[axis][cell + s[axis]]*by;
+            u[axis][cell] += sign*(T)inverse[axis][cell]*by;
         }
     }
     for (int d = 0; d < SHEARS; ++d) for (int q = 0; q < 4; ++q) {
-        if (!(part[d][q] > (T)0)) continue;
+        const long long o = cell + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]];
+        const T weight = share[d][o];
+        if (!(weight > (T)0)) continue;
         const T limit = radius > (T)LEAST_RADIUS ? cap[d] : (T)0, cut = larger(smaller(b[d][q], limit), -limit);
-        float* slot = stress + (FIRST + 4*d + q)*layer;
-        const float fresh = (float)cut; const T by = part[d][q]*((T)fresh - (T)slot[0]);
+        float* slot = again + (FIRST + 4*d + q)*layer;
+        const float fresh = (float)cut; const T by = weight*((T)fresh - (T)slot[0]);
         slot[0] = fresh;
-        shear(d, at[d][q], by);
+        shear(d, o, by);
     }
 }

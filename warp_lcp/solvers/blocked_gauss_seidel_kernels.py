@@ -163,39 +163,15 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
                 state[p] = AT_UPPER
         solved = int(0)
         out = x
-        going = int(1)
+        sets = int(1)
+        for _ in range(n):
+            sets = sets * 3
+        code = int(-1)  # of the set; below 0: the one that the last asked for. One place solves, or CUDA keeps what it takes twice
         count = int(0)
-        while going == 1:
-            z = solve_set(a, low, high, state, n)
-            going = 0
-            if z[m] > ZERO:
-                v = vector()
-                for p in range(n):
-                    v[p] = z[p]
-                new = wanted(a, low, high, v, state, n)
-                first = int(-1)
-                for p in range(n):
-                    q = n - 1 - p
-                    if new[q] != state[q]:
-                        first = q
-                if first < 0:
-                    solved = 1
-                    out = v
-                elif count < 8 * n + 8:
-                    going = 1
-                    if count <= n:
-                        state = new
-                    else:
-                        state[first] = new[first]
-            count += 1
-        if solved == 0:
-            sets = int(1)
-            for _ in range(n):
-                sets = sets * 3
-            code = int(0)
-            while code < sets:
+        while code < sets:
+            possible = int(1)
+            if code >= 0:
                 rest = code
-                possible = int(1)
                 for p in range(n):
                     state[p] = rest % 3
                     rest = rest // 3
@@ -205,21 +181,31 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
                     if state[p] == AT_UPPER:
                         if high.constant[p] > INFINITE:
                             possible = 0
-                if possible == 1:
-                    z = solve_set(a, low, high, state, n)
-                    if z[m] > ZERO:
-                        v = vector()
-                        for p in range(n):
-                            v[p] = z[p]
-                        new = wanted(a, low, high, v, state, n)
-                        same = int(1)
-                        for p in range(n):
-                            if new[p] != state[p]:
-                                same = 0
-                        if same == 1:
-                            solved = 1
-                            out = v
-                            code = sets
+            going = int(0)
+            if possible == 1:
+                z = solve_set(a, low, high, state, n)
+                if z[m] > ZERO:
+                    v = vector()
+                    for p in range(n):
+                        v[p] = z[p]
+                    new = wanted(a, low, high, v, state, n)
+                    first = int(-1)
+                    for p in range(n):
+                        q = n - 1 - p
+                        if new[q] != state[q]:
+                            first = q
+                    if first < 0:
+                        solved = 1
+                        out = v
+                        code = sets
+                    elif code < 0 and count < 8 * n + 8:
+                        going = 1
+                        if count <= n:
+                            state = new
+                        else:
+                            state[first] = new[first]
+            count += 1
+            if going == 0:
                 code += 1
         if solved == 0:
             for p in range(n):
