@@ -173,7 +173,8 @@ def arrays_of(value, kind, found):
     """Collect the addresses of arrays in a parameter, in structs and in tables of structs, with their bytes and element types."""
     if isinstance(value, array_t):
         dtype, shape = getattr(kind, "dtype", None), [value.shape[i] for i in range(value.ndim)]
-        size = max((n * abs(value.strides[i]) for i, n in enumerate(shape)), default=0) if value.data and all(shape) else 0
+        item = ctypes.sizeof(dtype.ctype) if isinstance(dtype, codegen.Struct) else wp.types.type_size_in_bytes(dtype)
+        size = sum((n - 1) * abs(value.strides[i]) for i, n in enumerate(shape)) + item if value.data and all(shape) else 0
         if size > found.get(value.data, (0, None))[0]:
             found[value.data] = size, dtype
         if size and isinstance(dtype, codegen.Struct) and value.ndim == 1:

@@ -1,8 +1,9 @@
 """A verdict on a GPU from one command, in the source tree: `python -m benchmarks.gpu`; one page is left in out/gpu.
 
-What holds on the CPU must hold on the device: equal answers, the same bits in every run, graphs as launches, odd grids, hundreds of steps,
-memory that stays. Then times, beside what `benchmarks/gpu_model.py` foretold, and which share of the bandwidth kernels reach. A claim that
-fails is written down like one that holds. `--rehearse` does all of it on the CPU in CUDA's form (`benchmarks/emulated_cuda.py`).
+What holds on the CPU must hold on the device: equal answers, of each kernel too, the same bits in every run, graphs as launches, odd grids,
+hundreds of steps, memory that stays. Then times, beside what `benchmarks/gpu_model.py` foretold, and which share of the bandwidth kernels
+reach. A claim that fails is written down like one that holds. `--rehearse` does all of it on the CPU in CUDA's form
+(`benchmarks/emulated_cuda.py`).
 """
 
 import importlib
@@ -38,6 +39,7 @@ from warp_lcp.benchmarks.problems import natural, splash
 from warp_lcp.rows.program import Program
 
 CLOSE, ALIKE = 1e-5, 2e-2  # relative: solutions to 1e-8, and where particles are after many steps
+WRONG = 3  # what `benchmarks.gpu_kernels` ends with where kernels differ
 CAPTURE_LAUNCH = wp.capture_launch
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -82,6 +84,7 @@ class Verdict:
     def all(self) -> None:
         """Try everything."""
         self.claim("answers equal the CPU's", self.agreement)
+        self.claim("kernels agree with the CPU's, one by one", self.each_kernel)
         self.claim("residuals by NumPy", self.residuals)
         self.claim("the same bits in every run", self.repeats)
         self.claim("graphs do what launches do", self.graphs)
@@ -111,6 +114,14 @@ class Verdict:
         assert not wrong, "; ".join(sorted(wrong))
         assert worst > 0.0, "every bit is the CPU's: this was no other device"
         return f"{len(found)} cases, at most {worst:.1g} of what is allowed"
+
+    def each_kernel(self) -> str:
+        """Launch each kernel here and there on equal arrays, in a process of its own: what crashes there leaves this page."""
+        command = [sys.executable, "-m", "benchmarks.gpu_kernels", self.device, *["--rehearse"] * self.rehearsal]
+        done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=900)
+        said = (done.stdout.splitlines() or [""])[-1]
+        assert done.returncode == 0, said if done.returncode == WRONG else f"ended with {done.returncode}: {done.stderr[-500:]}"
+        return said
 
     def residuals(self) -> str:
         """Evaluate residuals of a splash by no code of the solvers."""

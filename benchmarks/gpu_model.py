@@ -2,8 +2,8 @@
 
 Every launch of CUDA's form is heard on the CPU (`benchmarks/emulated_cuda.py`), with the bytes of the fields that its pass declares, each
 counted once. A launch takes as long as its bytes at `SHARE` of the memory's bandwidth, and no less than its latency; small levels take a
-barrier a stage; the host waits for each readback. The pass over 128^3 cells stands for larger grids, of which each has launches for another
-level. Nothing here has been measured on a GPU.
+barrier a stage; the host waits for each readback. The two passes that compute most in float64 take as long as that takes, if it is longer.
+What is heard stands for larger grids, each of which has launches for another level. Nothing here has been measured on a GPU.
 """
 
 from benchmarks import emulated_cuda  # before the package
@@ -33,7 +33,10 @@ from warp_lcp.scene.simulator import simulators
 SHARE = 0.8  # of the bandwidth of data sheets that streaming kernels reach
 RECORDED, LAUNCHED = 2.0, 12.0  # [us] a launch in a graph, and one from Python
 BARRIER, READBACK = 1.5, 15.0  # [us]
-GPUS = {"H100 SXM": 3350.0, "H200": 4800.0, "RTX 4090": 1008.0, "RTX 4070 laptop": 256.0}  # GB/s
+GPUS = {  # bandwidth [GB/s], and float64 instructions [10^9 a second]
+    "H100 SXM": (3350.0, 16_700.0), "H200": (4800.0, 16_700.0), "RTX 4090": (1008.0, 645.0), "RTX 4070 laptop": (256.0, 158.0),
+}  # fmt: skip
+FLOAT64 = {"assess": 32 / 25, "update": 17 / 29}  # such instructions a byte of the passes that have many, see `benchmarks.two_floats`
 STEPS, HEARD = 10, 5  # of the dam break: until it moves, and those that are heard
 SIZES = (128, 256, 512, 1024)
 
@@ -56,10 +59,11 @@ class Work:
     stages: int = 0
     readbacks: int = 0
 
-    def ms(self, bandwidth: float) -> float:
-        """Return the time [ms] at a bandwidth [GB/s]."""
+    def ms(self, bandwidth: float, float64: float) -> float:
+        """Return the time [ms] at a bandwidth [GB/s] and a rate of instructions in float64 [10^9/s]."""
         least = np.where(self.graph, RECORDED, LAUNCHED)
-        moved = np.array(self.bytes) / (SHARE * bandwidth * 1e3)
+        slow = np.array([FLOAT64.get(name.rpartition(":")[2], 0.0) for name in self.names]) / float64
+        moved = np.array(self.bytes) * np.maximum(1 / (SHARE * bandwidth), slow) / 1e3
         return float(np.maximum(least, moved).sum() + BARRIER * self.stages + READBACK * self.readbacks) / 1e3
 
     def grown(self, before: "Work", levels: int) -> "Work":
@@ -187,10 +191,10 @@ def step(n: int) -> Work:
 def table(small: Work, large: Work, n: int, times: int = 1) -> str:
     """Return a table of sizes and devices for one of some `times`, from the work at n / 2 and at n."""
     lines = [f"| cells | launches | GB | {' | '.join(GPUS)} |", "|---|---|---|" + "---|" * len(GPUS)]
-    for size in SIZES:
-        work = large.grown(small, int(np.log2(size / n))) if size > n else large
+    for size in (s for s in SIZES if s >= n // 2):
+        work = large.grown(small, int(np.log2(size / n))) if size > n else large if size == n else small
         columns = [f"{len(work.bytes) / times:.0f}", f"{sum(work.bytes) / times / 1e9:.2f}"]
-        columns += [f"{work.ms(bandwidth) / times:.1f}" for bandwidth in GPUS.values()]
+        columns += [f"{work.ms(*rates) / times:.1f}" for rates in GPUS.values()]
         lines.append(f"| {size}^3 | {' | '.join(columns)} |")
     return "\n".join(lines)
 
@@ -199,13 +203,17 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cells", type=int, default=128, help="along an axis of what is heard")
-    n = parser.parse_args().cells
+    parser.add_argument("--step-cells", type=int, help="the same of steps; as many")
+    given = parser.parse_args()
+    n, cells = given.cells, given.step_cells or given.cells
     (small, _), (large, iterations) = solve(n // 2), solve(n)
     print(f"A cold solve to 1e-6 [ms]: {iterations} iterations, {large.readbacks} readbacks, {large.stages} stages of small levels\n")
     print(table(small, large, n))
-    before, after = step(n // 2), step(n)
+    before, after = step(cells // 2), step(cells)
     print(f"\nA step of the dam break [ms]: {after.readbacks / HEARD:.0f} readbacks, {after.stages / HEARD:.0f} stages\n")
-    print(table(before, after, n, HEARD))
+    print(table(before, after, cells, HEARD))
+    print("\nWhat moves most in a solve\n")
+    print(large.passes())
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ def test_projected_sweeps_lower_the_energy_from_anywhere():
     work._begin_cycles(300)
     energies, norms = [work.residual.energy], [work.residual.norm]
     for _ in range(300):
-        work._descent.safe = True
+        work.descent.safe = True
         work.monotone_step()
         energies.append(work.residual.energy)
         norms.append(work.residual.norm)

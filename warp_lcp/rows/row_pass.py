@@ -316,8 +316,8 @@ class Form:
         if d.stencil:
             each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz", "known")]
             each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
-        sums = [f"const double all_[] = {{{', '.join(f'(double){s}' for s in d.found)}}}; double* sums_ = given.out.data + P.t;"]
-        sums += [text(HEADERS / "sums.h")]
+        sums = [f"#define EACH_FOUND(DO) {' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}", text(HEADERS / "sums.h")]
+        sums += ["#undef EACH_FOUND"]
         common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
         before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', *each]
         body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass

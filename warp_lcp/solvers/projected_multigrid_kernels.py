@@ -25,13 +25,14 @@ SIZE = wp.constant(9)  # corrections are computed for a right-hand side divided 
 BETA = wp.constant(10)
 STEP = wp.constant(11)  # x moved by this multiple of the direction
 CARRY = wp.constant(12)  # 0: forget the search direction
-SLOTS = 13
+PER_SIZE = wp.constant(13)  # 1 / SIZE: a division takes a GPU as long as the residual does, which each cell would make
+SLOTS = 14
 LEAST_REST = wp.constant(wp.float64(1e-3))  # of a correction's energy that must not lie along the last direction: else cancellation
 
 f64 = wp.array(dtype=wp.float64)
 
 HEADERS = Path(__file__).parent / "headers"
-SLOT = {"SIZE": SIZE, "BETA": BETA, "STEP": STEP}
+SLOT = {"SIZE": SIZE, "BETA": BETA, "STEP": STEP, "PER_SIZE": PER_SIZE}
 PRODUCTS = ("zaz", "zap", "gz", "gp")
 
 UPDATE = RowPass(
@@ -113,6 +114,7 @@ def rescale(scalars: f64):
     """Take the norm of the residual as the next right-hand side's unit."""
     if scalars[NORM] > wp.float64(0.0):
         scalars[SIZE] = wp.sqrt(scalars[NORM])
+        scalars[PER_SIZE] = wp.float64(1.0) / scalars[SIZE]
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
@@ -167,6 +169,7 @@ def take_unit_kernel(scalars: f64, square: f64):
     scalars[SIZE] = size
     if size == wp.float64(0.0):
         scalars[SIZE] = wp.float64(1.0)
+    scalars[PER_SIZE] = wp.float64(1.0) / scalars[SIZE]
     scalars[STEP] = wp.float64(0.0)
 
 

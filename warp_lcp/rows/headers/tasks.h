@@ -2,7 +2,7 @@
 // The body that follows ends with three braces.
 const int per_plane_ = L.rows*L.chunks; int i_ = slab_, at_ = row_*L.chunks + chunk_;
 #ifdef __CUDA_ARCH__
-double total_[FOUND ? FOUND : 1];
+double total_[FOUND ? FOUND : 1]; int whole_[FOUND ? FOUND : 1];
 #endif
 for (int left_ = count_, here_; left_ > 0; left_ -= here_, ++i_, at_ = 0) {
     here_ = left_ < per_plane_ - at_ ? left_ : per_plane_ - at_;

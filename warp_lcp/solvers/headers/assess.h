@@ -4,7 +4,7 @@
 #include "mark.h"
 const auto near = [](T v) -> T { return ROUNDED ? (T)(float)v : v; };  // a bound as x can hold it
 const auto stored = [&](int k) -> F { return sizeof(F) > sizeof(*d) ? (F)diagonal(k) : (F)d[k]; };  // a count of faces, or what it is worth
-const T inverse = reciprocal(scalars[SIZE]);
+const T inverse = scalars[PER_SIZE];
 T norm = 0, energy = 0; int moved = 0, active = 0, off = 0; unsigned char hold[M];
 for (int begin = 0; begin < n; begin += M) {
     const int end = n - begin < M ? n : begin + (int)M; T y[M]; unsigned char any = 0, count = 0, far = 0;
