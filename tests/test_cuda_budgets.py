@@ -22,7 +22,7 @@ ARCHS = ("sm_80", "sm_90", "sm_100")
 REGISTERS = 65536  # of a multiprocessor, on all of them
 # Kernels that may spill, and why.
 SPILLS = {
-    "warp_lcp.blocked_gauss_seidel.*_[456]:*": "a thread enumerates the sets of a block of 4 to 6 unknowns with its matrix at hand",
+    "warp_lcp.blocked_gauss_seidel.*_[56]:*": "a thread enumerates the sets of a block of 5 or 6 unknowns with its matrix at hand",
     "warp_lcp.small_levels.coarsen.*": "a few hundred bytes once a solve, in one block",
     "warp_lcp.small_levels.cycle.solve.*": "84 bytes of a level that is solved directly, all there is of it",
     "warp_lcp.coarsest.invert_*": "20 bytes once a solve, in one block",
@@ -30,9 +30,10 @@ SPILLS = {
 # Kernels that take more than 128 registers, so that fewer than 512 threads fit on a multiprocessor, and why that is how it is.
 LARGE = {
     "warp_lcp.blocked_gauss_seidel.*_[23456]:*": "as above",
-    "granular.stress_*": "a step holds the stress and the rate of an edge and its cells, and projects it in principal axes",
-    "granular.interleaved_3d_*": "as a step",
-    "granular.bodies_*": "the same at cells that a body touches",
+    "granular.stress_3d_float64_residual_rate*": "the residual's step with friction that grows with the rate, in float64",
+    "granular.bodies_3d_float64*": "the same at cells that a body touches",
+    "granular.report_3d*": "130 on sm_80: what the log tells, once a step",
+    "warp_lcp.mprgp.split.variable_float64_float64_float64:split": "an operator in float64 throughout",
     "granular.packing:contents_kernel": "once a run",
     "warp_lcp.grid.mesh_crossings:find_crossings": "once a mesh",
     "fluids.coupling:*": "bodies' cells only",
