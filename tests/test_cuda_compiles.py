@@ -6,6 +6,7 @@ import itertools
 import pkgutil
 import re
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from warp_lcp.grid.sides import wrap_kernel
 from warp_lcp.grid.transfer import transfer_passes
 from warp_lcp.material.density_correction import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
+from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.rows import Rows
 from warp_lcp.rows.row_pass import Form
 from warp_lcp.rows.vectors import CUDA_BLOCK
@@ -51,6 +53,11 @@ def use_every_kernel(reals):
             problem = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), -np.ones(cells.shape))
             for solver in METHODS:
                 assert wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-4))
+            fused = mock.patch.object(Hierarchy, "_fuses", lambda self, level: False)
+            with fused, mock.patch.object(Level, "computes_again", True):  # as on CUDA, with small levels apart and together
+                for precision, cycle in itertools.product(("mixed", "double"), (CycleSettings(coarsest_cpu=8), *ONE_LAUNCH)):
+                    method = wl.ProjectedMultigrid(precision=precision, cycle=cycle)
+                    assert wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-4))
         assert Hierarchy(problem.A.stencil, dtype, bounded=False, settings=ONE_LAUNCH[1])._small.coarsening.kernel
     for real in (wp.float32, wp.float64):
         transfer_passes(real)
