@@ -36,7 +36,8 @@ from warp_lcp.benchmarks.harness.record import Table
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.problems import natural, splash
-from warp_lcp.rows.program import Program
+from warp_lcp.rows.program import Program, loops_on_device
+from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 CLOSE, ALIKE = 1e-5, 2e-2  # relative: solutions to 1e-8, and where particles are after many steps
 WRONG = 3  # what `benchmarks.gpu_kernels` ends with where kernels differ
@@ -88,6 +89,8 @@ class Verdict:
         self.claim("residuals by NumPy", self.residuals)
         self.claim("the same bits in every run", self.repeats)
         self.claim("graphs do what launches do", self.graphs)
+        self.claim("steps without the host are the host's", self.ahead)
+        self.claim("a step waits for the device twice", self.waiting)
         self.claim("grids without unknowns are refused", self.empty)
         self.claim("memory stays", self.memory)
         self.claim("compute-sanitizer finds nothing", self.sanitized)
@@ -154,6 +157,35 @@ class Verdict:
         assert not other, f"differ: {', '.join(other)}"
         return f"{len(alone)} solves, bit for bit"
 
+    def ahead(self) -> str | None:
+        """Solve, and step a liquid, with the host's judgment after each step."""
+        if not loops_on_device(wp.get_device(self.device)):
+            return None
+
+        def both() -> dict[str, np.ndarray]:
+            *_, last = gpu_cases.states("dam-break", self.device, self.steps)
+            return gpu_cases.large(self.device, 32) | last
+
+        found = both()
+        with mock.patch.object(RunAhead, "suits", lambda work: False):
+            judged = both()
+        other = [name for name, x in found.items() if not np.array_equal(x, judged[name])]
+        assert not other, f"differ: {', '.join(other)}"
+        return f"{len(found) - 2} solves and {self.steps} steps of a liquid, bit for bit"
+
+    def waiting(self) -> str | None:
+        """Count what the host reads in steps of a liquid whose particles are not moved apart."""
+        if not loops_on_device(wp.get_device(self.device)):
+            return None
+        simulation, counts = gpu_cases.simulation("dam-break", self.device), []
+        with mock.patch.object(wp.array, "numpy", autospec=True, side_effect=wp.array.numpy) as read:
+            for _ in range(self.steps):
+                read.reset_mock()
+                row = simulation.step(min(simulation.stable_dt(), gpu_cases.DT))
+                counts += [] if row.get("density_status") else [read.call_count]
+        assert max(counts[2:]) <= 2, f"up to {max(counts[2:])} times"  # the first steps load kernels
+        return f"{len(counts) - 2} steps"
+
     def empty(self) -> str:
         """Give problems without an unknown."""
         for shape in ((3, 3), (4, 5, 6)):
@@ -186,8 +218,8 @@ class Verdict:
         return "memcheck"
 
     def times(self) -> str:
-        """Time cold solves, and put them beside the model's tables."""
-        rows = []
+        """Time cold solves and steps, and put them beside the model's tables."""
+        rows, steps = [], []
         for n in (16, 32) if self.rehearsal else (128, 256, 512):
             problem, method = splash(n).problem("walls", self.device), wl.ProjectedMultigrid()
             workspace, taken = method.init(problem), []
@@ -199,12 +231,24 @@ class Verdict:
                 taken.append(time.perf_counter() - start)
             rows.append([f"{n}^3", f"{1e3 * min(taken[1:]):.1f}", str(result.iterations), result.status.name])
         self.tables.append(Table("Cold solves of a splash to 1e-6", ["cells", "ms", "iterations", "status"], rows))
+        assert all(row[-1] == "CONVERGED" for row in rows), rows
+        for n in (16,) if self.rehearsal else (64, 128):
+            simulation = gpu_cases.simulation("dam-break", self.device, n)
+            for count in (10, 20):  # until it moves, and what is timed
+                wp.synchronize()
+                start = time.perf_counter()
+                for _ in range(count):
+                    simulation.step(simulation.stable_dt())
+                wp.synchronize()
+            steps.append([f"{n}", f"{1e3 * (time.perf_counter() - start) / count:.1f}"])
+        self.tables.append(Table("Steps of the dam break", ["cells along x", "ms"], steps))
+        cells = ("16", "16") if self.rehearsal else ("128", "64")
         said = subprocess.run(
-            [sys.executable, "-m", "benchmarks.gpu_model", "--cells", "16" if self.rehearsal else "64"],
+            [sys.executable, "-m", "benchmarks.gpu_model", "--cells", cells[0], "--step-cells", cells[1]],
             cwd=ROOT, check=True, capture_output=True, text=True, timeout=600,
         ).stdout  # fmt: skip
         (self.out / "model.md").write_text(said)
-        return ", ".join(f"{cells} {ms} ms" for cells, ms, *_ in rows)
+        return ", ".join([*(f"{cells} {ms} ms" for cells, ms, *_ in rows), *(f"a step at {cells} {ms} ms" for cells, ms in steps)])
 
     def bandwidth(self) -> str:
         """Measure the kernels on the finest grid against copying."""

@@ -80,9 +80,9 @@ def large(device: str, n: int = 48) -> Arrays:
     return found
 
 
-def simulation(name: str, device: str) -> Any:
-    """Return a built-in scene's simulation, small."""
-    scene = load_scene(name, [f"domain.resolution={SCENES[name]}"])
+def simulation(name: str, device: str, cells: int = 0) -> Any:
+    """Return a built-in scene's simulation, small, or of so many cells."""
+    scene = load_scene(name, [f"domain.resolution={cells or SCENES[name]}"])
     return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
 
 
