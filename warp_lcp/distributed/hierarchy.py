@@ -13,7 +13,7 @@ import warp as wp
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.hierarchy import Hierarchy, Level, launch_all
-from warp_lcp.operators.stencil import Stencil
+from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.program import Launch, Program, perform
@@ -147,7 +147,7 @@ class DistributedHierarchy(Hierarchy):
         self._gathering.take(whole.x, ours.x)
 
 
-def _whole_stencil(part: Stencil, counts: tuple[int, int, int], strength: tuple[float, float, float]) -> Stencil:
+def _whole_stencil(part: PaddedStencil, counts: tuple[int, int, int], strength: tuple[float, float, float]) -> PaddedStencil:
     """Return a stencil like a rank's of the whole grid, still empty."""
     padding = Padding(counts)
 
@@ -155,4 +155,4 @@ def _whole_stencil(part: Stencil, counts: tuple[int, int, int], strength: tuple[
         return wp.zeros(padding.size, dtype=field.dtype, device=field.device)
 
     weights = None if part.weights is None else tuple(map(like, part.weights))
-    return Stencil(padding, like(part.d), weights, part.coefficients, part.unit, strength=strength)
+    return PaddedStencil(padding, like(part.d), weights, part.coefficients, part.unit, strength=strength)

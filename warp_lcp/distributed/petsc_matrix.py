@@ -20,7 +20,7 @@ from warp_lcp.distributed.ranks import petsc
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
-from warp_lcp.operators.stencil import Stencil
+from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import zeros
@@ -51,7 +51,7 @@ class VectorCopies:
         sizes: local and global length of the vectors, as PETSc takes them.
     """
 
-    def __init__(self, stencil: Stencil, comm: Any) -> None:
+    def __init__(self, stencil: PaddedStencil, comm: Any) -> None:
         self.stencil, self.comm, self.device = stencil, comm, stencil.device
         self._n = math.prod(stencil.padding.counts)
         self.sizes = self._n, None  # PETSc adds the ranks' up
@@ -102,7 +102,7 @@ class StencilMatrix:
         copies: of its grid.
     """
 
-    def __init__(self, stencil: Stencil, copies: VectorCopies) -> None:
+    def __init__(self, stencil: PaddedStencil, copies: VectorCopies) -> None:
         self._stencil, self._copies = stencil, copies
         self._x, self._y = (zeros(stencil.padding.size, wp.float64, stencil.device) for _ in range(2))
 

@@ -15,7 +15,7 @@ from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
-from warp_lcp.operators.stencil import Stencil, coarsen_spans_kernel
+from warp_lcp.operators.padded_stencil import PaddedStencil, coarsen_spans_kernel
 from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.program import Launch, Program, Task
@@ -35,7 +35,7 @@ def launch_all(stages: Iterable[Stage], launch: Launch) -> None:
 class Level:
     """One grid: its stencil, iterate x, right-hand side b, a second buffer t, and bounds of x if cycles are projected."""
 
-    def __init__(self, stencil: Stencil, real: Any, *, bounded: bool, upper: bool = True, bounds: Pair | None = None) -> None:
+    def __init__(self, stencil: PaddedStencil, real: Any, *, bounded: bool, upper: bool = True, bounds: Pair | None = None) -> None:
         self.stencil, self.real = stencil, real
         field: Callable[[], wp.array[Any]] = lambda: stencil.padding.zeros(real, stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
@@ -203,7 +203,7 @@ class Hierarchy:
     """
 
     def __init__(
-        self, stencil: Stencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, bounds: Pair | None = None,
+        self, stencil: PaddedStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, bounds: Pair | None = None,
         shifted: bool = False, shrunk: float = 1.0, strength: list[float] | None = None, finest: Level | None = None,
     ) -> None:  # fmt: skip
         self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
@@ -451,7 +451,7 @@ class Hierarchy:
         spans = None if s.spans is None else wp.zeros(padding.counts[:2], dtype=wp.vec2i, device=self.device)
         weights = (new[1], new[2], new[3])
         ghosts = None if s.ghosts is None else s.ghosts.coarser(factors)
-        stencil = Stencil(padding, new[0], weights, (0.0, 0.0, 0.0), 1.0, periodic, spans, ghosts=ghosts)  # type: ignore[arg-type]
+        stencil = PaddedStencil(padding, new[0], weights, (0.0, 0.0, 0.0), 1.0, periodic, spans, ghosts=ghosts)  # type: ignore[arg-type]
         level = Level(stencil, self.real, bounded=bounded, upper=fine.upper.size > 0)
         level.factors = factors
         # visiting levels of half the cells twice would cost as much on each of them: only every second one is
@@ -471,7 +471,7 @@ class Hierarchy:
         return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
 
 
-def _finest_level(stencil: Stencil, real: Any, *, bounded: bool, bounds: Pair | None, shifted: bool) -> Level:
+def _finest_level(stencil: PaddedStencil, real: Any, *, bounded: bool, bounds: Pair | None, shifted: bool) -> Level:
     """Return the level of an operator's stencil: its weights, and a diagonal of its own, 0 so far."""
     d_type = wp.uint8 if stencil.d.dtype is wp.uint8 and not shifted else real
     weights = stencil.weights
@@ -479,7 +479,7 @@ def _finest_level(stencil: Stencil, real: Any, *, bounded: bool, bounds: Pair | 
         weights = tuple(stencil.padding.zeros(real, w.device) for w in weights)
     d = stencil.padding.zeros(d_type, stencil.device)
     unit = stencil.unit if d_type is wp.uint8 else 1.0
-    finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans, ghosts=stencil.ghosts)
+    finest = PaddedStencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans, ghosts=stencil.ghosts)
     return Level(finest, real, bounded=bounded, bounds=bounds)
 
 

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from warp_lcp.operators.stencil import Stencil
+from warp_lcp.operators.padded_stencil import PaddedStencil
 
 if TYPE_CHECKING:
     from warp_lcp.multigrid.hierarchy import Level
 
 
-def whole_counts(stencil: Stencil) -> tuple[int, int, int]:
+def whole_counts(stencil: PaddedStencil) -> tuple[int, int, int]:
     """Return the cells (nz, ny, nx) of a stencil's grid, also of those that other processes have."""
     return stencil.padding.counts if stencil.ghosts is None else stencil.ghosts.whole
 
@@ -42,7 +42,7 @@ def share_changes(level: Level) -> None:
         level.changed.assign(changed)
 
 
-def clear_ghosts(stencil: Stencil, field: wp.array[Any]) -> None:
+def clear_ghosts(stencil: PaddedStencil, field: wp.array[Any]) -> None:
     """Set the ghost cells of a stored field that stand for cells of others to 0; on the CPU."""
     assert stencil.ghosts is not None
     grid = field.numpy().reshape(stencil.padding.shape)

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.sparse import GATHER
-from warp_lcp.operators.stencil import Stencil
+from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.program import Program
 
@@ -35,7 +35,7 @@ class TurningHierarchy(Hierarchy):
         strengths: of each companion.
     """
 
-    def __init__(self, stencil: Stencil, real: Any, strengths: list[Strength], **options: Any) -> None:
+    def __init__(self, stencil: PaddedStencil, real: Any, strengths: list[Strength], **options: Any) -> None:
         settings = options.pop("settings", None) or CycleSettings()
         fewer = math.prod(stencil.padding.counts) - 1  # a launch of all levels starts from x = 0: the finest one stays out of it
         cpu, cuda = (min(n, fewer) for n in (settings.one_launch_cpu, settings.one_launch_cuda))
@@ -95,7 +95,7 @@ class TurningHierarchy(Hierarchy):
         return program
 
 
-def make_hierarchy(stencil: Stencil, real: Any, **options: Any) -> Hierarchy:
+def make_hierarchy(stencil: PaddedStencil, real: Any, **options: Any) -> Hierarchy:
     """Return the hierarchy of a stencil, of all processes where it is shared; options as of `Hierarchy`."""
     if stencil.ghosts is not None:
         return stencil.ghosts.hierarchy(stencil, real, **options)
@@ -103,7 +103,7 @@ def make_hierarchy(stencil: Stencil, real: Any, **options: Any) -> Hierarchy:
     return TurningHierarchy(stencil, real, strengths, **options) if strengths else Hierarchy(stencil, real, **options)
 
 
-def turns(stencil: Stencil) -> list[Strength]:
+def turns(stencil: PaddedStencil) -> list[Strength]:
     """Return the ways in which cells are coupled that the mean weights do not tell; none where the strong axes are the same everywhere.
 
     Blocks are sampled. The mean logarithm of 64 faces knows neither random coefficients, nor surfaces and cut cells, which are few in a
@@ -136,12 +136,12 @@ def _mismatch(logs: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.ptp(logs - other, axis=1)
 
 
-def _long(stencil: Stencil) -> list[int]:
+def _long(stencil: PaddedStencil) -> list[int]:
     """Return the axes of more than one cell, 0, 1, 2 = x, y, z."""
     return [axis for axis, n in enumerate(reversed(stencil.padding.counts)) if n > 1]
 
 
-def _sampled(stencil: Stencil) -> np.ndarray:
+def _sampled(stencil: PaddedStencil) -> np.ndarray:
     """Return the mean logarithms of the weights along the long axes, a row a block that has open faces along all of them."""
     cells, long, device = stencil.padding.counts, _long(stencil), stencil.device
     dimension = max(len(long), 2)

@@ -134,7 +134,7 @@ class RowPass:
 
         Args:
             rows: which rows.
-            stencil: a `warp_lcp.operators.stencil.Stencil`, or a `Known` product in place of one.
+            stencil: a `warp_lcp.operators.padded_stencil.PaddedStencil`, or a `Known` product in place of one.
             bounds: operands of a `warp_lcp.problem.bounds.Bounds`.
             given: arrays, numbers, and constants that are not as usual, by name.
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.operators.stencil import Stencil
+from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import RowPass, Wave
 from warp_lcp.rows.program import Program
 from warp_lcp.rows.vectors import Reduction
@@ -66,7 +66,7 @@ class GridConjugateGradient:
         weighted: residuals are measured as ||d^(-1/2) r||, d the finest diagonal, else as ||r||.
     """
 
-    def __init__(self, source: Stencil, hierarchy: Hierarchy, *, weighted: bool) -> None:
+    def __init__(self, source: PaddedStencil, hierarchy: Hierarchy, *, weighted: bool) -> None:
         finest, device = hierarchy.finest, hierarchy.device
         r, s = finest.b, finest.stencil
         self.device, self.x, self._p = device, wp.zeros_like(r), wp.zeros_like(r)

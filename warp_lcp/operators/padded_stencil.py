@@ -114,7 +114,7 @@ class Ghosts(Protocol):
 
 
 @dataclass
-class Stencil:
+class PaddedStencil:
     """A x = unit d x - sum of w x_neighbor on the cells with d != 0.
 
     Args:
@@ -175,10 +175,10 @@ class Stencil:
         faces = [max(int(np.count_nonzero(w.numpy())), 1) for w in self.weights]
         return [s / n for s, n in zip(sums, faces, strict=True)]
 
-    def with_diagonal(self, d: wp.array[Any]) -> Stencil:
+    def with_diagonal(self, d: wp.array[Any]) -> PaddedStencil:
         """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
         unit = self.unit if d.dtype is self.d.dtype else 1.0
-        return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic, self.spans, self.strength, self.ghosts)
+        return PaddedStencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic, self.spans, self.strength, self.ghosts)
 
     @property
     def has_ghosts(self) -> bool:

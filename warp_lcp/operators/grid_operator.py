@@ -1,0 +1,263 @@
+"""What operators on the FLUID cells of a grid share: cell types, padded storage, rows in use, products and sweeps."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.operators.cell_lists import cells_of
+from warp_lcp.operators.padded_stencil import Ghosts, PaddedStencil, find_spans_kernel
+from warp_lcp.problem.pickling import Pickled
+from warp_lcp.problem.protocol import AIR, FLUID, SOLID
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, real_array
+from warp_lcp.rows.vectors import Across
+
+HEADERS = Path(__file__).parent / "headers"
+COPY_CELLS = RowPass("grid_poisson.copy_cells", HEADERS / "copy.h", wp.int8, reads={"source": wp.int8}, writes={"to": wp.int8})
+
+
+class GridOperator(Pickled):
+    """Matrix-free operator on the FLUID cells of a grid; what its rows are is for classes to say.
+
+    They set what `_fill_stencil` reads in `_take_coefficients`, return the memory of `stencil` from `_empty_stencil`, and fill that.
+
+    Args:
+        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or wp.array.
+        coefficients: what `_take_coefficients` is given.
+        periodic: whether x, y, z wrap around.
+        device: Warp device; that of `cells` or the default device if None.
+        dtype: storage of coefficients, wp.float32 or wp.float64.
+
+    Attributes:
+        cells: cell types with one layer of SOLID ghost cells, shape (nz + 2, ny + 2, nx + 2).
+        cells_around: the same with ghost cells of periodic axes filled; `cells` itself where no axis is periodic.
+        stencil: the diagonal and the weights on that padded grid.
+        version: how often the cells have been taken; memory that holds something outside the rows' spans is cleared when it changes.
+    """
+
+    symmetric = True
+    stencil: PaddedStencil
+    _ghosts: Ghosts | None = None  # of a box of cells among others
+    _across: Across | None = None
+    _finder: Any = None  # of floating components
+
+    def __init__(self, cells: Any, coefficients: dict[str, Any], periodic: tuple[bool, ...], device: Any, dtype: Any) -> None:
+        if dtype not in (wp.float32, wp.float64):
+            raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
+        host = _checked_cells(cells)
+        self.device = wp.get_device(device if device is not None else cells.device if isinstance(cells, wp.array) else None)
+        self.dtype, self.shape = dtype, host.shape
+        self.layout = PaddedLayout(host.shape, self.device, self._across)
+        counts = self.layout.padding.counts
+        flags = (*(bool(p) for p in periodic), False, False, False)[:3]
+        self.periodic = (flags[0] and counts[2] > 1, flags[1] and counts[1] > 1, flags[2] and counts[0] > 1)
+        self._take_coefficients(host, **coefficients)
+        padded = np.full(self.layout.stored_shape, SOLID, dtype=np.int8)
+        padded[1:-1, 1:-1, 1:-1] = host.reshape(counts)
+        self.cells = wp.array(padded, device=self.device, copy=self.device.is_cuda)
+        self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) or self._ghosts is not None else self.cells
+        self._spans, self._reach = (wp.zeros(counts[:2], dtype=wp.vec2i, device=self.device) for _ in range(2))
+        whole = self.device.is_cuda or self.cells_around is not self.cells or self.layout.size < LARGE
+        chunks = 0 if whole else -(-self.layout.size // CPU_CHUNK)
+        self._chunks = wp.zeros((chunks, 1), dtype=wp.vec2i, device=self.device)
+        self.layout.chunks = self._chunks if chunks else None
+        self._find_rows()
+        self.layout.find_use(self._reach.numpy()[..., 1] > 0)
+        self.version = 0
+        self.stencil = self._empty_stencil()
+        self._mask: wp.array[Any] | None = None
+        self._fill_stencil()
+
+    @classmethod
+    def from_cells(cls, shape: Sequence[int], fluid: Any, solid: Any = (), **options: Any) -> Self:
+        """Make the operator of a grid from lists of its FLUID and SOLID cells, the others being AIR.
+
+        Args:
+            shape: cells along each axis, (nz, ny, nx) or (ny, nx).
+            fluid: indices of FLUID cells, integers of shape (n, 3), a row (k, j, i) a cell as it is found in fields, or (n, 2) in 2-D;
+                numpy or wp.array. The order of the cells does not matter; lists in the order of memory are taken fastest.
+            solid: likewise of SOLID cells.
+            options: all that the class takes beside `cells`.
+
+        Raises:
+            ValueError: a list has another shape or type, a cell is not in the grid, is listed twice or in both lists; the message names it.
+
+        Example:
+            >>> import warp_lcp as wl
+            >>> A = wl.GridPoisson.from_cells((1, 1, 3), fluid=[(0, 0, 0), (0, 0, 1)], device="cpu")
+            >>> print(A.diagonal().numpy())
+            [[[1. 2. 0.]]]
+        """
+        return cls(cells=cells_of(shape, fluid, solid), **options)
+
+    def update(self, cells: wp.array[Any]) -> None:
+        """Take new cell types, and what face coefficients and shift in padded arrays have become, in place and without allocating.
+
+        Args:
+            cells: wp.int8 array on the operator's device, of its shape (3-D) or of the padded shape (nz + 2, ny + 2, nx + 2), whose
+                outer layer is ignored.
+
+        Raises:
+            ValueError: type, device or shape differ.
+        """
+        padded, counts = self.layout.stored_shape, self.layout.padding.counts
+        if not isinstance(cells, wp.array) or cells.dtype is not wp.int8 or cells.device != self.device:
+            raise ValueError(f"cells: expected a wp.int8 array on {self.device}")
+        if tuple(cells.shape) == self.shape != padded:
+            wp.copy(self.cells[1:-1, 1:-1, 1:-1], cells.reshape(counts))
+            cells = self.cells
+        elif tuple(cells.shape) != padded:
+            raise ValueError(f"cells has shape {tuple(cells.shape)}: expected {self.shape} or {padded}")
+        self._refill(cells)
+
+    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A x.
+
+        Args:
+            x: field of type wp.float32 or wp.float64, of the operator's shape or stored (padded, flat or not, 0 off the FLUID cells).
+            out: field like x that receives the product; made if None.
+        """
+        if x.size == self.layout.size:
+            if out is None:
+                out = wp.zeros_like(x)
+            else:
+                out.zero_()
+            self.stencil.product(x.flatten(), out.flatten())
+            return out
+        stored = self.layout.load(x, x.dtype, "x")
+        inside = self.cells.numpy().ravel() == FLUID if self._mask is None else self._mask.numpy() != 0
+        stored = wp.array(np.where(inside, stored.numpy(), 0), dtype=x.dtype, device=self.device)
+        product = self.layout.unload(self.apply(stored))
+        if out is None:
+            return product
+        wp.copy(out, product)
+        return out
+
+    apply_transpose = apply  # A is symmetric
+
+    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+        """out = A x + b in one pass; stored fields of one type."""
+        self.stencil.product(x, out, plus=b)
+
+    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
+        """Sweep stored fields once, red cells then black ones (forward) or the reverse, each unknown projected onto its bounds."""
+        self.stencil.relax(x, b, lower, upper, omega, forward=forward)
+
+    def diagonal(self) -> wp.array[Any]:
+        """Return the diagonal of A, a field of the operator's shape and type; 0 off the FLUID cells."""
+        d = self.stencil.d.numpy().astype(np.float64) * self.stencil.unit
+        inner = d.reshape(self.layout.stored_shape)[1:-1, 1:-1, 1:-1]
+        return wp.array(inner.reshape(self.shape), dtype=self.dtype, device=self.device)
+
+    def masked(self, free: Any, shift: Any = None) -> Self:
+        """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""
+        mask = (self.layout.load(free, wp.uint8, "free").numpy() != 0) & (self.cells.numpy().ravel() == FLUID)
+        twin = copy.copy(self)
+        twin._mask, twin._finder = wp.array(mask.astype(np.uint8), device=self.device), None
+        d, kind = self.stencil.d.numpy(), self.stencil.d.dtype
+        if shift is not None:
+            kind = self.dtype
+            d = self.stencil.unit * d.astype(np.float64) + self.layout.load(shift, kind, "shift").numpy()
+        new = wp.array(np.where(mask, d, 0), dtype=kind, device=self.device)
+        twin.stencil = self.stencil.with_diagonal(new)
+        return twin
+
+    def _pickled(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the cells and the options that every class has, as `__reduce__` needs them.
+
+        Raises:
+            TypeError: it is a part of a grid that ranks share, or a principal system.
+        """
+        if self.layout.across is not None:
+            raise TypeError(f"{type(self).__name__} is a part of a grid that ranks share: pickle its cells and coefficients on each rank")
+        if self._mask is not None:
+            raise TypeError("a masked operator is not pickled: pickle the one it was made from, and mask that again")
+        return self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape).copy(), {"periodic": self.periodic, "dtype": self.dtype}
+
+    @property
+    def unknowns(self) -> int:
+        """Number of FLUID cells, those of ghosts not counted."""
+        return sum(int(np.count_nonzero(plane == FLUID)) for plane in self.cells.numpy()[1:-1, 1:-1, 1:-1])
+
+    def _take_coefficients(self, cells: np.ndarray, *args: Any, **given: Any) -> None:
+        """Check and store what the rows are made from."""
+        raise NotImplementedError
+
+    def _empty_stencil(self) -> PaddedStencil:
+        """Return the stencil's memory."""
+        raise NotImplementedError
+
+    def _fill_stencil(self) -> None:
+        """Compute diagonal and weights, on rows that are in use or have been."""
+        raise NotImplementedError
+
+    def _refill(self, cells: wp.array[Any]) -> None:
+        """Take padded cell types and compute diagonal and weights."""
+        if cells is not self.cells:
+            COPY_CELLS.bind(Rows.of(self.layout.padding, self.device), source=cells.flatten(), to=self.cells.flatten()).launch()
+        self._find_rows()
+        self._fill_stencil()
+
+    def _in_place(self, field: Any, name: str) -> bool:
+        """Return whether a coefficient field is the caller's padded array, after checking it."""
+        if not isinstance(field, wp.array) or tuple(field.shape) != self.layout.stored_shape or self.layout.stored_shape == self.shape:
+            return False
+        if field.dtype is not self.dtype or field.device != self.device:
+            raise ValueError(f"{name} in the padded shape must be of type {self.dtype.__name__} on {self.device}")
+        check_coefficients(field.numpy(), self.dtype, name)
+        return True
+
+    def _stored_shift(self, shift: Any) -> wp.array[Any]:
+        if shift is None:
+            return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
+        if self._in_place(shift, "shift"):
+            return shift
+        host = real_array(shift, "shift")
+        host = np.full(self.shape, host) if host.ndim == 0 else host
+        if host.shape != self.shape:
+            raise ValueError(f"shift has shape {host.shape}: expected {self.shape}")
+        check_coefficients(host, self.dtype, "shift")
+        return wp.array(np.pad(host.reshape(self.layout.padding.counts), 1), dtype=self.dtype, device=self.device)
+
+    def _find_rows(self) -> None:
+        """Find what of each row is in use."""
+        counts = self.layout.padding.counts
+        wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans, self._reach, self._chunks], device=self.device)
+
+    def _wrap_cells(self) -> None:
+        """Fill ghost cells of periodic axes in `cells_around`; a version more."""
+        self.version += 1
+        if self.cells_around is not self.cells:
+            wp.copy(self.cells_around, self.cells)
+            self.stencil.wrap(self.cells_around)
+
+    @cached_property
+    def _rows_in_reach(self) -> Rows:
+        return Rows.of(self.layout.padding, self.device, self._reach)
+
+
+def _checked_cells(cells: Any) -> np.ndarray:
+    """Return cell types as a host array."""
+    host = real_array(cells, "cells")
+    if host.ndim not in (2, 3) or host.size == 0:
+        raise ValueError(f"cells has shape {host.shape}: expected (nz, ny, nx) or (ny, nx) with at least one cell")
+    if not np.issubdtype(host.dtype, np.integer):
+        raise ValueError(f"cells has type {host.dtype}: expected integers AIR = {AIR}, FLUID = {FLUID}, SOLID = {SOLID}")
+    if host.min() < AIR or host.max() > SOLID:
+        raise ValueError(f"cells has values from {host.min()} to {host.max()}: allowed are AIR = {AIR}, FLUID = {FLUID}, SOLID = {SOLID}")
+    return host
+
+
+def check_coefficients(values: np.ndarray, dtype: Any, name: str) -> None:
+    """Check that values are >= 0 and kept by their type."""
+    check_storable(values, dtype, name)
+    check_kept(values, dtype, name)
+    if (values < 0).any():
+        raise ValueError(f"{name} holds a negative value ({values.min()}): coefficients must be >= 0")
