@@ -3,7 +3,18 @@
 from importlib.metadata import PackageNotFoundError, version
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, LowRankOperator, Operator, SparseOperator, SumOperator
+from warp_lcp.operators import (
+    AIR,
+    FLUID,
+    SOLID,
+    DenseOperator,
+    GridPoisson,
+    LowRankOperator,
+    Operator,
+    SparseOperator,
+    Stencil,
+    SumOperator,
+)
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
@@ -85,6 +96,7 @@ __all__ = [
     "SparseOperator",
     "StaggeredRound",
     "Staggering",
+    "Stencil",
     "Step",
     "StoppingCriteria",
     "SubspaceMinimization",

@@ -10,8 +10,8 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.operators.sparse import GATHER
 from warp_lcp.operators.padded_stencil import PaddedStencil
+from warp_lcp.operators.sparse import GATHER
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.program import Program
 

@@ -47,6 +47,7 @@ class GridOperator(Pickled):
     _ghosts: Ghosts | None = None  # of a box of cells among others
     _across: Across | None = None
     _finder: Any = None  # of floating components
+    outside = SOLID  # what lies beyond the array
 
     def __init__(self, cells: Any, coefficients: dict[str, Any], periodic: tuple[bool, ...], device: Any, dtype: Any) -> None:
         if dtype not in (wp.float32, wp.float64):
@@ -59,7 +60,7 @@ class GridOperator(Pickled):
         flags = (*(bool(p) for p in periodic), False, False, False)[:3]
         self.periodic = (flags[0] and counts[2] > 1, flags[1] and counts[1] > 1, flags[2] and counts[0] > 1)
         self._take_coefficients(host, **coefficients)
-        padded = np.full(self.layout.stored_shape, SOLID, dtype=np.int8)
+        padded = np.full(self.layout.stored_shape, self.outside, dtype=np.int8)
         padded[1:-1, 1:-1, 1:-1] = host.reshape(counts)
         self.cells = wp.array(padded, device=self.device, copy=self.device.is_cuda)
         self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) or self._ghosts is not None else self.cells
@@ -124,23 +125,30 @@ class GridOperator(Pickled):
             x: field of type wp.float32 or wp.float64, of the operator's shape or stored (padded, flat or not, 0 off the FLUID cells).
             out: field like x that receives the product; made if None.
         """
+        return self._applied(x, out)
+
+    apply_transpose = apply  # A is symmetric
+
+    def _applied(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool = False) -> wp.array[Any]:
         if x.size == self.layout.size:
             if out is None:
                 out = wp.zeros_like(x)
             else:
                 out.zero_()
-            self.stencil.product(x.flatten(), out.flatten())
+            self._product(x.flatten(), out.flatten(), transposed=transposed)
             return out
         stored = self.layout.load(x, x.dtype, "x")
         inside = self.cells.numpy().ravel() == FLUID if self._mask is None else self._mask.numpy() != 0
         stored = wp.array(np.where(inside, stored.numpy(), 0), dtype=x.dtype, device=self.device)
-        product = self.layout.unload(self.apply(stored))
+        product = self.layout.unload(self._applied(stored, None, transposed=transposed))
         if out is None:
             return product
         wp.copy(out, product)
         return out
 
-    apply_transpose = apply  # A is symmetric
+    def _product(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
+        """out = A x, or A' x; flat stored fields."""
+        self.stencil.product(x, out)
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
         """out = A x + b in one pass; stored fields of one type."""

@@ -1,13 +1,14 @@
-"""The 7-point stencil on a padded grid: arrays, sizes and launches. An operator and each level of its multigrid are one of these.
+"""The stencil on a padded grid: arrays, sizes and launches. An operator and each level of its multigrid are one of these.
 
 (A x)_i = d_i x_i - sum of w_f x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give 0. Fields are 0 in cells that are no
-unknowns, so a neighbor needs no test. Two forms of one source: `uniform` has a weight an axis (and d may be a count of open faces in one
-byte, d_scale its unit), `variable` has an array of lower faces an axis.
+unknowns, so a neighbor needs no test. Forms of one source: of 7 points `uniform`, with a weight an axis (and d may be a count of open
+faces in one byte, d_scale its unit), or `variable`, with an array of lower faces an axis; or compact ones, of up to 27 points, symmetric or
+not, whose `Pattern` says what neighbors there are.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, no_type_check
@@ -17,7 +18,7 @@ import warp as wp
 
 from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import CPU_CHUNK, Padding
-from warp_lcp.rows.layout import check_memory, put, stencil_struct
+from warp_lcp.rows.layout import Pattern, check_memory, put, stencil_struct
 from warp_lcp.rows.program import Launch, Task
 
 HEADERS = Path(__file__).parent / "headers"
@@ -120,25 +121,28 @@ class PaddedStencil:
     Args:
         padding: counts of cells and of stored cells.
         d: diagonal in units of `unit`, flat stored field; 0 where there is no unknown. A count of faces (wp.uint8) or a float.
-        weights: weight of the lower face of each cell along x, y, z (flat stored fields), or None for one weight an axis.
-        coefficients: the weights along x, y, z where `weights` is None.
+        weights: weight of the lower face of each cell along x, y, z (flat stored fields), or None for one weight an axis. Of a compact
+            stencil the weights of the pattern's neighbors, in its order, if it has arrays.
+        coefficients: the weights along x, y, z where `weights` is None; of a compact stencil those of the pattern, if they are numbers.
         unit: value of one unit of d.
         periodic: whether x, y, z wrap around; ghost cells are then filled before each product.
         spans: first and one past the last cell of each row that may hold unknowns, shape (nz, ny), wp.vec2i; fields must be 0 outside.
             None: whole rows.
         strength: mean coefficient of all faces along x, y, z; None: that of the weights as they are.
         ghosts: fills ghost cells where another process has the neighbors, before each product; None: nobody has.
+        pattern: of a compact stencil; None: 7 points.
     """
 
     padding: Padding
     d: wp.array[Any]
-    weights: tuple[wp.array[Any], wp.array[Any], wp.array[Any]] | None
-    coefficients: tuple[float, float, float]
+    weights: tuple[wp.array[Any], ...] | None
+    coefficients: tuple[float, ...]
     unit: float = 1.0
     periodic: tuple[bool, bool, bool] = (False, False, False)
     spans: wp.array[Any] | None = None
     strength: tuple[float, float, float] | None = None
     ghosts: Ghosts | None = None
+    pattern: Pattern | None = None
 
     def __post_init__(self) -> None:
         """Take the device of the diagonal."""
@@ -153,11 +157,12 @@ class PaddedStencil:
     def struct(self) -> Any:
         """What passes take of it."""
         variable, d, w = self.storage
-        numbers = {"unit": self.unit, **dict(zip(("cx", "cy", "cz"), self.coefficients, strict=True))}
-        weights = dict(zip(("wx", "wy", "wz"), self.weights or (), strict=False)) if variable else {}
+        fields, names = (("wx", "wy", "wz"), ("cx", "cy", "cz")) if self.pattern is None else (self.pattern.names, self.pattern.numbers)
+        numbers = {"unit": self.unit, **dict(zip(names, self.coefficients, strict=True))}
+        weights = dict(zip(fields, self.weights or (), strict=False)) if variable else {}
         for name, array in weights.items():
             check_memory(f"the stencil's {name}", array, w, (self.d.size,))
-        return put(stencil_struct(d, w)(), numbers | {"d": self.d} | weights)
+        return put(stencil_struct(d, w, self.pattern)(), numbers | {"d": self.d} | weights)
 
     @property
     def storage(self) -> tuple[bool, Any, Any]:
@@ -178,7 +183,7 @@ class PaddedStencil:
     def with_diagonal(self, d: wp.array[Any]) -> PaddedStencil:
         """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
         unit = self.unit if d.dtype is self.d.dtype else 1.0
-        return PaddedStencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic, self.spans, self.strength, self.ghosts)
+        return replace(self, d=d, unit=unit)
 
     @property
     def has_ghosts(self) -> bool:
@@ -210,7 +215,11 @@ class PaddedStencil:
     def relax(
         self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any], omega: float, *, forward: bool = True
     ) -> None:
-        """Sweep x once, red cells then black ones (forward) or black then red, each cell projected onto its bounds."""
-        for color in (0, 1) if forward else (1, 0):
+        """Sweep x once, red cells then black ones (forward) or black then red, each cell projected onto its bounds.
+
+        Where cells touch diagonally, there are four colors, or eight in 3-D.
+        """
+        colors = 2 if self.pattern is None else 1 << sum(n > 1 for n in self.padding.counts)
+        for color in range(colors) if forward else reversed(range(colors)):
             self.wrap(x)
             RELAX.bind(self.rows, stencil=self, x=x, b=b, lower=lower, upper=upper, omega=omega, color=color).launch()

@@ -124,11 +124,88 @@ def joined(blank: Any, members: dict[str, Any], packing: Struct = NOTHING, numbe
     return made
 
 
+@dataclass(frozen=True)
+class Pattern:
+    """Which neighbors the rows of a compact stencil have, and how their weights are had.
+
+    Attributes:
+        offsets: (x, y, z), each -1, 0 or 1, of the neighbors; of a `symmetric` one of those before a cell, whose weights are those of the
+            ones after it, too.
+        symmetric: whether a weight serves both its cells.
+        kind: "numbers", one an offset; "arrays"; or "functions", Warp functions (k, j, i) of the cell.
+        functions: as many as offsets, of that kind: the coefficients, which are minus the weights; or numbers where they are the same everywhere.
+    """
+
+    offsets: tuple[tuple[int, int, int], ...]
+    symmetric: bool
+    kind: str
+    functions: tuple[Any, ...] = ()
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the weights in the struct."""
+        return tuple(f"w{i}" for i in range(len(self.offsets))) if self.kind == "arrays" else ()
+
+    @functools.cached_property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the numbers in the struct."""
+        return tuple(f"c{i}" for i in range(len(self.offsets))) if self.kind == "numbers" else ()
+
+    @functools.cached_property
+    def word(self) -> str:
+        """What tells its kernels from others."""
+        mask = sum(1 << (x + 1 + 3 * (y + 1) + 9 * (z + 1)) for x, y, z in self.offsets)
+        return f"compact_{'symmetric_' * self.symmetric}{self.kind}{_number_of(self.functions)}_{mask:x}"
+
+    def source(self) -> list[str]:
+        """Return C++ that `stencil.h` needs: a function of the piece's cell for each weight, and a macro that visits all of them."""
+        made = [f"const auto weight{i} = [&](long long k) -> T {{ return (T)({self._expression(i)}); }};" for i in range(len(self.offsets))]
+        visits = " ".join(f"DO(weight{i}, {x}, {y}, {z})" for i, (x, y, z) in enumerate(self.offsets))
+        return [*made, f"#define EACH_WEIGHT(DO) {visits}", f"constexpr bool SYMMETRIC = {str(self.symmetric).lower()};"]
+
+    def _expression(self, i: int) -> str:
+        """Return C++ of a weight at cell k."""
+        if self.kind != "functions":
+            return f"c{i}" if self.kind == "numbers" else f"w{i}[k]"
+        function = self.functions[i]
+        return f"{-function!r}" if isinstance(function, float) else f"-{function.native_func}(place(k)[0], place(k)[1], place(k)[2])"
+
+    @functools.cached_property
+    def touch(self) -> Any:
+        """A Warp function that calls all of them, so that whatever calls it has their code; None of others."""
+        touch = None
+        for function in self.functions:
+            touch = touch if isinstance(function, float) else _touching(function, touch)
+        return touch
+
+
 @functools.cache
-def stencil_struct(d: Any, w: Any) -> Any:
-    """Return the struct of a stencil whose diagonal and weights have these types."""
-    members = dict.fromkeys(("unit", "cx", "cy", "cz"), wp.float64) | {"d": wp.array(dtype=d), "known": wp.array(dtype=wp.float64)}
-    return make_struct(f"Stencil_{d.__name__}_{w.__name__}", members | dict.fromkeys(("wx", "wy", "wz"), wp.array(dtype=w)))
+def _number_of(functions: tuple[Any, ...]) -> str:
+    """Return what tells functions from others, of the same names too."""
+    return f"_{_number_of.cache_info().misses}" if functions else ""
+
+
+def _touching(function: Any, before: Any) -> Any:
+    if before is None:
+
+        def touch(i: int):  # type: ignore[no-untyped-def]
+            return wp.float64(function(i, i, i))
+    else:
+
+        def touch(i: int):  # type: ignore[no-untyped-def]
+            return wp.float64(function(i, i, i)) + before(i)
+
+    touch.__qualname__ = touch.__name__ = f"touch_{function.key}"
+    return wp.func(touch)
+
+
+@functools.cache
+def stencil_struct(d: Any, w: Any, pattern: Pattern | None = None) -> Any:
+    """Return the struct of a stencil whose diagonal and weights have these types: a 7-point one, unless it has a pattern."""
+    fields, numbers = (("wx", "wy", "wz"), ("cx", "cy", "cz")) if pattern is None else (pattern.names, pattern.numbers)
+    members = dict.fromkeys(("unit", *numbers), wp.float64) | {"d": wp.array(dtype=d), "known": wp.array(dtype=wp.float64)}
+    name = f"Stencil_{d.__name__}_{w.__name__}" + (f"_{pattern.word}" if pattern else "")
+    return make_struct(name, members | dict.fromkeys(fields, wp.array(dtype=w)))
 
 
 @dataclass(frozen=True)

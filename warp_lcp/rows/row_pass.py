@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_lcp.rows.layout import BoundFields, Known, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
+from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
 from warp_lcp.rows.native import HEADERS, shared, text
 from warp_lcp.rows.program import Launch, perform
 from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Stage, get_threads, ranges, team
@@ -165,8 +165,8 @@ class RowPass:
                 if length != rows.size:
                     raise ValueError(f"{self.name}: bounds have {length} elements, not {rows.size}")
         if stencil is not None:
-            d, weights = stencil.d, stencil.weights
-            stored = (type(stencil), d.dtype, weights[0].dtype if weights else None)
+            d, weights, pattern = stencil.d, stencil.weights, getattr(stencil, "pattern", None)
+            stored = (type(stencil), pattern, d.dtype, weights[0].dtype if weights else None)
             if d.size != (rows.other_size if self.finer else rows.size):
                 raise ValueError(f"{self.name}: the stencil has {d.size} elements, not {rows.other_size if self.finer else rows.size}")
         key = (constants, kind, *stored, *types)
@@ -174,7 +174,7 @@ class RowPass:
         if made is None:
             letters = tuple(sorted(self._letters(stencil, given).items()))
             numbers = tuple(zip(self.constants, constants, strict=True))
-            shape = KNOWN if isinstance(stencil, Known) else VARIABLE if weights else UNIFORM
+            shape = KNOWN if isinstance(stencil, Known) else stored[1] if stencil and stored[1] else VARIABLE if weights else UNIFORM
             made = self._forms[key] = _form(self, letters, numbers, shape, kind)
         self._check_memory(rows, given)
         return Bound(made, rows, made.fill(stencil, bounds, given))
@@ -247,7 +247,7 @@ class RowPass:
 
 
 @functools.cache
-def _form(declared: RowPass, letters: Any, constants: Any, shape: str, bounds: str) -> "Form":
+def _form(declared: RowPass, letters: Any, constants: Any, shape: str | Pattern, bounds: str) -> "Form":
     return Form(declared, dict(letters), dict(constants), shape, bounds)
 
 
@@ -261,13 +261,16 @@ class Form:
         run: native function (layout, fields, slab, row, chunk of the first task, number of tasks).
     """
 
-    def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], shape: str, bounds: str) -> None:
+    def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], shape: str | Pattern, bounds: str) -> None:
         self.declared, self.letters, self.bounds, d = declared, letters, bounds, declared
+        self.pattern = pattern = shape if isinstance(shape, Pattern) else None
+        shape = pattern.word if pattern else shape
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
         differing = [f"{name.lower()}{value}" for name, value in constants.items() if value != d.constants[name]]
         kinds = [shape] * bool(d.stencil) + [bounds] * (d.bounds and bounds != NUMBERS)
         self.words = [*kinds, *(t.__name__ for _, t in sorted(letters.items())), *differing]
-        parts = {"stencil": stencil_struct(of(d.stencil[0]), of(d.stencil[1]) if shape == VARIABLE else wp.float32)} if d.stencil else {}
+        weights = of(d.stencil[1]) if d.stencil and (shape == VARIABLE or (pattern and pattern.names)) else wp.float32
+        parts = {"stencil": stencil_struct(of(d.stencil[0]), weights, pattern)} if d.stencil else {}
         parts |= {"bounds": BoundFields} if d.bounds else {}
         self.types = {name: of(kind) for name, kind in d.arrays.items()}
         members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {n: of(t) for n, t in d.numbers.items()}
@@ -284,7 +287,7 @@ class Form:
 
     def _source(self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any) -> str:
         """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
-        d = self.declared
+        d, pattern = self.declared, self.pattern
         into = not {*d.ring}.isdisjoint(d.writes)
         levels = d.finer or bool(d.other)
         switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOX": bool(d.box)}
@@ -314,14 +317,21 @@ class Form:
             each += listed if d.listed else ["const int k = P.k + k0, j = P.j + j0, first = P.first + i0, last = first + n;"]
             each += [f"auto* {n} = given.{n}.data ? given.{n}.data + k*s1 + j*s2 : nullptr;" for n in d.box]
         if d.stencil:
-            each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz", "known")]
-            each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
+            fields, numbers = (pattern.names, pattern.numbers) if pattern else (("wx", "wy", "wz"), ("cx", "cy", "cz"))
+            first = "P.q" if d.finer else "p"
+            each += [f"const auto* {n} = given.stencil.{n}.data + {first};" for n in ("d", *fields, "known")]
+            each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", *numbers)]
+            if pattern:
+                into = f"const long long e = k + {first} - {'L.o0' if d.finer else 'L.base'}, a = yp, b = zp;"
+                each += [f"const auto place = [&](long long k) {{ {into} return wp::vec3i((int)(e / b), (int)(e % b / a), (int)(e % a)); }};"]
+                each += pattern.source()
         sums = [f"#define EACH_FOUND(DO) {' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}", text(HEADERS / "sums.h")]
         sums += ["#undef EACH_FOUND"]
         common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
         before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', *each]
         body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass
         closed = ["}"] * bool(d.listed)
+        macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
         tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
         return "\n".join(["", *before, *common, *body, *closed, '#line 1 "sums"', *(sums if d.found else []), *tail])
 
@@ -343,12 +353,21 @@ class Form:
     @functools.cached_property
     def kernel(self) -> Any:
         """The kernel of the pass alone."""
-        run, Fields = self.run, self.fields
+        run, Fields, touch = self.run, self.fields, self.pattern.touch if self.pattern else None
+        if touch is not None:
 
-        def alone(L: RowLayout, F: Fields):
-            i, j, c = wp.tid()
-            first = first_task(L)
-            run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
+            def alone(L: RowLayout, F: Fields):
+                i, j, c = wp.tid()
+                if L.planes < 0:
+                    touch(0)
+                first = first_task(L)
+                run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
+        else:
+
+            def alone(L: RowLayout, F: Fields):
+                i, j, c = wp.tid()
+                first = first_task(L)
+                run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
 
         alone.__name__ = alone.__qualname__ = self.declared.name.rpartition(".")[2]
         return wp.kernel(enable_backward=False, module=run.module.name)(alone)

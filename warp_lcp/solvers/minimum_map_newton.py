@@ -12,6 +12,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.line_hierarchy import needs_lines
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
@@ -80,7 +81,8 @@ class MinimumMapNewton(Settings):
         """
         if self.direct:
             return DirectNewtonWorkspace(problem, self)
-        return GridNewtonWorkspace(problem, problem.A, self) if has(problem.A, HasStencil) else NewtonWorkspace(problem, self)
+        by_grid = has(problem.A, HasStencil) and not needs_lines(problem.A)
+        return GridNewtonWorkspace(problem, problem.A, self) if by_grid else NewtonWorkspace(problem, self)  # type: ignore[arg-type]
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""

@@ -18,6 +18,7 @@ from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.multigrid.line_hierarchy import LineHierarchy, needs_lines
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.low_rank import LowRankOperator
@@ -157,6 +158,35 @@ class GridSystem(KrylovSystem):
     def monotone_cycle(self) -> None:
         """One projected cycle on r within the finest level's bounds; the correction is `z`."""
         self.hierarchy.monotone_cycle.run()
+
+
+class LineSystem(KrylovSystem):
+    """A Krylov method on a compact stencil in 2-D: conjugate gradients if A is symmetric, else GMRES, preconditioned by cycles over lines."""
+
+    def __init__(self, A: HasStencil, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False) -> None:
+        self._A = A
+        self._hierarchy = LineHierarchy(A.stencil, real, symmetric=A.symmetric, settings=settings)
+        finest = self._hierarchy.finest
+        self.r, self.z = finest.b, finest.x
+        self._weight = wp.zeros_like(self.r) if shifted else None
+        method = ConjugateGradient if A.symmetric else GMRES
+        self._iterate_by(method(finest.stencil.product, self, weight=self._weight), self._weight)
+
+    def refresh(self) -> None:
+        """Nothing is kept: `restrict` takes A's entries."""
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Take another free set and shift, and coarsen."""
+        self._hierarchy.restrict(free, shift, self._weight)
+
+    @property
+    def program(self) -> Program:
+        """Precondition: z = one cycle on r."""
+        return self._hierarchy.cycle
+
+    def apply(self) -> None:
+        """Precondition: run `program`."""
+        self.program.run()
 
 
 class CoupledGridSystem(KrylovSystem):
@@ -304,6 +334,8 @@ def principal_system(
     """
     A = problem.A
     if has(A, HasStencil):
+        if needs_lines(A):
+            return LineSystem(A, real, settings=settings, shifted=shifted)
         return GridSystem(A, real, bounded=bounded, settings=settings, shifted=shifted, hierarchy=hierarchy)
     if isinstance(A, DenseOperator):
         return DenseSystem(A)

@@ -1,0 +1,1 @@
+SIMD for (int k = 0; k < n; ++k) x[k] = 0;

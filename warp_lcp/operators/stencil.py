@@ -1,0 +1,285 @@
+"""Compact stencils of a user's own on a grid of cells, matrix-free: up to 9 points in 2-D, 27 in 3-D, symmetric or not."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, no_type_check
+
+import numpy as np
+import scipy.ndimage
+import warp as wp
+
+from warp_lcp.operators.components import FloatingComponents
+from warp_lcp.operators.grid_operator import GridOperator
+from warp_lcp.operators.padded_stencil import PaddedStencil
+from warp_lcp.problem.pickling import OnHost, made_again
+from warp_lcp.problem.protocol import AIR, FLUID, SOLID
+from warp_lcp.rows import RowPass
+from warp_lcp.rows.fields import check_kept, check_storable, real_array
+from warp_lcp.rows.layout import Pattern
+
+HEADERS = Path(__file__).parent / "headers"
+DIAGONAL = RowPass(
+    "stencil.diagonal", HEADERS / "compact_diagonal.h", "S", stencil=("S", "W"), reads={"cells": wp.int8, "center": "S", "shift": "S"},
+    optional=("center", "shift"), writes={"made": "S"}, numbers={"number": "S"},
+)  # fmt: skip
+TRANSPOSED = RowPass(
+    "stencil.transposed", HEADERS / "stencil_transposed.h", "S", stencil=("D", "W"), reads={"x": "S"}, writes={"y": "S"}
+)
+CENTER = (0, 0, 0)
+Offset = tuple[int, int, int]  # along x, y, z
+
+__all__ = ["Stencil"]
+
+
+class Stencil(GridOperator):
+    """Operator of a compact stencil on the FLUID cells of a grid: finite differences, volumes or elements of a user's own.
+
+    (A x)_i = sum over offsets o of a_o(i) x_(i + o) + shift_i x_i, with x = 0 in AIR, and x_(i + o) = x_i where i + o is SOLID (a closed
+    side: no flux). With other values in AIR cells, see `boundary_term`. Nothing is assembled: numbers are numbers in
+    the kernels, Warp functions are evaluated where a row is needed, arrays are read.
+
+    Args:
+        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or wp.array. Unknowns live on FLUID cells,
+            fields have the shape of `cells`.
+        coefficients: a_o by offset, (dz, dy, dx) or (dy, dx), each -1, 0 or 1, the center included; absent ones are 0. Each is a number,
+            an array of the shape of `cells`, or a Warp function of the cell's indices, (k, j, i) or (j, i), that returns a float; functions
+            and arrays do not mix. Or an array of numbers of shape (3, 3) or (3, 3, 3), the center in the middle.
+        shift: None, a number or an array of the shape of `cells`, >= 0.
+        periodic: whether x, y, z wrap around.
+        outside: what lies beyond the array where an axis is not periodic: SOLID, as for `wl.GridPoisson`, or AIR.
+        device: Warp device; that of `cells` or the default device if None.
+        dtype: storage of coefficients, wp.float32 or wp.float64. In float32 coefficients are rounded, so that the problem solved is another
+            one by about 1e-7 of the diagonal.
+
+    Attributes:
+        symmetric: whether a_o(i) = a_-o(i + o) between all unknowns, to the last bit.
+        monotone: whether all a_o but the center's are <= 0, as in an M-matrix.
+
+    Raises:
+        ValueError: an argument has a wrong shape or type or is not finite, an offset is not compact, or a row's diagonal is not positive;
+            the message names it.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.Stencil(np.full((1, 3), wl.FLUID), {(0, 0): 3.0, (0, -1): -2.0, (0, 1): -1.0}, outside=wl.AIR, device="cpu")
+        >>> print(A.apply(wp.array([[1.0, 1.0, 1.0]], dtype=wp.float64, device="cpu")).numpy(), A.symmetric)
+        [[2. 0. 1.]] False
+    """
+
+    def __init__(
+        self, cells: Any, coefficients: Mapping[tuple[int, ...], Any] | Any, *, shift: Any = None,
+        periodic: tuple[bool, ...] = (False, False, False), outside: int = SOLID, device: Any = None, dtype: Any = wp.float32,
+    ) -> None:  # fmt: skip
+        if outside not in (AIR, SOLID):
+            raise ValueError(f"outside = {outside}: allowed are wl.AIR = {AIR} and wl.SOLID = {SOLID}")
+        self.outside = outside
+        super().__init__(cells, {"coefficients": coefficients, "shift": shift}, periodic, device, dtype)
+
+    def _take_coefficients(self, cells: np.ndarray, *, coefficients: Any, shift: Any) -> None:
+        self._given = given = _by_offset(coefficients, cells.ndim)
+        self.shift = self._stored_shift(shift)
+        functions = {o: _of_three(f, cells.ndim) for o, f in given.items() if isinstance(f, wp.Function)}
+        values = {o: real_array(f, f"coefficients[{_named(o, cells.ndim)}]") for o, f in given.items() if o not in functions}
+        for o, f in values.items():
+            if f.ndim and f.shape != cells.shape:
+                raise ValueError(f"coefficients[{_named(o, cells.ndim)}] has shape {f.shape}: expected a number or {cells.shape}")
+            check_storable(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
+            check_kept(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
+        if functions and any(f.ndim for f in values.values()):
+            raise ValueError("coefficients: arrays and Warp functions do not mix, evaluate the functions or make the arrays functions")
+        fluid = cells.reshape(self.layout.padding.counts) == FLUID
+        evaluated = {o: self._evaluated(f) for o, f in functions.items()}  # to look at, not to keep
+        full = {o: np.broadcast_to(f.reshape(fluid.shape) if f.ndim else f, fluid.shape) for o, f in values.items()} | evaluated
+        self._center = self._stored(full[CENTER]) if evaluated.keys() & {CENTER} or values[CENTER].ndim else None
+        self._number = 0.0 if self._center is not None else float(values[CENTER])
+        around = [o for o in sorted(full, key=lambda o: o[::-1]) if o != CENTER and full[o][fluid].any()]
+        self.symmetric = all(self._mirrored(full, o, fluid) for o in around)
+        self.monotone = all(bool((full[o][fluid] <= 0).all()) for o in around)
+        stored = any(values[o].ndim for o in around if o in values) or (functions and any(self.periodic))
+        kind = "arrays" if stored else "functions" if any(o in functions for o in around) else "numbers"
+        halves = kind != "functions" and self.symmetric
+        offsets = tuple(o for o in around if not halves or o[::-1] < CENTER)
+        kept = tuple(functions.get(o, float(values[o]) if o in values else 0.0) for o in offsets) if kind == "functions" else ()
+        self._pattern = Pattern(offsets, halves, kind, kept)
+        self._weights = tuple(self._stored(-full[o], wrapped=True) for o in offsets) if stored else None
+        self._numbers = tuple(-float(values[o]) for o in offsets) if kind == "numbers" else ()
+        sizes = {o: float(np.abs(full[o][fluid]).mean()) if fluid.any() else 0.0 for o in around}
+        self._strength: Any = tuple(sum(size for o, size in sizes.items() if o[axis]) / 2 for axis in range(3))
+
+    def _mirrored(self, full: dict[Offset, np.ndarray], offset: Offset, fluid: np.ndarray) -> bool:
+        """Return whether the coefficients of an offset are those of the opposite one, seen from the neighbor, between unknowns."""
+        steps = tuple(-step for step in offset[::-1])
+        here, there = full[offset], full.get((-offset[0], -offset[1], -offset[2]), np.zeros(()))
+        moved, both = np.roll(np.broadcast_to(there, fluid.shape), steps, (0, 1, 2)), fluid & np.roll(fluid, steps, (0, 1, 2))
+        for axis, step in enumerate(steps):
+            if step and not self.periodic[2 - axis]:
+                np.moveaxis(both, axis, 0)[0 if step > 0 else -1] = False
+        return bool(np.array_equal(here[both], moved[both]))
+
+    def _evaluated(self, function: Any) -> np.ndarray:
+        """Return the values of a Warp function at all cells."""
+        out = wp.zeros(self.layout.padding.counts, dtype=wp.float64, device=self.device)
+        wp.launch(_evaluation(function), out.shape, [out], device=self.device)
+        values: np.ndarray = out.numpy()
+        check_storable(values, self.dtype, f"coefficients: {function.key}")
+        return values
+
+    def evaluated(self, function: Any) -> np.ndarray:
+        """Return the values of one of the pattern's functions as a stored field."""
+        return np.pad(self._evaluated(function), 1).ravel()
+
+    def _stored(self, values: np.ndarray, *, wrapped: bool = False) -> wp.array[Any]:
+        """Return coefficients of all cells as a stored field; ghost cells of periodic axes have those of the cells they stand for."""
+        padded = np.pad(values, 1)
+        for axis in range(3) if wrapped else ():
+            if self.periodic[2 - axis]:
+                lines = np.moveaxis(padded, axis, 0)
+                lines[0], lines[-1] = lines[-2], lines[1]
+        return wp.array(padded.ravel(), dtype=self.dtype, device=self.device)
+
+    def _empty_stencil(self) -> PaddedStencil:
+        layout = self.layout
+        options = {"periodic": self.periodic, "spans": self._spans, "strength": self._strength, "pattern": self._pattern}
+        return PaddedStencil(layout.padding, layout.zeros(self.dtype), self._weights, self._numbers, **options)  # type: ignore[arg-type]
+
+    def _fill_stencil(self) -> None:
+        s = self.stencil
+        self._wrap_cells()
+        shift = self.shift.flatten() if self.shift.size else None
+        given = {"cells": self.cells_around.flatten(), "center": self._center, "shift": shift, "number": self._number}
+        DIAGONAL.bind(self._rows_in_reach, stencil=s, **given, made=s.d).launch()
+        d, fluid = s.d.numpy(), self.cells.numpy().ravel() == FLUID
+        if not (d[fluid] > 0).all():
+            where = tuple(map(int, np.argwhere((fluid & (d <= 0)).reshape(self.layout.stored_shape))[0] - 1))[-len(self.shape) :]
+            raise ValueError(f"coefficients: the diagonal of cell {where} is {d[fluid].min():.3g}, with its closed sides: must be > 0")
+
+    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A' x, as `apply` does A x."""
+        return self._applied(x, out, transposed=not self.symmetric)
+
+    def _product(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
+        if not transposed:
+            super()._product(x, out, transposed=False)
+            return
+        self.stencil.wrap(x)
+        TRANSPOSED.bind(self.stencil.rows, stencil=self.stencil, x=x, y=out).launch()
+
+    def boundary_term(self, values: Any) -> wp.array[Any]:
+        """Return what given values in AIR cells, in place of 0, add to b: the sums of a_o(i) value_(i + o), float64, shape of `cells`.
+
+        Args:
+            values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2, nx + 2), with what lies outside; what FLUID
+                and SOLID cells have does not matter.
+        """
+        host = real_array(values, "values")
+        padded = np.zeros(self.layout.stored_shape)
+        if host.shape == self.shape:
+            padded[1:-1, 1:-1, 1:-1] = host
+        elif host.shape == tuple(n + 2 for n in self.shape):
+            padded[(slice(None),) * 3 if host.ndim == 3 else 1] = host
+        else:
+            raise ValueError(f"values has shape {host.shape}: expected {self.shape} or {tuple(n + 2 for n in self.shape)}")
+        check_storable(padded, wp.float64, "values")
+        given = wp.array(np.where(self.cells.numpy() == AIR, padded, 0).ravel(), dtype=wp.float64, device=self.device)
+        out = self.layout.zeros(wp.float64)
+        self.stencil.product(given, out)
+        return self.layout.unload(out)
+
+    def floating_components(self, scratch: Any = None) -> FloatingComponents | None:
+        """Return the components of cells on which rows and columns sum to 0, so that A is singular with constants; None if there are none."""
+        if self._finder is None or self._finder[0] != self.version:
+            self._finder = self.version, self._find_floating()
+        found: FloatingComponents | None = self._finder[1]
+        return found
+
+    def _find_floating(self) -> FloatingComponents | None:
+        """Look for components that no row's sum holds, of a symmetric A: on the host, for all that is needed are sums of rows."""
+        if not self.symmetric or any(self.periodic):
+            return None
+        ones = self.layout.load(np.ones(self.shape), wp.float64).numpy()
+        inside = (self.cells.numpy() == FLUID) & (self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0)
+        x, sums = wp.array(np.where(inside.ravel(), ones, 0), dtype=wp.float64, device=self.device), self.layout.zeros(wp.float64)
+        self.stencil.product(x, sums)
+        rounding = 8 * float(np.finfo(wp.dtype_to_numpy(self.dtype)).eps)
+        held = (np.abs(sums.numpy()) > rounding * self.stencil.d.numpy()).reshape(inside.shape)
+        if not (inside & ~held).any():
+            return None
+        number, count = scipy.ndimage.label(inside, np.ones((3, 3, 3)))
+        holding = np.zeros(count + 1, dtype=bool)
+        holding[np.unique(number[held & inside])] = True
+        holding[0] = True
+        if holding.all():
+            return None
+        names = np.where(holding, -1, np.cumsum(~holding) - 1).astype(np.int32)
+        return FloatingComponents(names[number].ravel(), self.device)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle cells and coefficients; those that are Warp functions as arrays."""
+        cells, options = self._pickled()
+        n = cells.ndim
+        given = {o[::-1][3 - n :]: self._evaluated(_of_three(f, n)).reshape(cells.shape) if isinstance(f, wp.Function) else
+                 f.numpy() if isinstance(f, wp.array) else f for o, f in self._given.items()}  # fmt: skip
+        shift = OnHost(self.shift) if self.shift.size else None
+        return made_again(Stencil, cells, given, device=self.device, shift=shift, outside=self.outside, **options)
+
+
+def _named(offset: Offset, dimension: int) -> tuple[int, ...]:
+    """Return an offset as users write it."""
+    return offset[::-1][3 - dimension :]
+
+
+def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
+    """Return coefficients by offset along x, y, z, the center among them."""
+    if not isinstance(coefficients, Mapping):
+        host = real_array(coefficients, "coefficients")
+        if host.shape != (3,) * dimension:
+            raise ValueError(f"coefficients has shape {host.shape}: expected {(3,) * dimension}, or a mapping by offset")
+        places = itertools.product(range(3), repeat=dimension)
+        coefficients = {tuple(i - 1 for i in place): float(host[place]) for place in places if host[place]}
+    given: dict[Offset, Any] = {}
+    for offset, value in coefficients.items():
+        steps = tuple(offset) if isinstance(offset, tuple) else (offset,)
+        if len(steps) != dimension or not all(isinstance(s, (int, np.integer)) and -1 <= s <= 1 for s in steps):
+            form = ("(dy, dx)", "(dz, dy, dx)")[dimension - 2]
+            raise ValueError(f"coefficients: offset {offset}: expected {form}, each -1, 0 or 1: wider stencils are a wl.SparseOperator's")
+        given[tuple(map(int, reversed((0,) * (3 - dimension) + steps)))] = value  # type: ignore[index]
+    if CENTER not in given:
+        raise ValueError(f"coefficients: the center, offset {(0,) * dimension}, is missing")
+    return given
+
+
+@functools.cache
+def _of_three(function: Any, dimension: int) -> Any:
+    """Return a Warp function of (k, j, i) in float64 from one of a cell's indices."""
+    count = len(function.input_types)
+    if count != dimension:
+        raise ValueError(f"coefficients: {function.key} takes {count} arguments: expected the {dimension} indices of a cell, integers")
+    if dimension == 3:
+
+        @no_type_check
+        def of_cell(k: int, j: int, i: int):
+            return wp.float64(function(k, j, i))
+    else:
+
+        @no_type_check
+        def of_cell(k: int, j: int, i: int):
+            return wp.float64(function(j, i))
+
+    of_cell.__name__ = of_cell.__qualname__ = f"{function.key}_of_cell"
+    return wp.func(of_cell)
+
+
+@functools.cache
+def _evaluation(function: Any) -> Any:
+    """Return a kernel that evaluates a Warp function of (k, j, i) at all cells."""
+
+    @no_type_check
+    def evaluate(out: wp.array3d(dtype=wp.float64)):  # type: ignore[valid-type]
+        k, j, i = wp.tid()
+        out[k, j, i] = function(k, j, i)
+
+    return wp.kernel(enable_backward=False, module="unique")(evaluate)
