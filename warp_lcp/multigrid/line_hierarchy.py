@@ -19,14 +19,12 @@ import warp as wp
 from warp_lcp.multigrid.cycle_passes import SOLVE
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
+from warp_lcp.operators.stencil import AROUND
 from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import Padding
-from warp_lcp.rows.layout import Pattern
 from warp_lcp.rows.program import Program
 
 HEADERS = Path(__file__).parent / "headers"
-AROUND = tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y)
-STORED = Pattern(AROUND, symmetric=False, kind="arrays")
 WEIGHTS = {"weights": "S"}
 FILL = RowPass(
     "lines.fill", HEADERS / "compact_fill.h", "S", stencil=("D", "W"), reads={"free": wp.uint8, "shift": wp.float64}, optional=("shift", "weight"),
@@ -88,29 +86,29 @@ class LineLevel:
         self.x, self.b, self.t, self.d = (padding.zeros(real, device) for _ in range(4))
         self.lines = [(make(1), make(1)) for _ in range(2)]  # one over pivots and multiples, along x and along y
         each = tuple(self.weights[i * n : (i + 1) * n] for i in range(8))
-        self.stencil = PaddedStencil(padding, self.d, each, (), pattern=STORED)
+        self.stencil = PaddedStencil(padding, self.d, each, (), pattern=AROUND)
         self.rows = Rows.of(padding, device, whole=True)
         self.columns = Rows.strided(
             n, device, (self.rows.single.base, padding.plane, padding.row), (1, 1, padding.counts[2]), cells=COLUMNS if device.is_cpu else 2
         )
 
     def transferring(self) -> list[Bound]:
-        """Return the passes that make shares and line factors."""
-        n, given = self.padding.size, {"d": self.d, "weights": self.weights, "size": self.padding.size}
+        """Return the passes that make shares."""
+        given = {"d": self.d, "weights": self.weights, "size": self.padding.size}
         given |= dict(zip(FACTORS, self.factors, strict=True))
         kinds = [{"SAME": 1}] if self.restricts is self.shares else [{"RESTRICTION": 0}, {"RESTRICTION": 1}]
         passes = []
         for shares, kind in zip((self.shares, self.restricts), kinds, strict=False):
             passes += [EDGES.bind(self.rows, **given, shares=shares, **kind)]
             passes += [CORNERS.bind(self.rows, **given, shares=shares, **kind)] if self.factors == (2, 2) else []
-        return passes + self.factoring(n)
+        return passes
 
-    def factoring(self, n: int) -> list[Bound]:
+    def factoring(self) -> list[Bound]:
         """Return the passes that eliminate along lines."""
         made = []
         for rows, (pivots, multiples), along in zip((self.rows, self.columns), self.lines, self._along, strict=True):
             fields = {"unused": self.d, "weights": self.weights, "diagonals": self.d, "pivots": pivots, "multiples": multiples}
-            made.append(FACTOR.bind(rows, **fields, size=n, **along))
+            made.append(FACTOR.bind(rows, **fields, size=self.padding.size, **along))
         return made
 
     @property
@@ -142,16 +140,18 @@ class LineLevel:
 
     def restricting(self, coarse: LineLevel) -> list[Bound]:
         """Return what hands the residual on."""
-        rows, numbers = coarse.rows.beside(self.rows, (*self.factors, 1)), dict(zip(FACTORS, self.factors, strict=True))
-        numbers |= {"size": self.padding.size, "cells": self.padding.counts[2]}
-        fields = {"t": self.t, "shares": self.restricts[: self.padding.size], "coarse": coarse.b}
-        residual = RESIDUAL.bind(self.rows, stencil=self.stencil, x=self.x, b=self.b, t=self.t)
-        return [residual, DOWN.bind(rows, **fields, **numbers)]
+        return [RESIDUAL.bind(self.rows, stencil=self.stencil, x=self.x, b=self.b, t=self.t), self.handing_down(coarse)]
 
-    def correcting(self, coarse: LineLevel) -> Bound:
-        """Return what adds the coarse correction."""
+    def handing_down(self, coarse: LineLevel) -> Bound:
+        """Return what makes t the coarse right-hand side."""
+        numbers = {"size": self.padding.size, "cells": self.padding.counts[2], **dict(zip(FACTORS, self.factors, strict=True))}
+        fields = {"t": self.t, "shares": self.restricts[: self.padding.size], "coarse": coarse.b}
+        return DOWN.bind(coarse.rows.beside(self.rows, (*self.factors, 1)), **fields, **numbers)
+
+    def correcting(self, coarse: LineLevel, *, add: bool = True) -> Bound:
+        """Return what adds the coarse correction, or takes it."""
         rows = self.rows.beside(coarse.rows, (-self.factors[0], -self.factors[1], -1))
-        return UP.bind(rows, coarse=coarse.x, d=self.d, x=self.x, shares=self.shares, size=self.padding.size, add=True)
+        return UP.bind(rows, coarse=coarse.x, d=self.d, x=self.x, shares=self.shares, size=self.padding.size, add=add)
 
 
 class LineHierarchy:
@@ -184,16 +184,25 @@ class LineHierarchy:
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None, weight: wp.array[Any] | None = None) -> None:
         """Take another free set (stored uint8 field) and shift (stored float64 field), write one over the diagonal to `weight`, and coarsen."""
+        self._fill(free, shift, weight)
+        self._building.run()
+
+    def take_all(self, free: wp.array[Any]) -> None:
+        """Take a free set for transfers between the two finest levels only."""
+        self._fill(free, None, None)
+        for made in self.finest.transferring():
+            made.launch()
+
+    def _fill(self, free: wp.array[Any], shift: wp.array[Any] | None, weight: wp.array[Any] | None) -> None:
         finest = self.finest
         given: dict[str, Any] = {"free": free, "shift": shift, "weight": weight, "made": finest.d, "weights": finest.weights}
-        FILL.bind(Rows.of(finest.padding, self.device, whole=True), stencil=self._source, **given, size=finest.padding.size).launch()
-        self._building.run()
+        FILL.bind(finest.rows, stencil=self._source, **given, size=finest.padding.size).launch()
 
     @cached_property
     def _building(self) -> Program:
         program = Program(self.device)
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
-            for made in (*fine.transferring(), fine.coarsening(coarse)):
+            for made in (*fine.transferring(), *fine.factoring(), fine.coarsening(coarse)):
                 made.launch(program.launch)
         last = self.levels[-1]
         _, ny, nx = last.padding.counts

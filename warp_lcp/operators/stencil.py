@@ -18,7 +18,7 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass
-from warp_lcp.rows.fields import check_kept, check_storable, real_array
+from warp_lcp.rows.fields import Padding, check_kept, check_storable, real_array
 from warp_lcp.rows.layout import Pattern
 
 HEADERS = Path(__file__).parent / "headers"
@@ -30,6 +30,7 @@ TRANSPOSED = RowPass(
     "stencil.transposed", HEADERS / "stencil_transposed.h", "S", stencil=("D", "W"), reads={"x": "S"}, writes={"y": "S"}
 )
 CENTER = (0, 0, 0)
+AROUND = Pattern(tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y), symmetric=False, kind="arrays")  # all neighbors in 2-D
 Offset = tuple[int, int, int]  # along x, y, z
 
 __all__ = ["Stencil"]
@@ -225,6 +226,38 @@ class Stencil(GridOperator):
                  f.numpy() if isinstance(f, wp.array) else f for o, f in self._given.items()}  # fmt: skip
         shift = OnHost(self.shift) if self.shift.size else None
         return made_again(Stencil, cells, given, device=self.device, shift=shift, outside=self.outside, **options)
+
+
+class StoredStencil(GridOperator):
+    """A level of a hierarchy as an operator: its own copy of a compact stencil in 2-D whose diagonal and weights are stored.
+
+    Args:
+        padding: of the level.
+        d: its diagonal.
+        weights: of its eight neighbors, one field after another.
+        inside: bool of each stored cell: which are unknowns.
+        symmetric: whether they make a symmetric matrix.
+    """
+
+    monotone = False
+
+    def __init__(self, padding: Padding, d: wp.array[Any], weights: wp.array[Any], inside: np.ndarray, *, symmetric: bool) -> None:
+        self.symmetric = symmetric
+        cells = np.where(inside.reshape(padding.shape)[1, 1:-1, 1:-1], FLUID, AIR)
+        super().__init__(cells, {"d": d, "weights": weights}, (), d.device, d.dtype)
+
+    def _take_coefficients(self, cells: np.ndarray, *, d: wp.array[Any], weights: wp.array[Any]) -> None:
+        n, self._d = d.size, wp.clone(d)
+        copied = wp.clone(weights)
+        self._weights = tuple(copied[i * n : (i + 1) * n] for i in range(8))
+
+    def _empty_stencil(self) -> PaddedStencil:
+        inside = wp.array((self.cells.numpy().ravel() == FLUID).astype(np.uint8), device=self.device)
+        wp.copy(self._d, wp.array(self._d.numpy() * inside.numpy(), dtype=self.dtype, device=self.device))
+        return PaddedStencil(self.layout.padding, self._d, self._weights, (), spans=self._spans, strength=(1.0, 1.0, 1.0), pattern=AROUND)
+
+    def _fill_stencil(self) -> None:
+        self._wrap_cells()
 
 
 def _named(offset: Offset, dimension: int) -> tuple[int, ...]:

@@ -22,8 +22,17 @@ from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.phases import CoarseProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
-from warp_lcp.solvers.principal_system import CLASSIFY, ON_FREE, DenseSystem, GridSystem, PrincipalSystem, principal_system, projected_move
+from warp_lcp.solvers.phases import CoarseProblem, CoarseStencilProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
+from warp_lcp.solvers.principal_system import (
+    CLASSIFY,
+    ON_FREE,
+    DenseSystem,
+    GridSystem,
+    LineSystem,
+    PrincipalSystem,
+    principal_system,
+    projected_move,
+)
 from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
 
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
@@ -113,6 +122,8 @@ class NewtonWorkspace(IterateMemory):
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
         self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
         self.coarse = CoarseProblem(problem.A, settings) if cycled else None  # type: ignore[arg-type]
+        if self.bounded and isinstance(self.system, LineSystem):
+            self.coarse = CoarseStencilProblem(problem.A, self.system, settings)  # type: ignore[arg-type]
         self.start(warm=True, tolerance=0.0)
 
     def _principal_system(self) -> PrincipalSystem:
@@ -190,7 +201,7 @@ class NewtonWorkspace(IterateMemory):
 
     def _minimizes(self) -> bool:
         """Return whether conjugate gradients within the bounds may take over: A has an energy, and is no matrix for coarse problems."""
-        if self.coarse is None or not self.problem.A.symmetric:
+        if self.coarse is None or not self.problem.A.symmetric or not isinstance(self.problem.A, SparseOperator):
             return False
         host = self.problem.A.matrix()  # type: ignore[attr-defined]
         return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())

@@ -14,8 +14,9 @@ import warp as wp
 from warp_lcp.multigrid.aggregates import coarse_points, suits_multigrid
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.operators.stencil import StoredStencil
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has
+from warp_lcp.problem.protocol import FLUID, HasRows, HasScale, HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, Step, solve
@@ -23,7 +24,7 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import Rows
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers.dense_problem import proved_infeasible
-from warp_lcp.solvers.principal_system import ALL_FREE, ON_FREE, GridSystem
+from warp_lcp.solvers.principal_system import ALL_FREE, ON_FREE, GridSystem, LineSystem
 from warp_lcp.solvers.projected_multigrid_kernels import GAPS, SIZE
 
 if TYPE_CHECKING:
@@ -380,11 +381,15 @@ class CoarseProblem:
 
     def correction(self, problem: LCP, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return P e for the problem at x, where A x + b = y."""
-        work, fields = self._work, (self._R @ y, (problem.lower.numpy() - x)[self._points], (problem.upper.numpy() - x)[self._points])
+        points = self._points
+        return self._P @ self._solved(self._R @ y, (problem.lower.numpy() - x)[points], (problem.upper.numpy() - x)[points]).numpy()
+
+    def _solved(self, *fields: np.ndarray) -> wp.array[Any]:
+        """Return the coarse problem's rough solution for this b, lower and upper."""
+        work = self._work
         for field, values in zip((work.problem.b, work.problem.lower, work.problem.upper), fields, strict=True):
             field.assign(values)
-        e = solve(work.problem, self._settings, stopping=ROUGH(), workspace=work).x.numpy()
-        return self._P @ e
+        return solve(work.problem, self._settings, stopping=ROUGH(), workspace=work).x
 
     def _refresh(self) -> bool:
         """Choose points of A as it is now, if it has changed since; return whether there are any."""
@@ -401,3 +406,67 @@ class CoarseProblem:
             if self._work.coarse is not None:
                 self._work.coarse = CoarseProblem(A, self._settings, coarse=True)
         return self._work is not None
+
+
+class CoarseStencilProblem(CoarseProblem):
+    """The same on every second cell of a compact stencil's grid, with the transfers of its hierarchy; each solve begins with a correction.
+
+    With coarse problems on all levels that is nested iteration: Newton's steps then start with a contact that is right but for a layer or two
+    of cells, cold or from another time step's solution, and come to the end in as many as a linear solve takes.
+
+    Args:
+        A: the operator.
+        system: of the fine problem.
+        settings: of Newton's method.
+    """
+
+    def __init__(self, A: HasStencil, system: LineSystem, settings: MinimumMapNewton) -> None:
+        self._system, self._hierarchy = system, system.hierarchy
+        super().__init__(A, settings, coarse=True)  # type: ignore[arg-type]
+
+    def start(self) -> None:
+        """A correction is due at once, others where the set creeps."""
+        self._moved, self._crept, self._wait, self._begins = 0.0, 0, STEPS, True
+
+    def is_due(self, moved: float) -> bool:
+        """Return whether a correction should come now."""
+        if not self._begins:
+            return super().is_due(moved)
+        self._begins = False
+        return self._refresh()
+
+    def correction(self, problem: LCP, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return P e for the problem at x, where A x + b = y."""
+        hierarchy, kind = self._hierarchy, self._hierarchy.finest.t.dtype
+        hierarchy.take_all(self._free)
+        fine, coarse, size = hierarchy.finest, hierarchy.levels[1], float(np.abs(y).max()) or 1.0
+        fine.t.assign((y / size).astype(wp.dtype_to_numpy(kind)))
+        fine.handing_down(coarse).launch()
+        held = (self._points((bound.numpy() - x) / size) for bound in (problem.lower, problem.upper))
+        coarse.x.assign(self._solved(coarse.b.numpy().astype(np.float64), *held).numpy().astype(wp.dtype_to_numpy(kind)))
+        fine.correcting(coarse, add=False).launch()
+        return size * fine.x.numpy().astype(np.float64)
+
+    def _points(self, field: np.ndarray) -> np.ndarray:  # type: ignore[override]
+        """Return the coarse cells' values of a stored field, as a stored field."""
+        fine, coarse = self._hierarchy.levels[:2]
+        values, (fx, fy) = np.zeros(coarse.padding.shape), fine.factors
+        values[1:-1, 1:-1, 1:-1] = field.reshape(fine.padding.shape)[1:-1, 1:-1:fy, 1:-1:fx]
+        return values.ravel()
+
+    def _refresh(self) -> bool:
+        """Make the coarse problem of A as it is now, if it has changed since; return whether there is one."""
+        if self._version == self._A.version or len(self._hierarchy.levels) < 2:
+            return self._work is not None
+        self._version, hierarchy = self._A.version, self._hierarchy  # type: ignore[attr-defined]
+        fluid = self._A.cells.numpy().ravel() == FLUID  # type: ignore[attr-defined]
+        self._free = wp.array(fluid.astype(np.uint8), device=hierarchy.device)
+        hierarchy.restrict(self._free)
+        coarse = hierarchy.levels[1]
+        inside = (coarse.d.numpy() != 0) & (self._points(fluid.astype(np.float64)) != 0)
+        if not inside.any():
+            return False
+        A = StoredStencil(coarse.padding, coarse.d, coarse.weights, inside, symmetric=self._A.symmetric)
+        b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
+        self._work = self._settings.init(LCP(A, b.reshape(A.layout.stored_shape), lower, upper))
+        return True

@@ -165,8 +165,8 @@ class LineSystem(KrylovSystem):
 
     def __init__(self, A: HasStencil, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False) -> None:
         self._A = A
-        self._hierarchy = LineHierarchy(A.stencil, real, symmetric=A.symmetric, settings=settings)
-        finest = self._hierarchy.finest
+        self.hierarchy = LineHierarchy(A.stencil, real, symmetric=A.symmetric, settings=settings)
+        finest = self.hierarchy.finest
         self.r, self.z = finest.b, finest.x
         self._weight = wp.zeros_like(self.r) if shifted else None
         method = ConjugateGradient if A.symmetric else GMRES
@@ -177,12 +177,12 @@ class LineSystem(KrylovSystem):
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take another free set and shift, and coarsen."""
-        self._hierarchy.restrict(free, shift, self._weight)
+        self.hierarchy.restrict(free, shift, self._weight)
 
     @property
     def program(self) -> Program:
         """Precondition: z = one cycle on r."""
-        return self._hierarchy.cycle
+        return self.hierarchy.cycle
 
     def apply(self) -> None:
         """Precondition: run `program`."""
