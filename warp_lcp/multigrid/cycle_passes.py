@@ -57,6 +57,21 @@ COARSEN = RowPass(
     by_row={"coarse_changed": wp.uint8}, writes=dict.fromkeys(("coarse_d", "coarse_wx", "coarse_wy", "coarse_wz"), "S"),
     numbers={"cells": int, "periodic_x": bool, "periodic_y": bool, "periodic_z": bool, "stiffen": "S", "held": "S"},
 )  # fmt: skip
+COARSEN_COMPACT = RowPass(
+    "coarsen.compact", HEADERS / "coarsen_compact.h", "S", stencil=("F", "W"), finer=True, other={}, by_row={"coarse_changed": wp.uint8},
+    whole={"changed": wp.uint8, "coarse_weights": "S"}, writes={"coarse_d": "S"}, constants={"MASK": 0},
+    numbers={
+        "cells": int, "coarse_size": wp.int64, "periodic_x": bool, "periodic_y": bool, "periodic_z": bool, "stiffen": "S", "held": "S"
+    },
+)  # fmt: skip
+ASSEMBLE = RowPass(
+    "coarsen.assemble", HEADERS / "assemble.h", wp.float64, stencil=("F", "W"), whole={"matrix": wp.float64},
+    numbers={"cells": int, "lines": int, "planes": int, "periodic_x": bool, "periodic_y": bool, "periodic_z": bool},
+)  # fmt: skip
+ELIMINATE = RowPass(
+    "coarsen.eliminate", HEADERS / "eliminate.h", wp.float64, whole=dict.fromkeys(("matrix", "inverse", "own"), wp.float64),
+    numbers={"m": int, "least": wp.float64},
+)  # fmt: skip
 HOLD = RowPass(
     "coarsen.hold", HEADERS / "hold.h", "B", reads={"d": "A", "free": wp.uint8}, writes={"out_d": "B"}, by_row={"changed": wp.uint8}
 )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
 import warp as wp
 
 from warp_lcp.multigrid import cycle_passes as passes
+from warp_lcp.multigrid.compact_levels import DenseInverse, coarser_pattern, mask, weights_block
 from warp_lcp.multigrid.coarsest_kernels import PINNED, coarsest_kernels
 from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.cycle_settings import CycleSettings
@@ -41,7 +43,8 @@ class Level:
         self.x, self.b, self.t = field(), field(), field()
         nothing = wp.empty(0, dtype=real, device=stencil.device)
         self.lower, self.upper = (bounds or (field(), field() if upper else nothing)) if bounded else (self.x, self.x)
-        self.form = stencil.weights is not None, stencil.d.dtype, real
+        self.form = stencil.weights is not None, stencil.d.dtype, real, stencil.pattern
+        self.block: wp.array[Any] | None = None  # weights of a compact level, one field after another
         self.factors = 1, 1, 1  # cells of the finer level along x, y and z that one of this level stands for
         self._bound: dict[Any, Any] = {}  # passes by what tells them apart: a W-cycle repeats few of them many times
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
@@ -56,7 +59,7 @@ class Level:
             keeps_weights: whether the weights are not the level's own to clear.
         """
         s = self.stencil
-        weights = dict(zip(passes.LOWER, (None if keeps_weights else s.weights) or (None,) * 3, strict=True))
+        weights = dict(zip(passes.LOWER, (None if keeps_weights or s.pattern else s.weights) or (None,) * 3, strict=True))
         fields = {"x": self.x, "b": self.b, "t": self.t, "diagonals": s.d, **weights}
         rows = Rows.of(s.padding, s.device, whole=True)
         return passes.RENEW.bind(rows, **fields, spans=s.spans, known=self._spans, changed=self.changed)
@@ -70,11 +73,15 @@ class Level:
     def coarsening(self, coarse: Level, stiffen: float, held: float) -> Bound:
         """Return the pass that makes those of the coarser level's rows that depend on rows of this level that have changed."""
         s, c = self.stencil, coarse.stencil
+        turns = dict(zip(("periodic_x", "periodic_y", "periodic_z"), s.periodic, strict=True))
+        numbers = {"cells": s.padding.counts[2], "stiffen": stiffen, "held": held, **turns}
+        if coarse.block is not None:
+            given = {"changed": self.changed, "coarse_changed": coarse.changed, "coarse_d": c.d, "coarse_weights": coarse.block}
+            numbers |= {"coarse_size": c.padding.size, "MASK": mask(c.pattern)}
+            return passes.COARSEN_COMPACT.bind(self._coarser_rows(coarse), stencil=s, **given, **numbers)
         names = ("coarse_d", "coarse_wx", "coarse_wy", "coarse_wz")
         fields = dict(zip(names, (c.d, *(c.weights or ())), strict=True)) | {"changed": self.changed, "coarse_changed": coarse.changed}
-        fields |= dict(zip(("periodic_x", "periodic_y", "periodic_z"), s.periodic, strict=True))
-        rows, cells = self._coarser_rows(coarse), s.padding.counts[2]
-        return passes.COARSEN.bind(rows, stencil=s, **fields, cells=cells, stiffen=stiffen, held=held)
+        return passes.COARSEN.bind(self._coarser_rows(coarse), stencil=s, **fields, **numbers)
 
     def restricting(self, coarse: Level) -> Bound:
         """Return the pass that sums the residual over aggregates."""
@@ -214,7 +221,7 @@ class Hierarchy:
         self._add_levels(bounded=bounded)
         self._prepare_coarsest()
         s = self.finest.stencil
-        signed = s.weights is not None and s.spans is not None
+        signed = s.weights is not None and s.spans is not None and s.pattern is None
         self._signs = wp.zeros(s.padding.counts[:2], dtype=wp.uint64, device=self.device) if signed else None  # of rows of weights
         self._descents: dict[tuple[int, bool, bool], Program] = {}
         self.refresh()
@@ -227,13 +234,11 @@ class Hierarchy:
 
     def _prepare_coarsest(self) -> None:
         """Make what solves on the coarsest levels."""
-        m = math.prod(self.levels[-1].stencil.padding.counts)
-        self._matrix, self._inverse = (wp.zeros((m, m), dtype=wp.float64, device=self.device) for _ in range(2))
+        self._dense = DenseInverse(self.levels[-1].stencil.padding.counts, self.device)
         cells = self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
+        cells = 0 if self.finest.stencil.pattern is not None else cells
         self._first_small = first_small(self.levels, cells)  # its index; none is small: len(levels)
-        last, names = self.levels[-1], ("nz", "ny", "nx")
-        fields = {"inverse": self._inverse, "b": last.b, "x": last.x, **dict(zip(names, last.stencil.padding.counts, strict=True))}
-        self._solving = passes.SOLVE.bind(Rows.flat(m, self.device), **fields)
+        self._solving = self._dense.solving(self.levels[-1])
         small = self.levels[self._first_small :]
         self._small = SmallLevels(small, self.settings, self._solving) if small else None
         self._last = SmallLevels(self.levels[-1:], self.settings, self._solving)
@@ -258,7 +263,7 @@ class Hierarchy:
         for w, source in zip(ours or (), theirs or (), strict=True):
             if w is not source:
                 convert(source, w)
-        if self.finest.stencil.spans is None:
+        if self.finest.stencil.spans is None or self.finest.stencil.pattern is not None:
             self.finest.changed.fill_(1)
         self._renewal.run()
 
@@ -312,15 +317,18 @@ class Hierarchy:
 
     def _factor_coarsest(self, program: Program) -> None:
         """Record the preparation of solves on the coarsest level."""
-        last, m = self.levels[-1], self._matrix.shape[0]
-        s, kernels = last.stencil, coarsest_kernels(*last.form)
+        last, matrix, inverse = self.levels[-1], self._dense.matrix, self._dense.inverse
+        if last.stencil.pattern is not None:
+            self._dense.making(last.stencil, self.real, program.launch)
+            return
+        s, m, kernels = last.stencil, matrix.shape[0], coarsest_kernels(*last.form[:3])
         inputs = [s.struct, s.rows.single, wp.vec3i(*map(int, s.periodic)), wp.float64(PINNED[self.real])]
         if self.device.is_cuda and self._small is not None:
-            inputs += [CUDA_THREADS, self._matrix, self._inverse]
+            inputs += [CUDA_THREADS, matrix, inverse]
             program.launch(kernels.invert, CUDA_THREADS, inputs, device=self.device, block_dim=CUDA_THREADS)
             return
-        program.launch(kernels.factor, 1, [*inputs, last.changed, self._matrix], device=self.device)
-        fields = {"changed": last.changed, "matrix": self._matrix, "inverse": self._inverse}
+        program.launch(kernels.factor, 1, [*inputs, last.changed, matrix], device=self.device)
+        fields = {"changed": last.changed, "matrix": matrix, "inverse": inverse}
         passes.INVERT.bind(Rows.flat(m, self.device), **fields, m=m, flags=last.changed.size).launch(program.launch)
 
     @cached_property
@@ -446,14 +454,17 @@ class Hierarchy:
         padding = Padding(fewer, s.padding.small_pages)
         for axis in range(3):  # a coarse face is as many finer ones as the other axes were aggregated by
             self._strength[axis] *= math.prod(factors) / factors[axis]
-        new = [padding.zeros(self.real, self.device) for _ in range(4)]
+        pattern = coarser_pattern(s.pattern, factors) if s.pattern else None
+        block, weights = weights_block(pattern, padding, self.real, self.device) if pattern else (None, None)
+        new = [padding.zeros(self.real, self.device) for _ in range(1 if pattern else 4)]
         periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(padding.counts), strict=True))
         spans = None if s.spans is None else wp.zeros(padding.counts[:2], dtype=wp.vec2i, device=self.device)
-        weights = (new[1], new[2], new[3])
+        weights = weights or (new[1], new[2], new[3])
         ghosts = None if s.ghosts is None else s.ghosts.coarser(factors)
-        stencil = PaddedStencil(padding, new[0], weights, (0.0, 0.0, 0.0), 1.0, periodic, spans, ghosts=ghosts)  # type: ignore[arg-type]
+        numbers = () if pattern else (0.0, 0.0, 0.0)
+        stencil = PaddedStencil(padding, new[0], weights, numbers, 1.0, periodic, spans, ghosts=ghosts, pattern=pattern)  # type: ignore[arg-type]
         level = Level(stencil, self.real, bounded=bounded, upper=fine.upper.size > 0)
-        level.factors = factors
+        level.factors, level.block = factors, block
         # visiting levels of half the cells twice would cost as much on each of them: only every second one is
         level.shrunk = fine.shrunk * math.prod(whole) / math.prod(whole_counts(stencil))
         if level.shrunk >= 3:
@@ -479,7 +490,7 @@ def _finest_level(stencil: PaddedStencil, real: Any, *, bounded: bool, bounds: P
         weights = tuple(stencil.padding.zeros(real, w.device) for w in weights)
     d = stencil.padding.zeros(d_type, stencil.device)
     unit = stencil.unit if d_type is wp.uint8 else 1.0
-    finest = PaddedStencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans, ghosts=stencil.ghosts)
+    finest = replace(stencil, d=d, weights=weights, unit=unit, strength=None)
     return Level(finest, real, bounded=bounded, bounds=bounds)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.multigrid.cycle_passes import SOLVE
+from warp_lcp.multigrid.compact_levels import DenseInverse
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.stencil import AROUND
@@ -63,15 +63,10 @@ UP = RowPass(
     "lines.up", HEADERS / "share_up.h", "S", other={"coarse": "S"}, reads={"d": "S"}, writes={"x": "S"}, whole={"shares": "S"},
     numbers={"size": wp.int64, "add": bool},
 )  # fmt: skip
-INVERT = RowPass(
-    "lines.invert", HEADERS / "compact_invert.h", wp.float64, whole={"weights": "S", "diagonals": "S", "matrix": wp.float64, "inverse": wp.float64},
-    numbers={"size": wp.int64, "first": wp.int64, "row": int, "lines": int, "cells": int, "least": wp.float64},
-)  # fmt: skip
 ZERO = RowPass("lines.zero", HEADERS / "zero.h", "S", writes={"x": "S"})
 SHORT = 3  # cells of an axis that is not coarsened any more
 COLUMNS = 256  # that one thread of a CPU solves for together: their cells of a row are vectors, and the rows stay in its cache
 EVEN = 0.5  # least ratio of weights along the two axes for point sweeps
-PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}  # share of a diagonal below which a pivot is what rounding has left
 
 
 class LineLevel:
@@ -173,9 +168,7 @@ class LineHierarchy:
             _, ny, nx = fine.padding.counts
             padding = Padding((1, -(-ny // fine.factors[1]), -(-nx // fine.factors[0])))
             self.levels.append(LineLevel(padding, real, self.device, symmetric=symmetric))
-        m = math.prod(self.levels[-1].padding.counts)
-        self._matrix, self._inverse = (wp.zeros((m, m), dtype=wp.float64, device=self.device) for _ in range(2))
-        self._real = real
+        self._inverse, self._real = DenseInverse(self.levels[-1].padding.counts, self.device), real
 
     @property
     def finest(self) -> LineLevel:
@@ -204,11 +197,7 @@ class LineHierarchy:
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
             for made in (*fine.transferring(), *fine.factoring(), fine.coarsening(coarse)):
                 made.launch(program.launch)
-        last = self.levels[-1]
-        _, ny, nx = last.padding.counts
-        numbers = {"size": last.padding.size, "first": last.rows.single.base, "row": last.padding.row, "lines": ny, "cells": nx}
-        fields = {"weights": last.weights, "diagonals": last.d, "matrix": self._matrix, "inverse": self._inverse}
-        INVERT.bind(Rows.flat(1, self.device, serial=True), **fields, **numbers, least=PINNED[self._real]).launch(program.launch)
+        self._inverse.making(self.levels[-1].stencil, self._real, program.launch)
         return program
 
     @cached_property
@@ -221,9 +210,7 @@ class LineHierarchy:
     def _descend(self, level: int, program: Program, *, from_zero: bool) -> None:
         L, launch = self.levels[level], program.launch
         if level == len(self.levels) - 1:
-            nz, ny, nx = L.padding.counts
-            rows = Rows.flat(self._matrix.shape[0], self.device)
-            SOLVE.bind(rows, inverse=self._inverse, b=L.b, x=L.x, nx=nx, ny=ny, nz=nz).launch(launch)
+            self._inverse.solving(L).launch(launch)
             return
         if from_zero:
             ZERO.bind(Rows.flat(L.x.size, self.device), x=L.x).launch(launch)

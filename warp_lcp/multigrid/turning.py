@@ -109,7 +109,7 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
     Blocks are sampled. The mean logarithm of 64 faces knows neither random coefficients, nor surfaces and cut cells, which are few in a
     block, from equal ones; where a block's ratios of weights along the axes differ from the median block's by `TURN`, the direction turns.
     """
-    if stencil.weights is None:
+    if stencil.weights is None or stencil.pattern is not None:
         return []
     logs = _sampled(stencil)
     centered = logs - logs.mean(axis=1, keepdims=True)
