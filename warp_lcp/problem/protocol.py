@@ -109,10 +109,10 @@ class HasCells(Operator, Protocol):
 
 
 class HasStencil(HasCells, HasLayout, Versioned, Protocol):
-    """The 5- or 7-point stencil of a grid: for multigrid and for passes that compute A x on the way.
+    """The stencil of a grid, of 5 or 7 points or a compact one: for multigrid and for passes that compute A x on the way.
 
     Attributes:
-        stencil: the diagonal and the weights of neighbors, A symmetric with weights >= 0 and weakly dominant rows.
+        stencil: the diagonal and the weights of neighbors; of 5 and 7 points A is symmetric with weights >= 0 and weakly dominant rows.
         periodic: whether x, y, z wrap around.
         layout: with a ghost cell on each side.
     """

@@ -187,6 +187,7 @@ class LineWorkspace(SweepWorkspace):
         p = self.problem
         stencil = p.A.stencil  # type: ignore[attr-defined]
         p.bounds.follow(x)
-        for color in (0, 1) if forward else (1, 0):
+        colors = 4 if stencil.pattern is not None and self._lines.single.planes > 1 else 2
+        for color in range(colors) if forward else reversed(range(colors)):
             stencil.wrap(x)
             SOLVE_LINE.bind(self._lines, stencil=stencil, x=x, b=p.b, l=p.lower, u=p.upper, color=color, **self._given).launch()

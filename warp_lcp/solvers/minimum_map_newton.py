@@ -90,7 +90,7 @@ class MinimumMapNewton(Settings):
         """
         if self.direct:
             return DirectNewtonWorkspace(problem, self)
-        by_grid = has(problem.A, HasStencil) and not needs_lines(problem.A)
+        by_grid = has(problem.A, HasStencil) and problem.A.symmetric and not needs_lines(problem.A)
         return GridNewtonWorkspace(problem, problem.A, self) if by_grid else NewtonWorkspace(problem, self)  # type: ignore[arg-type]
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:

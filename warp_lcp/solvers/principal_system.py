@@ -112,14 +112,15 @@ class GridSystem(KrylovSystem):
         self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = wp.zeros_like(self.r) if shifted else None
-        self.fused = self.hierarchy.open_cycle is not None  # one CPU thread, no ghost cells to fill
+        self.fused = self.hierarchy.open_cycle is not None and A.symmetric  # one CPU thread, no ghost cells to fill
         self._iterate_by(self._krylov_method(), self._weight)
 
     def _krylov_method(self) -> Any:
         """Return what iterates: it has `solve`, and the solution in `x`."""
         if self.fused:
             return GridConjugateGradient(self._A.stencil, self.hierarchy, weighted=self._weight is not None)
-        return ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight)
+        method = ConjugateGradient if self._A.symmetric else GMRES
+        return method(self.hierarchy.finest.stencil.product, self, weight=self._weight)
 
     def refresh(self) -> None:
         """Take the rows and the weights again if the operator has changed."""

@@ -20,7 +20,7 @@ if (make) {
         for (int z = 0; z < deep; ++z) for (int y = 0; y < wide; ++y) for (int x = 0; x < fx && first[0] + x < cells; ++x) {
             const long long i = fx*k + x + y*yp + z*zp; const T e = diagonal((int)i); T rest = e;
             if (e == 0) continue;
-            const auto visit = [&](int X, int Y, int Z, T w) {  // along which axes a neighbor is in another aggregate, and whether it is free
+            const auto visit_turning = [&](int X, int Y, int Z, T w) {  // along which axes a neighbor is in another aggregate, and whether it is free
                 const int at[3] = {first[0] + x + X, first[1] + y + Y, first[2] + z + Z}; const int steps[3] = {X, Y, Z};
                 const long long strides[3] = {1, yp, zp}; long long q = i; int place = 13;
                 for (int a = 0; a < 3; ++a) {
@@ -32,14 +32,17 @@ if (make) {
                     if (!(beyond && counts[a] <= factors[a])) place += o*(a == 0 ? 1 : a == 1 ? 3 : 9); }  // else one aggregate, beside itself
                 if (d[q] == 0) return;
                 rest -= w; sums[place] += w; };
-            const auto visit_all = [&](auto) {
+            const auto visit = [&](int X, int Y, int Z, T w) {
+                const int a = x + X, b = y + Y, c = z + Z, place = 13 + (a >= fx) - (a < 0) + 3*((b >= L.fy) - (b < 0)) + 9*((c >= L.fz) - (c < 0));
+                const T v = d[i + X + Y*yp + Z*zp] != 0 ? w : (T)0; rest -= v; sums[place] += v; };
+            const auto visit_all = [&](auto visit) {
 #define BEFORE(W, X, Y, Z) visit(X, Y, Z, (T)W(i));
 #define AND_AFTER(W, X, Y, Z) BEFORE(W, X, Y, Z) visit(-(X), -(Y), -(Z), (T)W(i - (X) - (Y)*yp - (Z)*zp));
                 if constexpr (SYMMETRIC) { EACH_WEIGHT(AND_AFTER) } else { EACH_WEIGHT(BEFORE) }
 #undef BEFORE
 #undef AND_AFTER
             };
-            visit_all(0);
+            if (periodic_x || periodic_y || periodic_z) visit_all(visit_turning); else visit_all(visit);
             excess += rest > least*e || rest < -least*e ? rest : (T)0; }
         int slot = 0;
         for (int o = 0; o < 27; ++o) if (o != 13) {
