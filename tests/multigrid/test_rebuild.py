@@ -34,7 +34,7 @@ def stored(A, free):
 
 def snapshot(hierarchy):
     fields = [f for lv in hierarchy.levels for f in (lv.stencil.d, *(lv.stencil.weights or ()))]
-    return [f.numpy().copy() for f in (*fields, hierarchy._inverse)]
+    return [f.numpy().copy() for f in (*fields, hierarchy._dense.inverse)]
 
 
 def sets(cells, rng):
@@ -78,7 +78,7 @@ def test_rows_that_nothing_changed_are_not_touched(device):
     hierarchy.hold(A.stencil.d, stored(A, fluid))
     hierarchy.rebuild_changed()
     assert not hierarchy.finest.changed.numpy().any()
-    spoiled = [lv.stencil.d for lv in hierarchy.levels[1:]] + [hierarchy._inverse]
+    spoiled = [lv.stencil.d for lv in hierarchy.levels[1:]] + [hierarchy._dense.inverse]
     for field in spoiled:
         field.fill_(7.0)
     hierarchy.hold(A.stencil.d, stored(A, fluid))
@@ -92,7 +92,7 @@ def test_rows_that_nothing_changed_are_not_touched(device):
     level = hierarchy.levels[1].stencil
     made = (level.d.numpy().reshape(level.padding.shape)[1:-1, 1:-1, 1:-1] != 7).any(axis=2)
     assert 1 <= made.sum() <= 4  # its own aggregates, and what lies beside the row
-    assert (hierarchy._inverse.numpy() != 7).any()
+    assert (hierarchy._dense.inverse.numpy() != 7).any()
 
 
 def test_the_first_rebuild_after_new_cells_is_complete(device):

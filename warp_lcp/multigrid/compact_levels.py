@@ -56,7 +56,7 @@ class DenseInverse:
 
     def making(self, stencil: PaddedStencil, real: Any, launch: Launch) -> None:
         """Launch the passes that make the inverse."""
-        turns = dict(zip(("periodic_x", "periodic_y", "periodic_z"), stencil.periodic, strict=True))
+        turns: dict[str, Any] = dict(zip(("periodic_x", "periodic_y", "periodic_z"), stencil.periodic, strict=True))
         nz, ny, nx = self._counts
         rows = Rows.of(stencil.padding, self._device, whole=True)
         ASSEMBLE.bind(rows, stencil=stencil, matrix=self.matrix.flatten(), cells=nx, lines=ny, planes=nz, **turns).launch(launch)

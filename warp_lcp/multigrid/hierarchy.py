@@ -11,8 +11,8 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.multigrid import cycle_passes as passes
-from warp_lcp.multigrid.compact_levels import DenseInverse, coarser_pattern, mask, weights_block
 from warp_lcp.multigrid.coarsest_kernels import PINNED, coarsest_kernels
+from warp_lcp.multigrid.compact_levels import DenseInverse, coarser_pattern, mask, weights_block
 from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
@@ -73,9 +73,9 @@ class Level:
     def coarsening(self, coarse: Level, stiffen: float, held: float) -> Bound:
         """Return the pass that makes those of the coarser level's rows that depend on rows of this level that have changed."""
         s, c = self.stencil, coarse.stencil
-        turns = dict(zip(("periodic_x", "periodic_y", "periodic_z"), s.periodic, strict=True))
-        numbers = {"cells": s.padding.counts[2], "stiffen": stiffen, "held": held, **turns}
-        if coarse.block is not None:
+        turns: dict[str, Any] = dict(zip(("periodic_x", "periodic_y", "periodic_z"), s.periodic, strict=True))
+        numbers: dict[str, Any] = {"cells": s.padding.counts[2], "stiffen": stiffen, "held": held, **turns}
+        if coarse.block is not None and c.pattern is not None:
             given = {"changed": self.changed, "coarse_changed": coarse.changed, "coarse_d": c.d, "coarse_weights": coarse.block}
             numbers |= {"coarse_size": c.padding.size, "MASK": mask(c.pattern)}
             return passes.COARSEN_COMPACT.bind(self._coarser_rows(coarse), stencil=s, **given, **numbers)

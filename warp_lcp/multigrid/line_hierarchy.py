@@ -1,10 +1,10 @@
 """Multigrid for compact stencils in 2-D that point sweeps do not smooth: operator-dependent transfers, relaxation of lines.
 
 Coarse cells are every second one along an axis. A cell between two of them shares in each by its row's weights (black-box multigrid, Dendy
-1982), which follow the prolongation's from (A + A')/2 and the restriction's from A' (de Zeeuw 1990), so that coarse matrices R A P of
-convection keep the wind's direction. They are compact again. Rows of one color after those of the other are solved for as tridiagonal systems,
-then columns; on the way up in the reverse order. With W-cycles the iterations of a Krylov method stay below ten from 128 to 1024 cells a
-side, for winds at Peclet numbers up to 1e4 that turn, for anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
+1982): the prolongation by those of (A + A')/2, the restriction by those of A' (de Zeeuw 1990), so that coarse matrices R A P of convection
+keep the wind's direction. They are compact again. Rows of one color after those of the other are solved for as tridiagonal systems, then
+columns; on the way up in the reverse order. With W-cycles the iterations of a Krylov method stay at about ten from 128 to 1024 cells a side,
+for winds at Peclet numbers up to 1e4 that turn, for anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import warp as wp
 
@@ -20,6 +20,7 @@ from warp_lcp.multigrid.compact_levels import DenseInverse
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.stencil import AROUND
+from warp_lcp.problem.protocol import HasStencil, Operator, has
 from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.program import Program
@@ -27,8 +28,8 @@ from warp_lcp.rows.program import Program
 HEADERS = Path(__file__).parent / "headers"
 WEIGHTS = {"weights": "S"}
 FILL = RowPass(
-    "lines.fill", HEADERS / "compact_fill.h", "S", stencil=("D", "W"), reads={"free": wp.uint8, "shift": wp.float64}, optional=("shift", "weight"),
-    writes={"made": "S", "weight": "S"}, whole=WEIGHTS, numbers={"size": wp.int64},
+    "lines.fill", HEADERS / "compact_fill.h", "S", stencil=("D", "W"), reads={"free": wp.uint8, "shift": wp.float64},
+    optional=("shift", "weight"), writes={"made": "S", "weight": "S"}, whole=WEIGHTS, numbers={"size": wp.int64},
 )  # fmt: skip
 FACTORS = {"fx": int, "fy": int}
 EDGES = RowPass(
@@ -52,9 +53,7 @@ LINES: dict[str, Any] = {
 }  # fmt: skip
 ZEBRA_X = RowPass("lines.zebra_x", HEADERS / "zebra_x.h", "S", **LINES, numbers={"size": wp.int64, "color": int})
 ZEBRA_Y = RowPass("lines.zebra_y", HEADERS / "zebra_y.h", "S", **LINES, numbers={**STRIDE, "color": int})
-RESIDUAL = RowPass(
-    "lines.residual", HEADERS / "compact_residual.h", "S", stencil=("S", "S"), reads={"x": "S", "b": "S"}, writes={"t": "S"}
-)
+RESIDUAL = RowPass("lines.residual", HEADERS / "compact_residual.h", "S", stencil=("S", "S"), reads={"x": "S", "b": "S"}, writes={"t": "S"})
 DOWN = RowPass(
     "lines.down", HEADERS / "share_down.h", "S", finer=True, other={"t": "S", "shares": "S"}, writes={"coarse": "S"},
     numbers={"size": wp.int64, "cells": int, **FACTORS},
@@ -70,7 +69,7 @@ EVEN = 0.5  # least ratio of weights along the two axes for point sweeps
 
 
 class LineLevel:
-    """One grid: its stored stencil, iterate x, right-hand side b, a buffer t, the factors of its lines, and shares in the next coarser one."""
+    """One grid: its stored stencil, iterate x, right-hand side b, a buffer t, factors of its lines, and shares in the next coarser one."""
 
     def __init__(self, padding: Padding, real: Any, device: wp.Device, *, symmetric: bool) -> None:
         self.padding, self.device, n = padding, device, padding.size
@@ -89,9 +88,9 @@ class LineLevel:
 
     def transferring(self) -> list[Bound]:
         """Return the passes that make shares."""
-        given = {"d": self.d, "weights": self.weights, "size": self.padding.size}
+        given: dict[str, Any] = {"d": self.d, "weights": self.weights, "size": self.padding.size}
         given |= dict(zip(FACTORS, self.factors, strict=True))
-        kinds = [{"SAME": 1}] if self.restricts is self.shares else [{"RESTRICTION": 0}, {"RESTRICTION": 1}]
+        kinds: list[dict[str, Any]] = [{"SAME": 1}] if self.restricts is self.shares else [{"RESTRICTION": 0}, {"RESTRICTION": 1}]
         passes = []
         for shares, kind in zip((self.shares, self.restricts), kinds, strict=False):
             passes += [EDGES.bind(self.rows, **given, shares=shares, **kind)]
@@ -107,14 +106,14 @@ class LineLevel:
         return made
 
     @property
-    def _along(self) -> list[dict[str, int]]:
+    def _along(self) -> list[dict[str, Any]]:
         _, ny, nx = self.padding.counts
         return [{"step": 1, "count": nx}, {"step": self.padding.row, "count": ny}]
 
     def coarsening(self, coarse: LineLevel) -> Bound:
         """Return the pass that makes the next level's matrix."""
-        constants = dict(zip(("FX", "FY"), self.factors, strict=True))
-        sizes = {"size": self.padding.size, "coarse_size": coarse.padding.size, "cells": self.padding.counts[2]}
+        constants: dict[str, Any] = dict(zip(("FX", "FY"), self.factors, strict=True))
+        sizes: dict[str, Any] = {"size": self.padding.size, "coarse_size": coarse.padding.size, "cells": self.padding.counts[2]}
         fields = {"weights": self.weights, "diagonals": self.d, "shares": self.shares, "restricts": self.restricts, "unused": self.t}
         rows = coarse.rows.beside(self.rows, (*self.factors, 1))
         return GALERKIN.bind(rows, **fields, coarse_weights=coarse.weights, coarse_d=coarse.d, **sizes, **constants)
@@ -139,7 +138,11 @@ class LineLevel:
 
     def handing_down(self, coarse: LineLevel) -> Bound:
         """Return what makes t the coarse right-hand side."""
-        numbers = {"size": self.padding.size, "cells": self.padding.counts[2], **dict(zip(FACTORS, self.factors, strict=True))}
+        numbers: dict[str, Any] = {
+            "size": self.padding.size,
+            "cells": self.padding.counts[2],
+            **dict(zip(FACTORS, self.factors, strict=True)),
+        }
         fields = {"t": self.t, "shares": self.restricts[: self.padding.size], "coarse": coarse.b}
         return DOWN.bind(coarse.rows.beside(self.rows, (*self.factors, 1)), **fields, **numbers)
 
@@ -150,7 +153,9 @@ class LineLevel:
 
 
 class LineHierarchy:
-    """Multigrid for (P A P + P D P) e = r of a compact stencil in 2-D; `restrict` takes free set and shift, `cycle` x from b on the finest level.
+    """Multigrid for (P A P + P D P) e = r of a compact stencil in 2-D.
+
+    `restrict` takes the free set and the shift, `cycle` makes the finest level's x from its b.
 
     Args:
         stencil: the operator's, with a pattern; no axis is periodic.
@@ -176,7 +181,7 @@ class LineHierarchy:
         return self.levels[0]
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None, weight: wp.array[Any] | None = None) -> None:
-        """Take another free set (stored uint8 field) and shift (stored float64 field), write one over the diagonal to `weight`, and coarsen."""
+        """Take another free set (stored uint8 field) and shift (float64), write one over the diagonal to `weight`, and coarsen."""
         self._fill(free, shift, weight)
         self._building.run()
 
@@ -223,7 +228,12 @@ class LineHierarchy:
             sweep.launch(launch)
 
 
-def needs_lines(A: Any) -> bool:
+def takes_points(A: Operator) -> TypeGuard[HasStencil]:
+    """Return whether an operator's systems are a `Hierarchy`'s: it has a stencil, is symmetric, and needs no lines."""
+    return has(A, HasStencil) and A.symmetric and not needs_lines(A)
+
+
+def needs_lines(A: HasStencil) -> bool:
     """Return whether an operator's stencil is one of these: compact and in 2-D, and not what point sweeps on aggregates solve as fast.
 
     Those are symmetric with weights >= 0, alike along both axes.
@@ -232,4 +242,4 @@ def needs_lines(A: Any) -> bool:
     if s.pattern is None or s.padding.counts[0] > 1 or any(s.periodic):
         return False
     along = sorted(s.mean_weights[:2])
-    return not (A.symmetric and A.monotone and along[0] >= EVEN * along[1])
+    return not (A.symmetric and getattr(A, "monotone", False) and along[0] >= EVEN * along[1])

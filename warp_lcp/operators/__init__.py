@@ -8,4 +8,6 @@ from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.sum import SumOperator
 from warp_lcp.problem.protocol import Operator
 
-__all__ = ["AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "LowRankOperator", "Operator", "SparseOperator", "Stencil", "SumOperator"]
+__all__ = [
+    "AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "LowRankOperator", "Operator", "SparseOperator", "Stencil", "SumOperator",
+]  # fmt: skip

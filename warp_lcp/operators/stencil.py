@@ -26,9 +26,7 @@ DIAGONAL = RowPass(
     "stencil.diagonal", HEADERS / "compact_diagonal.h", "S", stencil=("S", "W"), reads={"cells": wp.int8, "center": "S", "shift": "S"},
     optional=("center", "shift"), writes={"made": "S"}, numbers={"number": "S"},
 )  # fmt: skip
-TRANSPOSED = RowPass(
-    "stencil.transposed", HEADERS / "stencil_transposed.h", "S", stencil=("D", "W"), reads={"x": "S"}, writes={"y": "S"}
-)
+TRANSPOSED = RowPass("stencil.transposed", HEADERS / "stencil_transposed.h", "S", stencil=("D", "W"), reads={"x": "S"}, writes={"y": "S"})
 CENTER = (0, 0, 0)
 AROUND = Pattern(tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y), symmetric=False, kind="arrays")  # all neighbors in 2-D
 Offset = tuple[int, int, int]  # along x, y, z
@@ -144,8 +142,8 @@ class Stencil(GridOperator):
 
     def _empty_stencil(self) -> PaddedStencil:
         layout = self.layout
-        options = {"periodic": self.periodic, "spans": self._spans, "strength": self._strength, "pattern": self._pattern}
-        return PaddedStencil(layout.padding, layout.zeros(self.dtype), self._weights, self._numbers, **options)  # type: ignore[arg-type]
+        options: dict[str, Any] = {"periodic": self.periodic, "spans": self._spans, "strength": self._strength, "pattern": self._pattern}
+        return PaddedStencil(layout.padding, layout.zeros(self.dtype), self._weights, self._numbers, **options)
 
     def _fill_stencil(self) -> None:
         s = self.stencil
@@ -173,8 +171,8 @@ class Stencil(GridOperator):
         """Return what given values in AIR cells, in place of 0, add to b: the sums of a_o(i) value_(i + o), float64, shape of `cells`.
 
         Args:
-            values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2, nx + 2), with what lies outside; what FLUID
-                and SOLID cells have does not matter.
+            values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2, nx + 2), with what lies outside; what
+                FLUID and SOLID cells have does not matter.
         """
         host = real_array(values, "values")
         padded = np.zeros(self.layout.stored_shape)
@@ -191,7 +189,7 @@ class Stencil(GridOperator):
         return self.layout.unload(out)
 
     def floating_components(self, scratch: Any = None) -> FloatingComponents | None:
-        """Return the components of cells on which rows and columns sum to 0, so that A is singular with constants; None if there are none."""
+        """Return the components on which rows sum to 0, so that a symmetric A is singular there; None if there are none."""
         if self._finder is None or self._finder[0] != self.version:
             self._finder = self.version, self._find_floating()
         found: FloatingComponents | None = self._finder[1]
@@ -311,7 +309,7 @@ def _evaluation(function: Any) -> Any:
     """Return a kernel that evaluates a Warp function of (k, j, i) at all cells."""
 
     @no_type_check
-    def evaluate(out: wp.array3d(dtype=wp.float64)):  # type: ignore[valid-type]
+    def evaluate(out: wp.array3d(dtype=wp.float64)):
         k, j, i = wp.tid()
         out[k, j, i] = function(k, j, i)
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from struct import Struct
 from types import MappingProxyType
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
@@ -133,7 +133,7 @@ class Pattern:
             ones after it, too.
         symmetric: whether a weight serves both its cells.
         kind: "numbers", one an offset; "arrays"; or "functions", Warp functions (k, j, i) of the cell.
-        functions: as many as offsets, of that kind: the coefficients, which are minus the weights; or numbers where they are the same everywhere.
+        functions: as many as offsets, of that kind: the coefficients, which are minus the weights; or numbers, the same everywhere.
     """
 
     offsets: tuple[tuple[int, int, int], ...]
@@ -188,11 +188,13 @@ def _number_of(functions: tuple[Any, ...]) -> str:
 def _touching(function: Any, before: Any) -> Any:
     if before is None:
 
-        def touch(i: int):  # type: ignore[no-untyped-def]
+        @no_type_check
+        def touch(i: int):
             return wp.float64(function(i, i, i))
     else:
 
-        def touch(i: int):  # type: ignore[no-untyped-def]
+        @no_type_check
+        def touch(i: int):
             return wp.float64(function(i, i, i)) + before(i)
 
     touch.__qualname__ = touch.__name__ = f"touch_{function.key}"

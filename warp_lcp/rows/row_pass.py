@@ -322,8 +322,11 @@ class Form:
             each += [f"const auto* {n} = given.stencil.{n}.data + {first};" for n in ("d", *fields, "known")]
             each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", *numbers)]
             if pattern:
-                into = f"const long long e = k + {first} - {'L.o0' if d.finer else 'L.base'}, a = yp, b = zp;"
-                each += [f"const auto place = [&](long long k) {{ {into} return wp::vec3i((int)(e / b), (int)(e % b / a), (int)(e % a)); }};"]
+                at = f"const long long e = k + {first} - {'L.o0' if d.finer else 'L.base'}, a = yp, b = zp;"
+                each += [
+                    f"const auto place = [&](long long k) {{ {at}",
+                    "return wp::vec3i((int)(e / b), (int)(e % b / a), (int)(e % a)); };",
+                ]
                 each += pattern.source()
         sums = [f"#define EACH_FOUND(DO) {' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}", text(HEADERS / "sums.h")]
         sums += ["#undef EACH_FOUND"]

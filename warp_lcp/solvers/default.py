@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Never
 
-from warp_lcp.multigrid.line_hierarchy import needs_lines
+from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has, takes
 from warp_lcp.problem.result import Record, SolveResult
@@ -21,8 +21,9 @@ from warp_lcp.solvers.psor import ProjectedSOR
 
 
 def default_method(problem: LCP) -> Solver:
-    """Return the fastest method measured for the problem's operator: ProjectedMultigrid on grids, MinimumMapNewton on others, and on
-    compact stencils that are not symmetric or smoothed by lines.
+    """Return the fastest method measured for the problem's operator: ProjectedMultigrid on grids, else MinimumMapNewton.
+
+    That is also for compact stencils that are not symmetric, or that only lines smooth.
 
     Its systems are solved directly on the host, on CUDA devices too, where a matrix has at most 200 unknowns or a bandwidth up to 3. Where
     bounds are affine in x, a method that takes them: ProjectedSOR, or ProjectedJacobi where A cannot be swept.
@@ -30,7 +31,7 @@ def default_method(problem: LCP) -> Solver:
     if problem.bounds.affine is not None:
         return ProjectedSOR() if takes(ProjectedSOR, problem.A) else ProjectedJacobi()
     if has(problem.A, HasStencil):
-        return ProjectedMultigrid() if problem.A.symmetric and not needs_lines(problem.A) else MinimumMapNewton()
+        return ProjectedMultigrid() if takes_points(problem.A) else MinimumMapNewton()
     return MinimumMapNewton(direct=suits(problem.A))
 
 

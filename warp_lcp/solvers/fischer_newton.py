@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
@@ -110,7 +110,7 @@ class FischerWorkspace(IterateMemory):
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
         self.settings, self.kink, layout = settings, Kink(settings.kink), problem.layout
         self.active_set: GridNewtonWorkspace | None = None
-        if has(problem.A, HasStencil) and self.kink is not Kink.APPROXIMATION:
+        if takes_points(problem.A) and self.kink is not Kink.APPROXIMATION:
             newton = MinimumMapNewton(precision=settings.precision, monotone_cycles=settings.monotone_cycles, cycle=settings.cycle)
             self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
             self.scratch = self.active_set.scratch

@@ -17,8 +17,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.rows import Known, RowPass, Wave
@@ -157,7 +157,7 @@ class InteriorPointWorkspace(IterateMemory):
             precision=settings.precision, monotone_cycles=settings.monotone_cycles, max_linear_iterations=settings.max_linear_iterations,
             cycle=settings.cycle,
         )  # fmt: skip
-        if has(problem.A, HasStencil) and problem.bounded:
+        if takes_points(problem.A) and problem.bounded:
             grid = self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
             self.scratch, shared = grid.scratch, grid.hierarchy
             super().__init__(problem, settings.precision, x=grid.x, residual=grid.residual)

@@ -12,10 +12,9 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.multigrid.line_hierarchy import needs_lines
+from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
 from warp_lcp.rows.vectors import Sums, rows_of
@@ -90,8 +89,7 @@ class MinimumMapNewton(Settings):
         """
         if self.direct:
             return DirectNewtonWorkspace(problem, self)
-        by_grid = has(problem.A, HasStencil) and problem.A.symmetric and not needs_lines(problem.A)
-        return GridNewtonWorkspace(problem, problem.A, self) if by_grid else NewtonWorkspace(problem, self)  # type: ignore[arg-type]
+        return GridNewtonWorkspace(problem, problem.A, self) if takes_points(problem.A) else NewtonWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
@@ -121,7 +119,7 @@ class NewtonWorkspace(IterateMemory):
         self._sums = Sums(rows_of(self.x), 4, slots=SLOTS, across=layout.across)
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
         self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
-        self.coarse = CoarseProblem(problem.A, settings) if cycled else None  # type: ignore[arg-type]
+        self.coarse = CoarseProblem(problem.A, settings) if cycled else None
         if self.bounded and isinstance(self.system, LineSystem):
             self.coarse = CoarseStencilProblem(problem.A, self.system, settings)  # type: ignore[arg-type]
         self.start(warm=True, tolerance=0.0)
@@ -203,7 +201,7 @@ class NewtonWorkspace(IterateMemory):
         """Return whether conjugate gradients within the bounds may take over: A has an energy, and is no matrix for coarse problems."""
         if self.coarse is None or not self.problem.A.symmetric or not isinstance(self.problem.A, SparseOperator):
             return False
-        host = self.problem.A.matrix()  # type: ignore[attr-defined]
+        host = self.problem.A.matrix()
         return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
 
     def _gradient_step(self, x: wp.array[Any], spent: int = 0) -> Step | None:

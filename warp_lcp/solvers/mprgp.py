@@ -13,6 +13,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Level
+from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
@@ -187,7 +188,7 @@ class MPRGPWorkspace(IterateMemory):
 
     def __init__(self, problem: LCP, settings: MPRGP, system: SparseSystem | None = None) -> None:
         precision, self.settings = Precision(settings.precision), settings
-        self.bounded, self.is_grid = problem.bounded, has(problem.A, HasStencil)
+        self.bounded, self.is_grid = problem.bounded, takes_points(problem.A)
         self.system, self.preconditioner = _preconditioner(problem, precision.correction, settings.cycle, system)
         z = self.preconditioner.z
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]

@@ -361,7 +361,7 @@ class CoarseProblem:
         coarse: whether A is a coarse problem's.
     """
 
-    def __init__(self, A: SparseOperator, settings: MinimumMapNewton, *, coarse: bool = False) -> None:
+    def __init__(self, A: Any, settings: MinimumMapNewton, *, coarse: bool = False) -> None:
         self._A, self._settings, self._coarse, self._version = A, replace(settings, monotone_cycles=0), coarse, -1
         self._work: Any = None
         self.start()
@@ -411,8 +411,8 @@ class CoarseProblem:
 class CoarseStencilProblem(CoarseProblem):
     """The same on every second cell of a compact stencil's grid, with the transfers of its hierarchy; each solve begins with a correction.
 
-    With coarse problems on all levels that is nested iteration: Newton's steps then start with a contact that is right but for a layer or two
-    of cells, cold or from another time step's solution, and come to the end in as many as a linear solve takes.
+    With coarse problems on all levels that is nested iteration: Newton's steps then start with a contact that is right but for a layer or
+    two of cells, cold or from another time step's solution, and come to the end in as many as a linear solve takes.
 
     Args:
         A: the operator.
@@ -422,7 +422,7 @@ class CoarseStencilProblem(CoarseProblem):
 
     def __init__(self, A: HasStencil, system: LineSystem, settings: MinimumMapNewton) -> None:
         self._system, self._hierarchy = system, system.hierarchy
-        super().__init__(A, settings, coarse=True)  # type: ignore[arg-type]
+        super().__init__(A, settings, coarse=True)
 
     def start(self) -> None:
         """A correction is due at once, others where the set creeps."""
@@ -458,8 +458,8 @@ class CoarseStencilProblem(CoarseProblem):
         """Make the coarse problem of A as it is now, if it has changed since; return whether there is one."""
         if self._version == self._A.version or len(self._hierarchy.levels) < 2:
             return self._work is not None
-        self._version, hierarchy = self._A.version, self._hierarchy  # type: ignore[attr-defined]
-        fluid = self._A.cells.numpy().ravel() == FLUID  # type: ignore[attr-defined]
+        self._version, hierarchy = self._A.version, self._hierarchy
+        fluid = self._A.cells.numpy().ravel() == FLUID
         self._free = wp.array(fluid.astype(np.uint8), device=hierarchy.device)
         hierarchy.restrict(self._free)
         coarse = hierarchy.levels[1]

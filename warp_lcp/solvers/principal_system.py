@@ -162,7 +162,7 @@ class GridSystem(KrylovSystem):
 
 
 class LineSystem(KrylovSystem):
-    """A Krylov method on a compact stencil in 2-D: conjugate gradients if A is symmetric, else GMRES, preconditioned by cycles over lines."""
+    """Conjugate gradients on a compact stencil in 2-D, or GMRES if A is not symmetric, preconditioned by cycles over lines."""
 
     def __init__(self, A: HasStencil, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False) -> None:
         self._A = A

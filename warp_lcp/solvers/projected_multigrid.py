@@ -56,7 +56,9 @@ class ProjectedMultigrid(Settings):
         check_taken(self, problem.A)
         if has(problem.A, HasStencil):
             if not problem.A.symmetric:
-                raise ValueError("A is not symmetric: ProjectedMultigrid descends an energy, which such a problem has not; take MinimumMapNewton")
+                raise ValueError(
+                    "A is not symmetric: ProjectedMultigrid descends an energy, which such a problem has not; take MinimumMapNewton"
+                )
             return MultigridWorkspace(problem, problem.A, self)
         terms = grid_and_low_rank(problem.A)
         if terms is None:
