@@ -73,7 +73,7 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
     cells, free, keywords = problem(shape, "arrays")
     hierarchy = masked_hierarchy(cells, free, periodic, "cpu", CycleSettings(**TOGETHER), wp.float64, True, **keywords)[1]
     rows, first = hierarchy._small, hierarchy._small.levels[0]
-    inverse = hierarchy._inverse.numpy().copy()
+    inverse = hierarchy._dense.inverse.numpy().copy()
     rng = np.random.default_rng(101)
     inside = first.stencil.d.numpy() != 0
     first.b.assign(rng.standard_normal(inside.size) * inside)
@@ -90,9 +90,9 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
         counts = level.stencil.padding.counts
         level.stencil.__dict__["rows"] = Rows.strided(level.stencil.d.size, first.x.device, (L.base, L.s1, L.s2), counts, cells=1)
     kernels, s, m = coarsest_kernels(*rows.levels[-1].form), rows.levels[-1].stencil, len(inverse)
-    inputs = [s.struct, s.rows.single, wp.vec3i(*map(int, s.periodic)), wp.float64(1e-13), 1, hierarchy._matrix, hierarchy._inverse]
+    inputs = [s.struct, s.rows.single, wp.vec3i(*map(int, s.periodic)), wp.float64(1e-13), 1, hierarchy._dense.matrix, hierarchy._dense.inverse]
     wp.launch(kernels.invert, 1, inputs, device="cpu")
-    np.testing.assert_allclose(hierarchy._inverse.numpy(), inverse, rtol=1e-12)
+    np.testing.assert_allclose(hierarchy._dense.inverse.numpy(), inverse, rtol=1e-12)
     solve = hierarchy._solving._replace(rows=Rows.by_turns(m, first.x.device, m))
     small = SmallLevels(rows.levels, rows.settings, solve)
     cycles = small.sequence(2, projected, True)
@@ -119,7 +119,7 @@ def test_the_coarsest_level_is_inverted(shape, periodic, faces, device):
     cells, free, keywords = problem(shape, faces)
     _, hierarchy = masked_hierarchy(cells, free, periodic, device, CycleSettings(**TOGETHER), **keywords)
     assert len(hierarchy.levels) == 1
-    matrix, inverse = level_matrix(hierarchy.finest.stencil), hierarchy._inverse.numpy()
+    matrix, inverse = level_matrix(hierarchy.finest.stencil), hierarchy._dense.inverse.numpy()
     unknown = np.diag(matrix) > 0
     assert 0 < unknown.sum() < cells.size
     np.testing.assert_allclose((inverse @ matrix)[np.ix_(unknown, unknown)], np.eye(unknown.sum()), atol=1e-12)
@@ -133,7 +133,7 @@ def test_a_singular_coarsest_level_is_pinned(real, device):
     cells = np.full((4, 4, 4), wl.FLUID)
     cells[:, :, 2] = wl.SOLID  # two components
     _, hierarchy = masked_hierarchy(cells, np.ones(cells.shape), (False,) * 3, device, CycleSettings(**TOGETHER), real)
-    matrix, inverse = level_matrix(hierarchy.finest.stencil, real), hierarchy._inverse.numpy()
+    matrix, inverse = level_matrix(hierarchy.finest.stencil, real), hierarchy._dense.inverse.numpy()
     assert np.linalg.matrix_rank(inverse) == (cells == wl.FLUID).sum() - 2
     np.testing.assert_allclose(matrix @ inverse @ matrix, matrix, atol=1e-11)
 

@@ -10,7 +10,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import resident_bytes
 from warp_lcp.benchmarks.tank import Tank, record
-from warp_lcp.operators import grid_poisson
+from warp_lcp.operators import grid_operator
 from warp_lcp.rows import Rows
 
 SHAPES = (24, 150, 90), (8, 300, 150)  # planes of liquid; rows of it in each plane
@@ -62,9 +62,9 @@ def solves(up, method, *, in_place):
 @pytest.mark.parametrize("up", [0, 1])
 @pytest.mark.parametrize("method", [wl.ProjectedMultigrid(), wl.ProjectedMultigrid(precision="double"), wl.MinimumMapNewton(), wl.MPRGP()])
 def test_bits_are_those_of_a_problem_that_looks_through_its_box(method, up, in_place, monkeypatch):
-    monkeypatch.setattr(grid_poisson, "LARGE", 1 << 40)
+    monkeypatch.setattr(grid_operator, "LARGE", 1 << 40)
     whole, expected = solves(up, method, in_place=in_place)
-    monkeypatch.setattr(grid_poisson, "LARGE", 0)
+    monkeypatch.setattr(grid_operator, "LARGE", 0)
     part, found = solves(up, method, in_place=in_place)
     assert part.layout.sparse
     assert not whole.layout.sparse
@@ -76,7 +76,7 @@ def test_bits_are_those_of_a_problem_that_looks_through_its_box(method, up, in_p
 @pytest.mark.cpu_form("boxes that are partly in use are the CPU's")
 @pytest.mark.parametrize("up", [0, 1])
 def test_passes_take_the_chunks_that_have_been_in_use(up, monkeypatch):
-    monkeypatch.setattr(grid_poisson, "LARGE", 0)
+    monkeypatch.setattr(grid_operator, "LARGE", 0)
     A = wl.GridPoisson(liquid(up, 0.2), device="cpu")
     chunks = A.layout.chunks.numpy()[:, 0]
     lengths = np.diff(chunks)[:, 0]
@@ -94,7 +94,7 @@ def test_passes_take_the_chunks_that_have_been_in_use(up, monkeypatch):
 
 
 def test_full_boxes_have_huge_pages_and_are_copied_at_once(monkeypatch):
-    monkeypatch.setattr(grid_poisson, "LARGE", 0)
+    monkeypatch.setattr(grid_operator, "LARGE", 0)
     layout = wl.GridPoisson(np.ones(SHAPES[0], dtype=np.int8), device="cpu").layout
     assert not layout.sparse
     assert not layout.padding.small_pages
@@ -104,7 +104,7 @@ TAKEN = """
 import numpy as np
 import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import forget_peak, resident_bytes
-from warp_lcp.operators import grid_poisson
+from warp_lcp.operators import grid_operator
 
 def solved(planes):
     cells = np.zeros((planes, 400, 200), dtype=np.int8)
