@@ -2,8 +2,20 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
+from warp_lcp.linear_complementarity import linear_complementarity
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, LowRankOperator, Operator, SparseOperator, SumOperator
+from warp_lcp.operators import (
+    AIR,
+    FLUID,
+    SOLID,
+    DenseOperator,
+    GridPoisson,
+    LinearOperator,
+    LowRankOperator,
+    Operator,
+    SparseOperator,
+    SumOperator,
+)
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
@@ -68,6 +80,7 @@ __all__ = [
     "IncrementalPivoting",
     "InteriorPoint",
     "Lemke",
+    "LinearOperator",
     "LowRankOperator",
     "MinimumMapNewton",
     "NaturalResidual",
@@ -93,6 +106,7 @@ __all__ = [
     "default_method",
     "enumerate_batch",
     "get_threads",
+    "linear_complementarity",
     "recommend",
     "set_threads",
     "solve",

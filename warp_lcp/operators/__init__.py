@@ -2,9 +2,13 @@
 
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
+from warp_lcp.operators.linear_operator import LinearOperator
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator
 from warp_lcp.problem.protocol import Operator
 
-__all__ = ["AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "LowRankOperator", "Operator", "SparseOperator", "SumOperator"]
+__all__ = [
+    "AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "LinearOperator", "LowRankOperator", "Operator", "SparseOperator",
+    "SumOperator",
+]  # fmt: skip

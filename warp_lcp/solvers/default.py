@@ -22,12 +22,15 @@ from warp_lcp.solvers.psor import ProjectedSOR
 def default_method(problem: LCP) -> Solver:
     """Return the fastest method measured for the problem's operator: ProjectedMultigrid on grids, MinimumMapNewton on others.
 
-    Its systems are solved directly on the host, on CUDA devices too, where a matrix has at most 200 unknowns or a bandwidth up to 3. Where
-    bounds are affine in x, a method that takes them: ProjectedSOR, or ProjectedJacobi where A cannot be swept.
+    Its systems are solved directly on the host, on CUDA devices too, where a matrix has at most 200 unknowns or a bandwidth up to 3, unless
+    the problem brings a preconditioner. Where bounds are affine in x, a method that takes them: ProjectedSOR, or ProjectedJacobi where A
+    cannot be swept.
     """
     if problem.bounds.affine is not None:
         return ProjectedSOR() if takes(ProjectedSOR, problem.A) else ProjectedJacobi()
-    return ProjectedMultigrid() if has(problem.A, HasStencil) else MinimumMapNewton(direct=suits(problem.A))
+    if has(problem.A, HasStencil):
+        return ProjectedMultigrid()
+    return MinimumMapNewton(direct=problem.preconditioner is None and suits(problem.A))
 
 
 def solve(
@@ -42,7 +45,7 @@ def solve(
         stopping: the criteria; defaults to `StoppingCriteria()`.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
         workspace: what `solver.init(problem)` returned, to use its memory again.
-        callback: called with each Record as it is made.
+        callback: called with each Record as it is made; where it raises StopIteration, the solve ends with STOPPED.
         misplaced: nothing; other options are refused.
 
     Returns:

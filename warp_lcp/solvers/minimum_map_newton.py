@@ -62,6 +62,7 @@ class MinimumMapNewton(Settings):
 
     needs: ClassVar[str] = "positive definite or P-matrix"
     distributed: ClassVar[bool] = True
+    preconditioned: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"
     monotone_cycles: CountOrZero = 2
@@ -188,7 +189,7 @@ class NewtonWorkspace(IterateMemory):
 
     def _minimizes(self) -> bool:
         """Return whether conjugate gradients within the bounds may take over: A has an energy, and is no matrix for coarse problems."""
-        if self.coarse is None or not self.problem.A.symmetric:
+        if self.coarse is None or not self.problem.A.symmetric or self.problem.preconditioner is not None:
             return False
         host = self.problem.A.matrix()  # type: ignore[attr-defined]
         return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())

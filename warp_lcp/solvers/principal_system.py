@@ -1,8 +1,9 @@
 """The system on the free unknowns that Newton-type methods share: (P A P + P D P) e = r with a free set P and a shift D >= 0.
 
 Grids take multigrid-preconditioned conjugate gradients, dense matrices a factorization, sparse ones algebraic multigrid or incomplete
-factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. The passes
-that make free sets, right-hand sides on them and projected steps stand here too.
+factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. Where a
+problem brings a preconditioner, that is taken instead. The passes that make free sets, right-hand sides on them and projected steps stand
+here too.
 """
 
 from __future__ import annotations
@@ -264,7 +265,7 @@ class DiagonalSystem(KrylovSystem):
         self._diagonal, self._inverse = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
         weight = self._inverse if shifted else None
         self._shift: wp.array[Any] | None = None
-        method = ConjugateGradient if self._A.symmetric else GMRES
+        method = ConjugateGradient if self._A.symmetric and self._definite(problem) else GMRES
         self._iterate_by(method(self._product, self, weight=weight), weight)
         self.refresh()
 
@@ -282,10 +283,27 @@ class DiagonalSystem(KrylovSystem):
         """Precondition: z = r / d."""
         DIVIDE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
+    def _definite(self, problem: LCP) -> bool:
+        """Return whether the preconditioner is fit for conjugate gradients."""
+        return True
+
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         shape = self._layout.stored_shape
         self._A.apply(p.reshape(shape), q.reshape(shape))
         MASK.bind(rows_of(q), free=self._free, shift=self._shift, direction=p, q=q).launch()
+
+
+class PreconditionedSystem(DiagonalSystem):
+    """The same, preconditioned by P M P with the problem's own M, on the host; conjugate gradients if M seems definite, too."""
+
+    def _definite(self, problem: LCP) -> bool:
+        assert problem.preconditioner is not None
+        self._M = problem.preconditioner
+        return self._M.definite
+
+    def apply(self) -> None:
+        """Precondition: z = P M r; r is 0 off the free set."""
+        self.z.assign(np.where(self._free.numpy() != 0, self._M(np.array(self.r.numpy())), 0.0))
 
 
 def principal_system(
@@ -303,6 +321,8 @@ def principal_system(
         hierarchy: of a grid's stencil, where another method has made one.
     """
     A = problem.A
+    if problem.preconditioner is not None and not shifted:
+        return PreconditionedSystem(problem)
     if has(A, HasStencil):
         return GridSystem(A, real, bounded=bounded, settings=settings, shifted=shifted, hierarchy=hierarchy)
     if isinstance(A, DenseOperator):
