@@ -25,6 +25,7 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.program import Launch, Program
@@ -259,13 +260,15 @@ def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
 class DiagonalSystem(KrylovSystem):
     """A Krylov method preconditioned by the diagonal, for any operator, in float64: conjugate gradients if A is symmetric, else GMRES."""
 
+    _definite = True  # whether conjugate gradients can take the preconditioner
+
     def __init__(self, problem: LCP, *, shifted: bool = False) -> None:
         self._A, self._layout = problem.A, problem.layout
         self.r, self.z = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
         self._diagonal, self._inverse = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
         weight = self._inverse if shifted else None
         self._shift: wp.array[Any] | None = None
-        method = ConjugateGradient if self._A.symmetric and self._definite(problem) else GMRES
+        method = ConjugateGradient if self._A.symmetric and self._definite else GMRES
         self._iterate_by(method(self._product, self, weight=weight), weight)
         self.refresh()
 
@@ -283,10 +286,6 @@ class DiagonalSystem(KrylovSystem):
         """Precondition: z = r / d."""
         DIVIDE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
-    def _definite(self, problem: LCP) -> bool:
-        """Return whether the preconditioner is fit for conjugate gradients."""
-        return True
-
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         shape = self._layout.stored_shape
         self._A.apply(p.reshape(shape), q.reshape(shape))
@@ -296,10 +295,9 @@ class DiagonalSystem(KrylovSystem):
 class PreconditionedSystem(DiagonalSystem):
     """The same, preconditioned by P M P with the problem's own M, on the host; conjugate gradients if M seems definite, too."""
 
-    def _definite(self, problem: LCP) -> bool:
-        assert problem.preconditioner is not None
-        self._M = problem.preconditioner
-        return self._M.definite
+    def __init__(self, problem: LCP, M: Preconditioner) -> None:
+        self._M, self._definite = M, M.definite
+        super().__init__(problem)
 
     def apply(self) -> None:
         """Precondition: z = P M r; r is 0 off the free set."""
@@ -322,7 +320,7 @@ def principal_system(
     """
     A = problem.A
     if problem.preconditioner is not None and not shifted:
-        return PreconditionedSystem(problem)
+        return PreconditionedSystem(problem, problem.preconditioner)
     if has(A, HasStencil):
         return GridSystem(A, real, bounded=bounded, settings=settings, shifted=shifted, hierarchy=hierarchy)
     if isinstance(A, DenseOperator):
