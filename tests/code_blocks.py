@@ -1,5 +1,6 @@
 """What tests read out of Markdown: code blocks, headings with their anchors, links."""
 
+import linecache
 import re
 import unicodedata
 from pathlib import Path
@@ -18,8 +19,9 @@ def prose(page: Path) -> str:
 
 
 def run(code: str, page: Path) -> None:
-    """Run a block in a name space of its own."""
-    exec(compile(code, page.name, "exec"), {})
+    """Run a block in a name space of its own; kernels in it find their source."""
+    linecache.cache[page.name] = (len(code), None, code.splitlines(keepends=True), page.name)
+    exec(compile(code, page.name, "exec"), {"__name__": f"block_of_{page.stem}"})
 
 
 def links(page: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
+from warp_lcp.linear_complementarity import linear_complementarity
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators import (
     AIR,
@@ -9,6 +10,7 @@ from warp_lcp.operators import (
     SOLID,
     DenseOperator,
     GridPoisson,
+    LinearOperator,
     LowRankOperator,
     Operator,
     SparseOperator,
@@ -79,6 +81,7 @@ __all__ = [
     "IncrementalPivoting",
     "InteriorPoint",
     "Lemke",
+    "LinearOperator",
     "LowRankOperator",
     "MinimumMapNewton",
     "NaturalResidual",
@@ -105,6 +108,7 @@ __all__ = [
     "default_method",
     "enumerate_batch",
     "get_threads",
+    "linear_complementarity",
     "recommend",
     "set_threads",
     "solve",

@@ -84,9 +84,9 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
     else:
         definiteness = _definiteness(matrix, A.symmetric, d)
     entries = matrix.nnz if kind == "sparse" else n**2 if kind == "dense" else 7 * n
-    able = tuple(name for name, method in METHODS.items() if takes(method, A) and _suits(method, n, bounds))
+    able = tuple(name for name, method in METHODS.items() if takes(method, A) and _suits(method, problem, n, bounds))
     sweeps = sweeps_to(problem, accuracy)
-    return Traits(kind, n, entries, A.symmetric, sign, definiteness, bounds, sweeps, suits(A), able)
+    return Traits(kind, n, entries, A.symmetric, sign, definiteness, bounds, sweeps, problem.preconditioner is None and suits(A), able)
 
 
 def bounds_of(problem: LCP) -> str:
@@ -98,8 +98,10 @@ def bounds_of(problem: LCP) -> str:
     return {0: "none", 1: "one-sided", 2: "box"}[sum(sides)]
 
 
-def _suits(method: Any, unknowns: int, bounds: str) -> bool:
-    """Return whether a method takes so many unknowns and such bounds."""
+def _suits(method: Any, problem: LCP, unknowns: int, bounds: str) -> bool:
+    """Return whether a method takes so many unknowns and such bounds, and makes use of a preconditioner that there is."""
+    if problem.preconditioner is not None and not getattr(method, "preconditioned", False):
+        return False
     return unknowns <= getattr(method, "most_unknowns", unknowns) and (bounds != "affine" or getattr(method, "affine_bounds", False))
 
 

@@ -90,7 +90,15 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
         counts = level.stencil.padding.counts
         level.stencil.__dict__["rows"] = Rows.strided(level.stencil.d.size, first.x.device, (L.base, L.s1, L.s2), counts, cells=1)
     kernels, s, m = coarsest_kernels(*rows.levels[-1].form), rows.levels[-1].stencil, len(inverse)
-    inputs = [s.struct, s.rows.single, wp.vec3i(*map(int, s.periodic)), wp.float64(1e-13), 1, hierarchy._dense.matrix, hierarchy._dense.inverse]
+    inputs = [
+        s.struct,
+        s.rows.single,
+        wp.vec3i(*map(int, s.periodic)),
+        wp.float64(1e-13),
+        1,
+        hierarchy._dense.matrix,
+        hierarchy._dense.inverse,
+    ]
     wp.launch(kernels.invert, 1, inputs, device="cpu")
     np.testing.assert_allclose(hierarchy._dense.inverse.numpy(), inverse, rtol=1e-12)
     solve = hierarchy._solving._replace(rows=Rows.by_turns(m, first.x.device, m))

@@ -2,6 +2,7 @@
 
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
+from warp_lcp.operators.linear_operator import LinearOperator
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import Stencil
@@ -9,5 +10,6 @@ from warp_lcp.operators.sum import SumOperator
 from warp_lcp.problem.protocol import Operator
 
 __all__ = [
-    "AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "LowRankOperator", "Operator", "SparseOperator", "Stencil", "SumOperator",
+    "AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "LinearOperator", "LowRankOperator", "Operator", "SparseOperator", "Stencil",
+    "SumOperator",
 ]  # fmt: skip

@@ -117,10 +117,12 @@ class SumOperator(Pickled):
         return None if found is None else found.without(_felt(found.label, found.count, low))
 
     def masked(self, free: Any, shift: Any = None) -> SumOperator:
-        """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
+        """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift); of terms that have that."""
+        first: Any = self.first
+        second: Any = self.second
         if isinstance(self.first, LowRankOperator):  # it cannot take a shift
-            return SumOperator(self.first.masked(free), self.second.masked(free, shift))
-        return SumOperator(self.first.masked(free, shift), self.second.masked(free))
+            return SumOperator(self.first.masked(free), second.masked(free, shift))
+        return SumOperator(first.masked(free, shift), second.masked(free))
 
     def _add(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool) -> wp.array[Any]:
         if x.size not in (self.layout.size, int(np.prod(self.shape))):

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.problem.bounds import HEADERS, INFINITE, LAUNCHED, Bounds
 from warp_lcp.problem.pickling import OnHost, Pickled
+from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
@@ -42,7 +43,10 @@ def as_operator(A: Any, device: Any = None, dtype: Any = wp.float64) -> Operator
     if hasattr(A, "__array__") or hasattr(A, "to_numpy"):
         return as_operator(real_array(A, "A"), device, dtype)
     if hasattr(A, "apply"):
-        raise ValueError(f"A is a {type(A).__name__} without {', '.join(missing)}: an operator needs them, see wl.Operator")
+        without = f"A is a {type(A).__name__} without {', '.join(missing)}"
+        raise ValueError(f"{without}: an operator needs them; what inherits from wl.Operator has all but shape, device and apply")
+    if hasattr(A, "__matmul__") or callable(A):
+        raise ValueError(f"A is a {type(A).__name__}: wl.LinearOperator(A, ...) makes an operator of what has products")
     raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")
 
 
@@ -61,9 +65,15 @@ class LCP(Pickled):
         b: field of A's shape, units of y.
         lower: l, a number or a field; -inf where there is none; or AffineBounds, which depend on x.
         upper: u, a number or a field; inf where there is none; or AffineBounds.
+        preconditioner: M, an approximation of A's inverse, for methods that solve linear systems with A on the free unknowns F by a Krylov
+            method (MinimumMapNewton, PrimalDualActiveSet, SubspaceMinimization): M_FF stands for the inverse of A_FF. Anything of shape
+            (n, n) with products by `@`: a matrix, a scipy.sparse.linalg.LinearOperator, PyAMG's `ml.aspreconditioner()`. It is applied on
+            the host, in float64. Conjugate gradients take it where A is symmetric and M seems symmetric positive definite, by two
+            products; GMRES takes any. None: the operator's own.
 
     Raises:
-        ValueError: a NaN, a wrong shape, l > u, l = inf, u = -inf, or no unknown; the message names the argument.
+        ValueError: a NaN, a wrong shape, l > u, l = inf, u = -inf, or no unknown; a preconditioner of another kind or shape, or for a grid,
+            whose multigrid it would replace. The message names the argument.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -75,7 +85,7 @@ class LCP(Pickled):
         [0.  1.5]
     """
 
-    def __init__(self, A: Operator | Array, b: Array, lower: Any = 0.0, upper: Any = np.inf) -> None:
+    def __init__(self, A: Operator | Array, b: Array, lower: Any = 0.0, upper: Any = np.inf, *, preconditioner: Any = None) -> None:
         A = as_operator(A, b.device if isinstance(b, wp.array) else None)
         self.A, self.layout = A, layout_of(A)
         self.unknown = _unknown(A, self.layout)
@@ -85,11 +95,13 @@ class LCP(Pickled):
         self.b = self.layout.load(b, wp.float64, "b")
         self.bounds = Bounds(self.layout, lower, upper)
         self._check()
+        self.preconditioner = None if preconditioner is None else Preconditioner(preconditioner, self.layout)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the operator, b and the bounds as they are now; fields that are used in place come back as device arrays."""
         b = OnHost(self.b.reshape(self.layout.stored_shape)) if self.in_place else self.b.numpy().copy()
-        return LCP, (self.A, b, *self.bounds.given_again())
+        M = None if self.preconditioner is None else self.preconditioner.given
+        return _made, (self.A, b, *self.bounds.given_again(), M)
 
     @property
     def device(self) -> wp.Device:
@@ -157,6 +169,10 @@ class LCP(Pickled):
                 raise ValueError(f"{name} holds {wrong}: no x could meet it")
         if crossed:
             raise ValueError(f"lower > upper in {crossed} unknowns")
+
+
+def _made(A: Operator, b: Array, lower: Any, upper: Any, preconditioner: Any) -> LCP:
+    return LCP(A, b, lower, upper, preconditioner=preconditioner)
 
 
 def _count(unknown: np.ndarray) -> int:

@@ -6,12 +6,14 @@ An operator has a capability if it has the members; `has` says so, and is the on
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from functools import cache
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeGuard, TypeVar, runtime_checkable
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.problem.scale import NoTranspose, estimated_scale
 from warp_lcp.rows.fields import Layout
 
 if TYPE_CHECKING:
@@ -26,32 +28,46 @@ Capability = TypeVar("Capability", bound="Operator")
 class Operator(Protocol):
     """A square linear operator A on fields of shape `shape`: what each operator has.
 
-    Bring your own by implementing this protocol; docs "Operators of your own" has one. Fields are then plain contiguous arrays of that
-    shape. What more an operator can do are capabilities (`warp_lcp.problem.protocol`): it has one if it has its members.
+    Bring your own by inheriting from this protocol, which leaves `shape`, `device` and `apply` to write, or by having all its members; a
+    product of NumPy arrays makes one by `wl.LinearOperator`. Docs "Operators of your own" shows both. Fields are plain contiguous arrays of
+    that shape. What more an operator can do are capabilities (`warp_lcp.problem.protocol`): it has one if it has its members.
 
     Attributes:
         shape: shape of the fields that A maps to each other.
-        dtype: type in which A's entries are stored, wp.float32 or wp.float64.
+        dtype: type in which A's entries are stored, wp.float32 or wp.float64, which is the default.
         device: the device of A's arrays.
-        symmetric: whether A equals its transpose.
+        symmetric: whether A equals its transpose; by default it is not taken to.
     """
 
     shape: tuple[int, ...]
-    dtype: Any
+    dtype: Any = wp.float64
     device: wp.Device
-    symmetric: bool
+    symmetric: bool = False
 
+    @abstractmethod
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return A x, written to `out` if that is given."""
 
     def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
-        """Return A' x, written to `out` if that is given."""
+        """Return A' x, written to `out` if that is given; by default A x of a symmetric A.
+
+        Raises:
+            NoTranspose: A is not symmetric, and has no transpose of its own. It is a ValueError.
+        """
+        if not self.symmetric:
+            raise NoTranspose(f"{type(self).__name__} has no apply_transpose and is not symmetric: give it one, or take MinimumMapNewton")
+        return self.apply(x, out)
 
     def diagonal(self) -> wp.array[Any]:
-        """Return the diagonal of A as a field of type `dtype`."""
+        """Return the diagonal of A as a field of type `dtype`.
 
-    def masked(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> Operator:
-        """Return P A P + P D P, with P the restriction to the unknowns where `free` is not 0 and D = diag(shift)."""
+        By default sizes of rows and columns stand for it, which 16 products estimate each time that this is called: positive, and for a
+        diagonal that leads in its rows about as large. They make preconditioners and step lengths nearly as good as the diagonal's.
+        """
+        layout = layout_of(self)
+        unknown = self.cells.numpy().ravel() == 1 if has(self, HasCells) else np.ones(layout.size, dtype=bool)
+        sizes = estimated_scale(self, layout, unknown) * unknown
+        return wp.array(sizes.reshape(layout.stored_shape), dtype=self.dtype, device=self.device)
 
 
 class HasRows(Operator, Protocol):

@@ -7,7 +7,6 @@ change when x is rescaled; it vanishes exactly at solutions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import warp as wp
 
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
-from warp_lcp.problem.scale import scale_by_products
+from warp_lcp.problem.scale import estimated_scale
 from warp_lcp.rows import Known, RowPass, Rows
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Sums
@@ -104,18 +103,7 @@ class NaturalResidual:
     def _estimated_scale(self) -> np.ndarray:
         """Return d of an operator that does not know it, a flat stored field."""
         p, layout = self.problem, self.problem.layout
-        z, image, unknown = layout.zeros(wp.float64), layout.zeros(wp.float64), p.unknown.numpy() == 1
-
-        def images(apply: Callable[..., Any]) -> Callable[[np.ndarray], np.ndarray]:
-            def product(values: np.ndarray) -> np.ndarray:
-                z.assign(values * unknown)
-                apply(z.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
-                return image.numpy() * unknown
-
-            return product
-
-        d = layout.load(p.A.diagonal(), wp.float64).numpy() * unknown
-        return scale_by_products(d, images(p.A.apply), images(p.A.apply if p.A.symmetric else p.A.apply_transpose))
+        return estimated_scale(p.A, layout, p.unknown.numpy() == 1, layout.load(p.A.diagonal(), wp.float64).numpy())
 
     @property
     def row_sizes(self) -> wp.array[Any] | None:

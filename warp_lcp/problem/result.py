@@ -21,6 +21,7 @@ class SolveStatus(Enum):
         "where coefficients differ by more than 1e5, precision='double'"
     )
     TIME_LIMIT = "`max_seconds` came first: raise it, start from this x, or take a faster method, that of wl.solve(problem) or wl.recommend"
+    STOPPED = "the callback raised StopIteration: go on from this x"
     STAGNATED = "no smaller residual in the last `patience` steps: take another method or precision='double'"
     FLOOR = "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'"
     LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start elsewhere or take another method"

@@ -19,11 +19,18 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
+import warp as wp
+
+from warp_lcp.rows.fields import Layout
 
 SLACK = 1e-6  # of entries above the diagonal's: what storage in float32 leaves of semi-definite matrices of low rank
 PASSES = 50  # over the entries in search of r and c that make the diagonal 1: chains of rows that differ are seldom longer
 PROBES = 8  # vectors of signs with which the sizes of rows and columns are estimated
 TRUSTED = 10.0  # times |A_ii|: an operator's rows and columns that are larger have another scale
+
+
+class NoTranspose(ValueError):
+    """Products with the transpose of an operator that has none were asked for."""
 
 
 def scale_of_matrix(A: Any) -> np.ndarray:
@@ -53,19 +60,45 @@ def scale_by_products(
 
     |A_ii| where the rest of row and column i is not much larger; elsewhere q_i t_i as of a matrix, but with 2-norms, which are no smaller
     than the largest entries. With vectors z of random signs, the same each time, they are the roots of the means of (A'z)_j^2 and of
-    (A diag(1 / q) z)_i^2 (Hutchinson's estimator).
+    (A diag(1 / q) z)_i^2 (Hutchinson's estimator). Without a transpose q is 1: the sizes are those of rows.
 
     Args:
-        diagonal: of A, shape (n,).
+        diagonal: of A, shape (n,); zeros where it is not known.
         product: returns A z.
-        transposed: returns A' z.
+        transposed: returns A' z, or raises NoTranspose.
     """
     signs = np.random.default_rng(20010611).choice((-1.0, 1.0), (PROBES, len(diagonal)))
-    q = np.sqrt(np.mean([transposed(z) ** 2 for z in signs], axis=0))
+    try:
+        q = np.sqrt(np.mean([transposed(z) ** 2 for z in signs], axis=0))
+    except NoTranspose:
+        q = np.ones(len(diagonal))
     q = np.where(q > 0, q, 1.0)
     t = np.sqrt(np.mean([product(z / q) ** 2 for z in signs], axis=0))
     d, found = np.abs(diagonal), q * np.where(t > 0, t, 1.0)
     return np.where((d > 0) & (found <= TRUSTED * d), d, found)
+
+
+def estimated_scale(A: Any, layout: Layout, unknown: np.ndarray, diagonal: np.ndarray | None = None) -> np.ndarray:
+    """Return `scale_by_products` of an operator, a flat stored field, after 16 products.
+
+    Args:
+        A: the operator.
+        layout: of its fields.
+        unknown: which elements of a stored field are, bool, shape (n,).
+        diagonal: of A, a stored field; None: not known.
+    """
+    z, image = layout.zeros(wp.float64), layout.zeros(wp.float64)
+
+    def images(apply: Callable[..., Any]) -> Callable[[np.ndarray], np.ndarray]:
+        def product(values: np.ndarray) -> np.ndarray:
+            z.assign(values * unknown)
+            apply(z.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
+            return np.asarray(image.numpy() * unknown)
+
+        return product
+
+    d = np.zeros(layout.size) if diagonal is None else diagonal * unknown
+    return scale_by_products(d, images(A.apply), images(A.apply if A.symmetric else A.apply_transpose))
 
 
 def _diagonal_leads(size: Any, d: np.ndarray) -> bool:

@@ -230,6 +230,8 @@ def solve(
         across, loop = problem.layout.across, _LoopInBox
         if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
             raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
+        if problem.preconditioner is not None and not getattr(solver, "preconditioned", False):
+            raise ValueError(f"preconditioner: {type(solver).__name__} makes no use of it: take MinimumMapNewton or PrimalDualActiveSet")
         if across is not None and not getattr(solver, "distributed", False):
             raise ValueError(f"{type(solver).__name__} does not work on several ranks: take ProjectedMultigrid or MinimumMapNewton")
     stopping = stopping or StoppingCriteria()
@@ -275,7 +277,7 @@ class _Loop:
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
         self.linear = 0
-        self.best_iteration, self.best_norm, self.progress = 0, math.inf, 0
+        self.best_iteration, self.best_norm, self.progress, self.stopped = 0, math.inf, 0, False
 
     def run(self, x0: Array | None) -> SolveResult:
         """Solve from where the workspace's iterate is, from x0 or, in a box, from clip(0, l, u)."""
@@ -285,7 +287,7 @@ class _Loop:
         try:
             with self.deadline:
                 wanted = self.work.start(warm=self.warm, tolerance=self.tolerance) and self.stopping.max_iterations > 0
-                return self._iterate(None if wanted else self._status(0, None))
+                return self._iterate(None if wanted and not self.stopped else self._status(0, None))
         except TimeIsUp:  # within a step, of which nothing is left
             self._restore()
             ended = SolveStatus.CONVERGED if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
@@ -330,6 +332,8 @@ class _Loop:
     def _status(self, iteration: int, failure: SolveStatus | None, *, interim: bool = False) -> SolveStatus | None:
         """Return how the solve ends now, None if it goes on."""
         norm, first = self.residual.norm, max(self.history[0].residual, self.reference)
+        if self.stopped and self.tolerance < norm < math.inf:
+            return SolveStatus.STOPPED
         if failure is not None and self.tolerance < norm < math.inf:
             return self._floor_or(failure)
         idle = iteration - max(self.best_iteration, self.progress)
@@ -353,7 +357,10 @@ class _Loop:
         record = Record(iteration, self.residual.norm, self.linear, step.active, step.name, seconds)
         self.history.append(record)
         if self.callback is not None:
-            self.callback(record)
+            try:
+                self.callback(record)
+            except StopIteration:
+                self.stopped = True
 
     def _keep(self, iteration: int) -> None:
         """Remember the iterate as the best one."""

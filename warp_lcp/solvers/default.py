@@ -25,14 +25,15 @@ def default_method(problem: LCP) -> Solver:
 
     That is also for compact stencils that are not symmetric, or that only lines smooth.
 
-    Its systems are solved directly on the host, on CUDA devices too, where a matrix has at most 200 unknowns or a bandwidth up to 3. Where
-    bounds are affine in x, a method that takes them: ProjectedSOR, or ProjectedJacobi where A cannot be swept.
+    Its systems are solved directly on the host, on CUDA devices too, where a matrix has at most 200 unknowns or a bandwidth up to 3, unless
+    the problem brings a preconditioner. Where bounds are affine in x, a method that takes them: ProjectedSOR, or ProjectedJacobi where A
+    cannot be swept.
     """
     if problem.bounds.affine is not None:
         return ProjectedSOR() if takes(ProjectedSOR, problem.A) else ProjectedJacobi()
     if has(problem.A, HasStencil):
         return ProjectedMultigrid() if takes_points(problem.A) else MinimumMapNewton()
-    return MinimumMapNewton(direct=suits(problem.A))
+    return MinimumMapNewton(direct=problem.preconditioner is None and suits(problem.A))
 
 
 def solve(
@@ -47,7 +48,7 @@ def solve(
         stopping: the criteria; defaults to `StoppingCriteria()`.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
         workspace: what `solver.init(problem)` returned, to use its memory again.
-        callback: called with each Record as it is made.
+        callback: called with each Record as it is made; where it raises StopIteration, the solve ends with STOPPED.
         misplaced: nothing; other options are refused.
 
     Returns:

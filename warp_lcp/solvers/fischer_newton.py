@@ -15,6 +15,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.scale import NoTranspose
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll
 from warp_lcp.solvers.descent import NonmonotoneSearch
@@ -221,7 +222,10 @@ class FischerWorkspace(IterateMemory):
         """Go down the gradient where Newton's direction is of no use, or say so."""
         if not self.settings.safeguard:
             return Step("fischer", iterations, None, SolveStatus.NON_DESCENT)
-        step = self.descend(x)
+        try:
+            step = self.descend(x)
+        except NoTranspose:  # of an operator that has products only
+            return Step("fischer", iterations, None, SolveStatus.NON_DESCENT)
         return Step("gradient", iterations + step.linear_iterations, None, step.failure)
 
     def descend(self, x: wp.array[Any]) -> Step:

@@ -71,6 +71,7 @@ class MinimumMapNewton(Settings):
 
     needs: ClassVar[str] = "positive definite or P-matrix"
     distributed: ClassVar[bool] = True
+    preconditioned: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"
     monotone_cycles: CountOrZero = 2
@@ -199,9 +200,10 @@ class NewtonWorkspace(IterateMemory):
 
     def _minimizes(self) -> bool:
         """Return whether conjugate gradients within the bounds may take over: A has an energy, and is no matrix for coarse problems."""
-        if self.coarse is None or not self.problem.A.symmetric or not isinstance(self.problem.A, SparseOperator):
+        A = self.problem.A
+        if self.coarse is None or not isinstance(A, SparseOperator) or not A.symmetric or self.problem.preconditioner is not None:
             return False
-        host = self.problem.A.matrix()
+        host = A.matrix()
         return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
 
     def _gradient_step(self, x: wp.array[Any], spent: int = 0) -> Step | None:

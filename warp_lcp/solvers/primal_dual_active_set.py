@@ -53,6 +53,7 @@ class PrimalDualActiveSet(Settings):
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
+    preconditioned: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"
     monotone_cycles: CountOrZero = 2

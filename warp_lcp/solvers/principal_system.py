@@ -1,8 +1,9 @@
 """The system on the free unknowns that Newton-type methods share: (P A P + P D P) e = r with a free set P and a shift D >= 0.
 
 Grids take multigrid-preconditioned conjugate gradients, dense matrices a factorization, sparse ones algebraic multigrid or incomplete
-factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. The passes
-that make free sets, right-hand sides on them and projected steps stand here too.
+factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. Where a
+problem brings a preconditioner, that is taken instead. The passes that make free sets, right-hand sides on them and projected steps stand
+here too.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.program import Launch, Program
@@ -289,13 +291,15 @@ def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
 class DiagonalSystem(KrylovSystem):
     """A Krylov method preconditioned by the diagonal, for any operator, in float64: conjugate gradients if A is symmetric, else GMRES."""
 
+    _definite = True  # whether conjugate gradients can take the preconditioner
+
     def __init__(self, problem: LCP, *, shifted: bool = False) -> None:
         self._A, self._layout = problem.A, problem.layout
         self.r, self.z = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
         self._diagonal, self._inverse = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
         weight = self._inverse if shifted else None
         self._shift: wp.array[Any] | None = None
-        method = ConjugateGradient if self._A.symmetric else GMRES
+        method = ConjugateGradient if self._A.symmetric and self._definite else GMRES
         self._iterate_by(method(self._product, self, weight=weight), weight)
         self.refresh()
 
@@ -319,6 +323,18 @@ class DiagonalSystem(KrylovSystem):
         MASK.bind(rows_of(q), free=self._free, shift=self._shift, direction=p, q=q).launch()
 
 
+class PreconditionedSystem(DiagonalSystem):
+    """The same, preconditioned by P M P with the problem's own M, on the host; conjugate gradients if M seems definite, too."""
+
+    def __init__(self, problem: LCP, M: Preconditioner) -> None:
+        self._M, self._definite = M, M.definite
+        super().__init__(problem)
+
+    def apply(self) -> None:
+        """Precondition: z = P M r; r is 0 off the free set."""
+        self.z.assign(np.where(self._free.numpy() != 0, self._M(np.array(self.r.numpy())), 0.0))
+
+
 def principal_system(
     problem: LCP, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False,
     hierarchy: Hierarchy | None = None,
@@ -334,6 +350,8 @@ def principal_system(
         hierarchy: of a grid's stencil, where another method has made one.
     """
     A = problem.A
+    if problem.preconditioner is not None and not shifted:
+        return PreconditionedSystem(problem, problem.preconditioner)
     if has(A, HasStencil):
         if needs_lines(A):
             return LineSystem(A, real, settings=settings, shifted=shifted)

@@ -74,17 +74,7 @@ class QuadraticProgramWorkspace(DenseWorkspace):
         Raises:
             ValueError: A is not positive semi-definite.
         """
-        A = self.read().scaled()[0].A
-        if scipy.sparse.issparse(A):
-            shifted = (A + SEMIDEFINITE * scipy.sparse.eye_array(A.shape[0])).tocsc()
-            settings = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-            try:  # without row exchanges the signs of U's diagonal are A's inertia
-                definite = bool((scipy.sparse.linalg.splu(shifted, **settings).U.diagonal() > 0).all())
-            except RuntimeError:
-                definite = False
-        else:
-            definite = semidefinite(A)
-        if not definite:
+        if not is_convex(self.read().scaled()[0].A):
             raise ValueError("A is not positive semi-definite: QuadraticProgram needs a convex objective; Lemke does not")
 
     def minimize(self, tolerance: float, max_iterations: int) -> int:
@@ -113,3 +103,15 @@ class QuadraticProgramWorkspace(DenseWorkspace):
             self.write_iterate(min((x, settled), key=data.residual))
         self.ended = SolveStatus.STAGNATED if solved or iterations < max_iterations else SolveStatus.MAX_ITERATIONS
         return iterations
+
+
+def is_convex(A: Any) -> bool:
+    """Return whether a symmetric matrix with entries near 1, dense or sparse, is positive semi-definite: factors of it, shifted, say so."""
+    if not scipy.sparse.issparse(A):
+        return semidefinite(A)
+    shifted = (A + SEMIDEFINITE * scipy.sparse.eye_array(A.shape[0])).tocsc()
+    settings = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    try:  # without row exchanges the signs of U's diagonal are A's inertia
+        return bool((scipy.sparse.linalg.splu(shifted, **settings).U.diagonal() > 0).all())
+    except RuntimeError:
+        return False

@@ -58,6 +58,7 @@ class SubspaceMinimization(Settings):
 
     supports: ClassVar = (Relaxes, HasRows)
     needs: ClassVar[str] = "what ProjectedSOR needs; regular principal blocks (dense: least squares otherwise)"
+    preconditioned: ClassVar[bool] = True
     affine_bounds: ClassVar[bool] = True
 
     sweeps: Count = 5

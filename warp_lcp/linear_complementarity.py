@@ -1,0 +1,186 @@
+"""Complementarity problems in the manner of scipy.optimize: arrays in, an OptimizeResult out."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.problem.affine_bounds import AffineBounds
+from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.result import Record, SolveStatus
+from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.rows.fields import Array, real_array
+from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
+from warp_lcp.solvers.default import default_method, solve
+from warp_lcp.solvers.registry import METHODS
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
+
+STATUSES = {  # in the manner of SciPy: 0 is success, 99 that a callback has ended it
+    SolveStatus.CONVERGED: 0,
+    SolveStatus.MAX_ITERATIONS: 1,
+    SolveStatus.INFEASIBLE: 2,
+    SolveStatus.STAGNATED: 3,
+    SolveStatus.FLOOR: 4,
+    SolveStatus.NON_DESCENT: 5,
+    SolveStatus.LOCAL_MINIMUM: 6,
+    SolveStatus.DIVERGED: 7,
+    SolveStatus.NON_FINITE: 8,
+    SolveStatus.TIME_LIMIT: 9,
+    SolveStatus.STOPPED: 99,
+}
+WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # what criteria are called here
+
+
+def linear_complementarity(
+    A: Any, b: Array, *, bounds: Any = None, x0: Array | None = None, tol: float = 1e-6, atol: float = 0.0,
+    method: str | Solver | None = None, maxiter: int = 1000, preconditioner: Any = None, callback: Callable[..., Any] | None = None,
+) -> OptimizeResult:  # fmt: skip
+    """Find x with lo <= x <= hi and y = A x + b: y_i >= 0 where x_i = lo_i, y_i <= 0 where x_i = hi_i, and y_i = 0 in between.
+
+    For bounds 0 and inf that is the linear complementarity problem, 0 <= x, y >= 0, x'y = 0 ([Book] 1.2); if A is symmetric positive
+    semi-definite, x minimizes x'Ax / 2 + b'x within its bounds. This is `wl.solve` in SciPy's manner, for arrays on the host: problems
+    that are solved again and again, or live on a device, are better made once as a `wl.LCP`.
+
+    Args:
+        A: matrix (n, n), a numpy array or scipy.sparse one in any format, a scipy.sparse.linalg.LinearOperator, or an operator of warp_lcp.
+        b: n numbers in any shape, or a field of the operator's shape.
+        bounds: a pair (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None where there is none; None: (0, inf).
+        x0: a guess, of b's shape.
+        tol: relative tolerance, in [0, 1): of the natural residual's norm, relative to that at the projection of 0 onto the bounds.
+        atol: absolute tolerance of that norm, >= 0, in the units of b.
+        method: a method with its settings, say `wl.InteriorPoint()`, or a name in `wl.METHODS`, which stands for the method with the
+            settings it has if none are given; None: `wl.default_method`. (Names are for this function and the command line alone.)
+        maxiter: the most iterations of the method, >= 0.
+        preconditioner: of `wl.LCP`.
+        callback: called after each iteration: `callback(intermediate_result)`, an OptimizeResult with x, nit and residual, if that is what
+            its parameter is called, else `callback(x)`. Where it raises StopIteration the best x so far is returned, with status 99.
+
+    Returns:
+        `x`, a float64 array of b's shape; `success`, whether the residual, recomputed in float64, meets a tolerance; `status`, 0 for
+        success, 1 where maxiter came first, 2 where there is no solution, others as `STATUSES` of this module has them; `message`,
+        which says what to try next; `nit`; `residual`, the norm of the natural residual, and `relative_residual`; `slack`, y;
+        `active_mask`, as scipy.optimize.lsq_linear has it, -1 where x is held at lo, 1 at hi, 0 where y = 0 is asked for; `result`,
+        what `wl.solve` returned.
+
+    Raises:
+        ValueError: an argument is of another kind, shape or range, or the method cannot take this A; the message names it.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> found = wl.linear_complementarity(np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([2.0, -3.0]))
+        >>> print(found.success, found.x, found.slack, found.active_mask)
+        True [0.  1.5] [0.5 0. ] [-1  0]
+    """
+    from scipy.optimize import OptimizeResult  # a quarter of a second to import
+
+    criteria = {"tol": ShareOrZero, "atol": NonNegative, "maxiter": CountOrZero}
+    rtol, least, most = (checked(name, given, criteria[name]) for name, given in (("tol", tol), ("atol", atol), ("maxiter", maxiter)))
+    tell = _told(callback)
+    operator = as_operator(A, b.device if isinstance(b, wp.array) else None)
+    fields = _Fields(real_array(b, "b"), tuple(operator.shape))
+    lower, upper = _pair(bounds)
+    lower, upper = fields.load(lower, "bounds, lo"), fields.load(upper, "bounds, hi")
+    problem = LCP(operator, fields.load(b, "b"), lower, upper, preconditioner=preconditioner)
+    solver = default_method(problem) if method is None else _method(method)
+    stopping = StoppingCriteria(rtol=rtol, atol=least, max_iterations=most, patience=max(30, most // 10))
+    work = solver.init(problem)
+
+    def told(record: Record) -> None:
+        if tell is not None and record.iteration > 0:
+            x = fields.unload(problem.layout.unload(work.x))
+            tell(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
+
+    guess = None if x0 is None else fields.load(x0, "x0")
+    result = solve(problem, solver, stopping=stopping, x0=guess, workspace=work, callback=told)
+    message = f"{result.status.name}: {result.status.value}"
+    for word, here in WORDS.items():
+        message = message.replace(word, here)
+    slack, active = _sides(problem, work.residual, result.x)
+    return OptimizeResult(
+        x=fields.unload(result.x), success=bool(result), status=STATUSES[result.status], message=message, nit=result.iterations,
+        residual=result.residual, relative_residual=result.relative_residual, slack=fields.unload(slack),
+        active_mask=fields.unload(active, np.int8), result=result,
+    )  # fmt: skip
+
+
+class _Fields:
+    """Arrays of b's shape, as fields of the operator's and back."""
+
+    def __init__(self, b: np.ndarray, shape: tuple[int, ...]) -> None:
+        self._given, self._shape = b.shape, shape
+
+    def load(self, values: Any, name: str) -> Any:
+        """Return an array in the operator's shape if it has b's, else as it is."""
+        if np.ndim(values) == 0 or isinstance(values, (AffineBounds, wp.array)):
+            return values
+        host = real_array(values, name)
+        if host.shape == self._given and host.size == int(np.prod(self._shape)):
+            return host.reshape(self._shape)
+        if np.ndim(host) and name != "b" and host.shape != self._shape:
+            raise ValueError(f"{name} has shape {host.shape}: expected {self._given}")
+        return host
+
+    def unload(self, field: wp.array[Any], dtype: Any = np.float64) -> np.ndarray:
+        """Return a field as an array of b's shape, where that has as many elements."""
+        host = np.array(field.numpy(), dtype=dtype)
+        return host.reshape(self._given if host.size == int(np.prod(self._given)) else host.shape)
+
+
+def _pair(bounds: Any) -> tuple[Any, Any]:
+    """Return lower and upper bounds."""
+    if bounds is None:
+        return 0.0, np.inf
+    if hasattr(bounds, "lb") and hasattr(bounds, "ub"):
+        return bounds.lb, bounds.ub
+    if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
+        raise ValueError(f"bounds is a {type(bounds).__name__}: expected a pair (lo, hi), a scipy.optimize.Bounds or None")
+    lower, upper = bounds
+    return -np.inf if lower is None else lower, np.inf if upper is None else upper
+
+
+def _method(method: Any) -> Solver:
+    """Return the method that a name stands for, or the one given."""
+    if isinstance(method, str):
+        if method not in METHODS:
+            raise ValueError(f"method = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings or None")
+        return METHODS[method]()
+    if isinstance(method, type) or not isinstance(method, Solver):
+        kind = f"the class {method.__name__}" if isinstance(method, type) else f"a {type(method).__name__}"
+        raise ValueError(f"method is {kind}: expected a name in wl.METHODS, a method with its settings, say wl.MinimumMapNewton(), or None")
+    return method
+
+
+def _told(callback: Any) -> Callable[[OptimizeResult], Any] | None:
+    """Return what calls a callback in the way that its signature asks for, SciPy's two."""
+    if callback is None:
+        return None
+    if not callable(callback):
+        raise ValueError(f"callback is a {type(callback).__name__}: expected a function of one argument")
+    try:
+        names = set(inspect.signature(callback).parameters)
+    except ValueError:  # of a function written in C
+        names = set()
+    if names == {"intermediate_result"}:
+        return lambda found: callback(intermediate_result=found)
+    return lambda found: callback(found.x)
+
+
+def _sides(problem: LCP, residual: Any, x: wp.array[Any]) -> tuple[wp.array[Any], wp.array[Any]]:
+    """Return y at x and on which side of its bounds each unknown is held, fields of the operator's shape; 0 where there is no unknown."""
+    layout = problem.layout
+    stored, y = layout.load(x, wp.float64), layout.zeros(wp.float64)
+    problem.bounds.follow(stored)
+    problem.apply_plus(stored, problem.b, y)
+    at, slack, unknown = stored.numpy(), y.numpy(), problem.unknown.numpy() == 1
+    d = np.maximum(np.abs(residual.diagonal.numpy().astype(np.float64)) * residual.unit, np.finfo(np.float64).tiny)
+    low = (d * (at - problem.lower.numpy()) <= slack) & unknown
+    high = (d * (at - problem.upper.numpy()) >= slack) & unknown & ~low
+    mask = high.astype(np.float64) - low
+    return layout.unload(wp.array(np.where(unknown, slack, 0.0), device=y.device)), layout.unload(wp.array(mask, device=y.device))

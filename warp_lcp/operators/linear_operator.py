@@ -1,0 +1,184 @@
+"""An operator that is known by its products on the host: a function of NumPy arrays, SciPy's LinearOperator, or what else has `@`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import scipy.sparse.linalg
+import warp as wp
+
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.protocol import Operator
+from warp_lcp.problem.scale import NoTranspose, estimated_scale
+from warp_lcp.rows.fields import Layout, check_storable, real_array
+
+Product = Callable[[np.ndarray], Any]
+ASYMMETRY = 1e-5  # of ||u|| ||A v||: above what products in float32 leave of u'Av = v'Au
+
+
+class LinearOperator(Pickled, Operator):
+    """A x by a function, or by `A @ x` of a scipy.sparse.linalg.LinearOperator: products are all that there is of A.
+
+    Products are made on the host, from copies of x in float64, whatever the device. Every method that needs products only takes it
+    (docs "Operators of your own"); `MinimumMapNewton` is the default. Two products check what is given, two more that A is symmetric
+    where it is said to be.
+
+    Args:
+        A: function of a float64 array of shape `shape` that returns A x in that shape; or what has a shape (n, n) and products by `@`.
+        shape: of the fields; (n,) if None, which a function does not allow.
+        symmetric: whether A equals its transpose, which halves what Newton's systems cost (conjugate gradients, else GMRES) and some
+            methods need. None: not, unless A is its own adjoint, `A.H is A`, as SciPy's special arrays are.
+        diagonal: of A, a number or a field. None: sizes of rows and columns, estimated by 16 products, stand for it; the natural
+            residual's scale does not rest on it alone in any case.
+        transpose: function that returns A'x; None: `A.rmatvec` where that is defined. An unsymmetric A without it is refused by what
+            needs A' (GradientDescent).
+        device: Warp device of the fields; the CPU if None.
+
+    Raises:
+        ValueError: A is of another kind, not square or not real; a product has another shape, is not real or not finite; A is said to be
+            symmetric and is not.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.LinearOperator(lambda x: 3 * x - np.roll(x, 1) - np.roll(x, -1), (5,), symmetric=True, diagonal=3.0)
+        >>> print(wl.solve(wl.LCP(A, np.array([1.0, -2.0, 1.0, 1.0, 1.0]))).x.numpy().round(3))
+        [0.    0.667 0.    0.    0.   ]
+    """
+
+    def __init__(
+        self, A: Any, shape: tuple[int, ...] | None = None, *, symmetric: bool | None = None, diagonal: Any = None,
+        transpose: Product | None = None, device: Any = None,
+    ) -> None:  # fmt: skip
+        self._given = (A, shape, symmetric, diagonal, transpose)
+        self.shape = _shape_of(A, shape)
+        self.device = wp.get_device("cpu" if device is None else device)
+        self.layout = Layout(self.shape, self.device)
+        self._product, self._transpose = _products_of(A, self.shape, transpose)
+        self._diagonal = None if diagonal is None else self._field(diagonal)
+        probes = np.random.default_rng(20230817).standard_normal((2, *self.shape))
+        images = [self._image(z, self._product) for z in probes]
+        if not all(np.isfinite(image).all() for image in images):
+            raise ValueError("A gives a product that is not finite, of normally distributed numbers")
+        self.symmetric = isinstance(A, scipy.sparse.linalg.LinearOperator) and A.H is A if symmetric is None else bool(symmetric)
+        one, other = (float(np.vdot(z, image)) for z, image in zip(probes, images[::-1], strict=True))
+        if symmetric and abs(one - other) > ASYMMETRY * math.sqrt(self.layout.size) * max(float(np.linalg.norm(v)) for v in images):
+            raise ValueError(f"symmetric: A is not, u'Av is {one:.6g} and v'Au {other:.6g} for some u and v; pass symmetric=False")
+        self._scale: np.ndarray | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the operator was made of."""
+        return made_again(_made, *self._given, device=self.device)
+
+    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A x, x of `shape` and type wp.float32 or wp.float64."""
+        return self._applied(self._product, x, out)
+
+    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A' x, x as for `apply`.
+
+        Raises:
+            NoTranspose: A has none.
+        """
+        if self._transpose is None and not self.symmetric:
+            raise NoTranspose("A has no products with its transpose: give wl.LinearOperator a transpose, or a method that needs none")
+        return self._applied(self._product if self.symmetric or self._transpose is None else self._transpose, x, out)
+
+    def diagonal(self) -> wp.array[Any]:
+        """Return the diagonal of A, or sizes in its place, of `shape`."""
+        d = self.scale() if self._diagonal is None else self._diagonal
+        return wp.array(d.reshape(self.shape), dtype=wp.float64, device=self.device)
+
+    def scale(self) -> np.ndarray:
+        """Return the natural residual's d, estimated by 16 products, the first time that it is asked for."""
+        if self._scale is None:
+            self._scale = estimated_scale(self, self.layout, np.ones(self.layout.size, dtype=bool), self._diagonal)
+        return self._scale
+
+    def _field(self, diagonal: Any) -> np.ndarray:
+        """Return a diagonal as a flat field."""
+        host = np.asarray(real_array(diagonal, "diagonal"), dtype=np.float64)
+        if host.shape not in ((), self.shape):
+            raise ValueError(f"diagonal has shape {host.shape}: expected a number or {self.shape}")
+        check_storable(host, wp.float64, "diagonal")
+        return np.broadcast_to(host, self.shape).ravel().copy()
+
+    def _applied(self, product: Product, x: wp.array[Any], out: wp.array[Any] | None) -> wp.array[Any]:
+        if x.size != self.layout.size:
+            raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
+        image = self._image(np.array(x.numpy(), dtype=np.float64).reshape(self.shape), product)
+        out = wp.zeros_like(x) if out is None else out
+        out.assign(image.reshape(out.shape))
+        return out
+
+    def _image(self, x: np.ndarray, product: Product) -> np.ndarray:
+        """Return a product with an array that it may keep.
+
+        Raises:
+            ValueError: it is none, not real or has another shape.
+        """
+        try:
+            image = np.asarray(product(x))
+        except ValueError as reason:  # SciPy's, of a matvec that returns another shape
+            raise ValueError(f"A fails to multiply an array of shape {self.shape}: {reason}") from reason
+        if image.dtype.kind not in "biuf":
+            raise ValueError(f"A gives a product of type {image.dtype}: expected real numbers")
+        if image.shape != self.shape:
+            raise ValueError(f"A gives a product of shape {image.shape}: expected {self.shape}")
+        return image
+
+
+def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
+    """Return the shape of A's fields, which is checked against that of A where it has one."""
+    own: Any = getattr(A, "shape", None)
+    if isinstance(A, Operator) or not (callable(A) or hasattr(A, "__matmul__")):
+        raise ValueError(f"A is a {type(A).__name__}: expected a function, or a scipy.sparse.linalg.LinearOperator")
+    if not hasattr(A, "__matmul__"):
+        own = None
+    elif own is None or len(own) != 2 or own[0] != own[1] or own[0] == 0:
+        raise ValueError(f"A has shape {own}: expected (n, n) with n >= 1")
+    if own is None and shape is None:
+        raise ValueError("shape: say which fields A takes, a function has none")
+    try:
+        wanted = (int(own[0]),) if shape is None else tuple(int(n) for n in (shape if np.ndim(shape) else (shape,)))
+    except (TypeError, ValueError):
+        raise ValueError(f"shape = {shape!r}: expected a tuple of integers") from None
+    if not wanted or min(wanted) < 1 or (own is not None and math.prod(wanted) != own[0]):
+        raise ValueError(f"shape = {shape!r}: expected integers >= 1" + ("" if own is None else f" whose product is {own[0]}"))
+    if np.dtype(getattr(A, "dtype", None) or np.float64).kind not in "biuf":
+        raise ValueError(f"A has type {A.dtype}: expected real numbers")
+    return wanted
+
+
+def _products_of(A: Any, shape: tuple[int, ...], transpose: Product | None) -> tuple[Product, Product | None]:
+    """Return x -> A x and x -> A'x on fields of a shape, None in its place where that is not defined."""
+    if not (transpose is None or callable(transpose)):
+        raise ValueError(f"transpose is a {type(transpose).__name__}: expected a function")
+    if not hasattr(A, "__matmul__"):
+        return A, transpose
+
+    def product(x: np.ndarray) -> np.ndarray:
+        return np.asarray(A @ x.ravel()).reshape(shape)
+
+    def adjoint(x: np.ndarray) -> np.ndarray:
+        return np.asarray(A.rmatvec(x.ravel())).reshape(shape)
+
+    if transpose is not None or not hasattr(A, "rmatvec"):
+        return product, (lambda x: np.asarray(A.T @ x.ravel()).reshape(shape)) if transpose is None and hasattr(A, "T") else transpose
+    try:
+        adjoint(np.zeros(shape))
+    except NotImplementedError:  # SciPy's way to say that there is none
+        return product, None
+    return product, adjoint
+
+
+def _made(A: Any, shape: Any, symmetric: Any, diagonal: Any, transpose: Any, device: Any) -> LinearOperator:
+    return LinearOperator(A, shape, symmetric=symmetric, diagonal=diagonal, transpose=transpose, device=device)
+
+
+@as_operator.register(scipy.sparse.linalg.LinearOperator)
+def _linear(A: Any, device: Any = None, dtype: Any = wp.float64) -> LinearOperator:
+    return LinearOperator(A, device=device)

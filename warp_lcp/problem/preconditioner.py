@@ -1,0 +1,55 @@
+"""An approximate inverse of A that a user brings, checked once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from warp_lcp.rows.fields import Layout
+
+SYMMETRIC = 1e-6  # of ||u|| ||M v||: asymmetry above what rounding leaves, which conjugate gradients do not bear for long
+
+
+class Preconditioner:
+    """z = M r on the host, in float64.
+
+    Args:
+        M: of shape (n, n), with products by `@`.
+        layout: of the problem's fields.
+
+    Attributes:
+        given: M.
+        definite: whether two products say that M is symmetric and positive definite; more would be needed to be sure.
+
+    Raises:
+        ValueError: M is of another kind or shape, not real, or gives products that are not finite; or fields are stored with ghost cells.
+    """
+
+    def __init__(self, M: Any, layout: Layout) -> None:
+        n, shape = layout.size, getattr(M, "shape", None)
+        if not hasattr(M, "__matmul__"):
+            hint = ": PyAMG's is ml.aspreconditioner()" if hasattr(M, "aspreconditioner") else ""
+            raise ValueError(f"preconditioner is a {type(M).__name__}: expected something with products by @{hint}")
+        if layout.stored_shape != layout.shape:
+            raise ValueError("preconditioner: systems on grids have a multigrid method of their own, none can be given")
+        if shape != (n, n):
+            raise ValueError(f"preconditioner has shape {shape}: expected {(n, n)}")
+        self.given = M
+        u, v = np.random.default_rng(19520811).standard_normal((2, n))
+        Mu, Mv = self(u), self(v)
+        if not (np.isfinite(Mu).all() and np.isfinite(Mv).all()):
+            raise ValueError("preconditioner gives products that are not finite")
+        size = max(float(np.linalg.norm(u) * np.linalg.norm(Mv)), float(np.linalg.norm(v) * np.linalg.norm(Mu)))
+        self.definite = bool(abs(u @ Mv - v @ Mu) <= SYMMETRIC * size and u @ Mu > 0 and v @ Mv > 0)
+
+    def __call__(self, r: np.ndarray) -> np.ndarray:
+        """Return M r, shape (n,).
+
+        Raises:
+            ValueError: the product is not real, or of another shape.
+        """
+        z = np.asarray(self.given @ r)
+        if z.shape != r.shape or z.dtype.kind not in "biuf":
+            raise ValueError(f"preconditioner gives products of shape {z.shape} and type {z.dtype}: expected {r.shape}, real numbers")
+        return z
