@@ -89,7 +89,7 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
         level._bound.clear()
         counts = level.stencil.padding.counts
         level.stencil.__dict__["rows"] = Rows.strided(level.stencil.d.size, first.x.device, (L.base, L.s1, L.s2), counts, cells=1)
-    kernels, s, m = coarsest_kernels(*rows.levels[-1].form), rows.levels[-1].stencil, len(inverse)
+    kernels, s, m = coarsest_kernels(*rows.levels[-1].form[:3]), rows.levels[-1].stencil, len(inverse)
     inputs = [
         s.struct,
         s.rows.single,

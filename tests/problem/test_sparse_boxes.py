@@ -113,7 +113,7 @@ def solved(planes):
     return problem, wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=3))
 
 assert solved(16)[0].A.layout.padding.small_pages  # kernels are loaded
-for grid_poisson.LARGE in (1 << 20, 1 << 40):
+for grid_operator.LARGE in (1 << 20, 1 << 40):
     forget_peak()
     before = resident_bytes()
     kept = solved(64)

@@ -18,7 +18,7 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass
-from warp_lcp.rows.fields import Padding, check_kept, check_storable, real_array
+from warp_lcp.rows.fields import check_kept, check_storable, real_array
 from warp_lcp.rows.layout import Pattern
 
 HEADERS = Path(__file__).parent / "headers"
@@ -227,32 +227,36 @@ class Stencil(GridOperator):
 
 
 class StoredStencil(GridOperator):
-    """A level of a hierarchy as an operator: its own copy of a compact stencil in 2-D whose diagonal and weights are stored.
+    """A compact stencil whose diagonal and weights are there, as fields of a padded grid that it takes over.
 
     Args:
-        padding: of the level.
-        d: its diagonal.
-        weights: of its eight neighbors, one field after another.
-        inside: bool of each stored cell: which are unknowns.
-        symmetric: whether they make a symmetric matrix.
+        cells: as of `Stencil`; beyond the array there is AIR.
+        d: diagonal in units of `unit`, stored; 0 off the FLUID cells.
+        weights: of the pattern's neighbors, stored, or numbers.
+        pattern: which neighbors, and how their weights are had.
+        symmetric: whether A is.
+        unit: of the diagonal.
+        monotone: whether all weights are >= 0.
+        strength: mean weights along x, y, z.
     """
 
-    monotone = False
+    outside = AIR
 
-    def __init__(self, padding: Padding, d: wp.array[Any], weights: wp.array[Any], inside: np.ndarray, *, symmetric: bool) -> None:
-        self.symmetric = symmetric
-        cells = np.where(inside.reshape(padding.shape)[1, 1:-1, 1:-1], FLUID, AIR)
-        super().__init__(cells, {"d": d, "weights": weights}, (), d.device, d.dtype)
+    def __init__(
+        self, cells: np.ndarray, d: wp.array[Any], weights: tuple[Any, ...], pattern: Pattern, *, symmetric: bool, unit: float = 1.0,
+        monotone: bool = False, strength: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> None:  # fmt: skip
+        self.symmetric, self.monotone = symmetric, monotone
+        self._made, self._unit = (d, weights, pattern, strength), unit
+        super().__init__(cells, {}, (), d.device, wp.float64 if d.dtype is wp.uint8 else d.dtype)
 
-    def _take_coefficients(self, cells: np.ndarray, *, d: wp.array[Any], weights: wp.array[Any]) -> None:
-        n, self._d = d.size, wp.clone(d)
-        copied = wp.clone(weights)
-        self._weights = tuple(copied[i * n : (i + 1) * n] for i in range(8))
+    def _take_coefficients(self, cells: np.ndarray) -> None:
+        pass
 
     def _empty_stencil(self) -> PaddedStencil:
-        inside = wp.array((self.cells.numpy().ravel() == FLUID).astype(np.uint8), device=self.device)
-        wp.copy(self._d, wp.array(self._d.numpy() * inside.numpy(), dtype=self.dtype, device=self.device))
-        return PaddedStencil(self.layout.padding, self._d, self._weights, (), spans=self._spans, strength=(1.0, 1.0, 1.0), pattern=AROUND)
+        d, weights, pattern, strength = self._made
+        fields, numbers = (weights, ()) if pattern.names else (None, weights)
+        return PaddedStencil(self.layout.padding, d, fields, numbers, self._unit, spans=self._spans, strength=strength, pattern=pattern)
 
     def _fill_stencil(self) -> None:
         self._wrap_cells()

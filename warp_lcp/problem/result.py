@@ -71,6 +71,8 @@ class SolveResult(FieldsOnHost):
         residual: norm of the natural residual at x, recomputed in float64, units of y.
         relative_residual: residual over the one at clip(0, l, u); 0 where both vanish.
         history: a Record for the start and one for each step.
+        grid: cells (nz, ny, nx) or (ny, nx) of the grid whose compact stencil a sparse matrix was seen to be, and as which it was solved;
+            None of others.
     """
 
     x: wp.array[Any]
@@ -80,6 +82,7 @@ class SolveResult(FieldsOnHost):
     residual: float
     relative_residual: float
     history: list[Record] = field(repr=False)
+    grid: tuple[int, ...] | None = None
 
     def __bool__(self) -> bool:
         """Return whether the solve converged."""

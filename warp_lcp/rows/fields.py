@@ -65,9 +65,9 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
     Raises:
         ValueError: one is NaN or infinite, or becomes so.
     """
-    if not np.isfinite(values).all():
+    largest = max(-float(values.min(initial=0.0)), float(values.max(initial=0.0)))  # NaN if one is
+    if not np.isfinite(largest):
         raise ValueError(f"{name} holds a value that is not finite")
-    largest = float(np.abs(values).max(initial=0.0))
     if largest > float(np.finfo(wp.dtype_to_numpy(dtype)).max):
         raise ValueError(f"{name} holds values up to {largest:.1e}, too large for {dtype.__name__}: pass dtype=wp.float64")
 

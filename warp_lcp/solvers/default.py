@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Never
 
+import warp as wp
+
 from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.operators.matrix_stencil import stencil_of
+from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has, takes
 from warp_lcp.problem.result import Record, SolveResult
@@ -18,6 +23,8 @@ from warp_lcp.solvers.minimum_map_newton_direct import suits
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.psor import ProjectedSOR
+
+LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
 
 
 def default_method(problem: LCP) -> Solver:
@@ -44,7 +51,8 @@ def solve(
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
-        solver: the method, say `MinimumMapNewton()`; `default_method(problem)` if None.
+        solver: the method, say `MinimumMapNewton()`; `default_method(problem)` if None, and sparse matrices that are a compact stencil on a
+            box of cells in its natural order, x first, are then solved as such, which the result's `grid` says.
         stopping: the criteria; defaults to `StoppingCriteria()`.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
         workspace: what `solver.init(problem)` returned, to use its memory again.
@@ -68,5 +76,25 @@ def solve(
         raise ValueError("workspace: name the solver that made it")
     if solver is None and isinstance(problem, ConvexSetProblem):
         raise ValueError(f"solver: a {type(problem).__name__} is solved by methods of its own, name one")
+    if solver is None and isinstance(problem, LCP):
+        found = _solve_as_grid(problem, stopping, x0, callback)
+        if found is not None:
+            return found
     solver = default_method(problem) if solver is None else solver  # type: ignore[arg-type]  # an LCP, or refused there
     return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)
+
+
+def _solve_as_grid(
+    problem: LCP, stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None, callback: Callable[[Record], None] | None
+) -> SolveResult | None:
+    """Return the result of a large sparse matrix that is a grid's stencil, solved as one; None where it is none, or has not converged."""
+    A = problem.A
+    if not isinstance(A, SparseOperator) or A.unknowns < LARGE or problem.in_place or problem.preconditioner is not None:
+        return None
+    stencil = None if problem.bounds.affine is not None else stencil_of(A)
+    if stencil is None:
+        return None
+    fields = (field.numpy().reshape(stencil.shape) for field in (problem.b, problem.lower, problem.upper))
+    on_grid, start = LCP(stencil, *fields), None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy().reshape(stencil.shape)
+    result = solve_by(on_grid, default_method(on_grid), stopping=stopping, x0=start, callback=callback)
+    return replace(result, x=result.x.flatten(), grid=stencil.shape) if result else None

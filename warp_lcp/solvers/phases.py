@@ -14,9 +14,9 @@ import warp as wp
 from warp_lcp.multigrid.aggregates import coarse_points, suits_multigrid
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.operators.stencil import StoredStencil
+from warp_lcp.operators.stencil import AROUND, StoredStencil
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import FLUID, HasRows, HasScale, HasStencil, has
+from warp_lcp.problem.protocol import AIR, FLUID, HasRows, HasScale, HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, Step, solve
@@ -466,7 +466,10 @@ class CoarseStencilProblem(CoarseProblem):
         inside = (coarse.d.numpy() != 0) & (self._points(fluid.astype(np.float64)) != 0)
         if not inside.any():
             return False
-        A = StoredStencil(coarse.padding, coarse.d, coarse.weights, inside, symmetric=self._A.symmetric)
+        cells = np.where(inside.reshape(coarse.padding.shape)[1, 1:-1, 1:-1], FLUID, AIR)
+        d = wp.array(np.where(inside, coarse.d.numpy(), 0), dtype=coarse.d.dtype, device=hierarchy.device)
+        copied, n = wp.clone(coarse.weights), coarse.padding.size
+        A = StoredStencil(cells, d, tuple(copied[i * n : (i + 1) * n] for i in range(8)), AROUND, symmetric=self._A.symmetric)
         b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
         self._work = self._settings.init(LCP(A, b.reshape(A.layout.stored_shape), lower, upper))
         return True

@@ -1,0 +1,119 @@
+"""Sparse matrices that are stencils: those of a box of cells in its natural order, x first, whose rows reach compact neighbors only."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.operators.compressed_rows import CompressedRows
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.operators.stencil import StoredStencil
+from warp_lcp.problem.protocol import FLUID
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.layout import Pattern
+from warp_lcp.rows.vectors import Sums
+
+RECOGNIZE = RowPass(
+    "matrix_stencil.recognize", Path(__file__).parent / "headers" / "recognize.h", wp.float64, writes={"made": wp.float64},
+    whole={"ptr": wp.int32, "col": wp.int32, "a": wp.float64, "middle": wp.float64, "weights": wp.float64}, optional=("weights",),
+    numbers={**dict.fromkeys(("nx", "ny", "nz", "full", "kept"), int), "size": wp.int64}, sums=("wrong", "centers", "differ", "positive"),
+)  # fmt: skip
+LEAST = 3  # cells of an axis: with fewer, offsets along it and across it are the same
+SAMPLED = 8  # rows from the middle one on whose offsets tell the box: side by side, for most are not on its border then
+
+
+def stencil_of(A: SparseOperator) -> StoredStencil | None:
+    """Return the same operator as a stencil on a box, to the last bit; None where the matrix is none, or not stored in float64.
+
+    It takes one pass over the entries, and a second one where they have to be kept because they are not the same everywhere.
+    """
+    if A.dtype is not wp.float64:
+        return None
+    rows = A.rows()
+    for shape in _boxes(rows):
+        found = _as_stencil(A, rows, shape)
+        if found is not None:
+            return found
+    return None
+
+
+def _offsets(rows: CompressedRows) -> np.ndarray:
+    """Return the offsets of entries in some rows near the middle, ascending."""
+    starts, columns = rows.indptr.numpy(), rows.indices.numpy()
+    n = len(starts) - 1
+    some = range(n // 2, min(n // 2 + SAMPLED, n))
+    return np.unique(np.concatenate([columns[starts[r] : starts[r + 1]] - r for r in some]))
+
+
+def _boxes(rows: CompressedRows) -> Iterator[tuple[int, int, int]]:
+    """Yield the boxes (nz, ny, nx) that the offsets allow."""
+    n, found = rows.indptr.size - 1, _offsets(rows)
+    far = np.unique(np.abs(found[np.abs(found) > 1]))
+    if len(far) == 0 or len(found) > 27:
+        return
+    for nx in far[far <= far[0] + 2]:
+        if nx < LEAST or n % nx:
+            continue
+        beyond = far[far > nx + 1]
+        if len(beyond) == 0:
+            yield 1, n // int(nx), int(nx)
+        for plane in beyond:
+            if plane % nx == 0 and n % plane == 0 and (np.abs(beyond - plane) <= nx + 1).all():
+                yield n // int(plane), int(plane // nx), int(nx)
+
+
+def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, int]) -> StoredStencil | None:
+    nz, ny, nx = shape
+    if ny < LEAST or (nz > 1 and nz < LEAST):
+        return None
+    padding, device, starts = Padding(shape), A.device, rows.indptr.numpy()
+    middle = np.zeros(27)
+    row = ((nz // 2) * ny + ny // 2) * nx + nx // 2
+    steps = itertools.product((-1, 0, 1) if nz > 1 else (0,), (-1, 0, 1), (-1, 0, 1))
+    offsets = {x + y * nx + z * nx * ny: 13 + x + 3 * y + 9 * z for z, y, x in steps}
+    full = 0
+    for offset in _offsets(rows).tolist():
+        if offset not in offsets:
+            return None
+        full |= 1 << offsets[offset]
+    entries = slice(starts[row], starts[row + 1])
+    for column, value in zip(rows.indices.numpy()[entries].tolist(), rows.values.numpy()[entries], strict=True):
+        if column - row not in offsets:
+            return None
+        middle[offsets[column - row]] += value
+    kept = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
+    where, d = Rows.of(padding, device), padding.zeros(wp.float64, device)
+    given: dict[str, Any] = {
+        "ptr": rows.indptr,
+        "col": rows.indices,
+        "a": rows.values,
+        "middle": wp.array(middle, device=device),
+        "made": d,
+    }
+    given |= {"nx": nx, "ny": ny, "nz": nz, "full": full, "kept": kept, "size": padding.size}
+    sums = Sums(where, 4)
+    wrong, centers, differ, positive = sums.of(RECOGNIZE, **given, weights=None)
+    if wrong:
+        return None
+    places = [o for o in range(27) if kept >> o & 1]
+    neighbors = tuple((o % 3 - 1, o // 3 % 3 - 1, o // 9 - 1) for o in places)
+    weights: tuple[Any, ...] = tuple(-middle[o] for o in places)
+    if differ:
+        block = wp.zeros(len(places) * padding.size, dtype=wp.float64, device=device)
+        sums.of(RECOGNIZE, **given, weights=block)
+        weights = tuple(block[i * padding.size : (i + 1) * padding.size] for i in range(len(places)))
+    sizes = [float(np.abs(w.numpy()).sum()) / A.unknowns if differ else abs(w) for w in weights]
+    strength = tuple(sum(s for s, o in zip(sizes, neighbors, strict=True) if o[axis]) / (1 if A.symmetric else 2) for axis in range(3))
+    cells = np.full(shape if nz > 1 else shape[1:], FLUID, dtype=np.int8)
+    pattern = Pattern(neighbors, A.symmetric, "arrays" if differ else "numbers")
+    unit = 1.0
+    if not centers:  # a byte a cell
+        inside, unit = d.numpy() != 0, float(middle[13])
+        d = wp.array(inside.astype(np.uint8), device=device)
+    return StoredStencil(cells, d, weights, pattern, unit=unit, symmetric=A.symmetric, monotone=not positive, strength=strength)  # type: ignore[arg-type]
