@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.integrate
 import scipy.interpolate
-import scipy.sparse
 import warp as wp
 
-from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.operators.grid_matrix import grid_matrix
+from warp_lcp.operators.stencil import Stencil
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import AIR, FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
@@ -22,28 +22,6 @@ from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 Coefficients = dict[tuple[int, int], np.ndarray]
 IMPLICIT = 2  # steps of implicit Euler before those of Crank and Nicolson: the payoff has a kink
 DENSE = 0.2  # of K: within it nodes of S are as dense as can be
-
-
-def stencil_matrix(cells: np.ndarray, coefficients: Coefficients) -> scipy.sparse.csr_array:
-    """Return the matrix of (A x)_i = sum over offsets o of a_o(i) x_{i+o} on the FLUID cells; x = 0 in AIR, x_{i+o} = x_i outside the array.
-
-    Args:
-        cells: AIR or FLUID, shape (ny, nx).
-        coefficients: a_o, each of the shape of `cells`, by its offset (dy, dx).
-    """
-    ny, nx = cells.shape
-    number = np.where(cells == FLUID, np.cumsum(cells == FLUID).reshape(ny, nx) - 1, -1)
-    j, i = np.nonzero(cells == FLUID)
-    rows, columns, entries = [], [], []
-    for (dy, dx), a in coefficients.items():
-        inside = (j + dy >= 0) & (j + dy < ny) & (i + dx >= 0) & (i + dx < nx)
-        other = number[np.where(inside, j + dy, j), np.where(inside, i + dx, i)]
-        known = (other >= 0) & (a[j, i] != 0)
-        rows.append(number[j, i][known])
-        columns.append(other[known])
-        entries.append(a[j, i][known])
-    n = len(j)
-    return scipy.sparse.coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)).tocsr()
 
 
 def differences(x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,6 +39,12 @@ def differences(x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray) -> tupl
     low_upwind = 2 * diffusion / (below * (below + above)) + np.maximum(-drift, 0) / below
     high_upwind = 2 * diffusion / (above * (below + above)) + np.maximum(drift, 0) / above
     return np.where(upwind, low_upwind, low), np.where(upwind, high_upwind, high)
+
+
+def _with_free_top(coefficients: Coefficients, shift: wp.array[Any], device: Any) -> Stencil:
+    """Return the operator on all nodes but those of the largest S, where prices are 0; nothing reaches beyond the other sides."""
+    cells = np.full(coefficients[0, 0].shape, FLUID, dtype=np.int8)
+    return Stencil(cells, coefficients, shift=shift, outside=AIR, device=device, dtype=wp.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,24 +148,45 @@ class Heston:
             if value < least:
                 raise ValueError(f"{name} = {value}: must be >= {least}")
         S, v = self.nodes(ns, nv)
-        cells = np.full((nv + 1, ns + 1), FLUID, dtype=np.int8)
-        cells[:, -1] = AIR
-        L = stencil_matrix(cells, self.coefficients(S, v))
-        identity = scipy.sparse.eye_array(L.shape[0], format="csr")
-        payoff = np.broadcast_to(np.maximum(self.strike - S[:-1], 0), (nv + 1, ns)).ravel().copy()
-        lower = payoff if american else np.full_like(payoff, -np.inf)
-        u, times, A = payoff, self.expiry * (np.arange(steps + 1) / steps) ** 2, None
+        shape = (nv + 1, ns)
+        coefficients = {o: a[:, :-1] for o, a in self.coefficients(S, v).items()}
+        shift = wp.zeros((3, nv + 3, ns + 2), dtype=wp.float64, device=device)
+        A = _with_free_top(coefficients, shift, device)
+        L = grid_matrix(A)
+        payoff = np.broadcast_to(np.maximum(self.strike - S[:-1], 0), shape)
+        lower = payoff if american else np.full(shape, -np.inf)
+        u, times = payoff.copy(), self.expiry * (np.arange(steps + 1) / steps) ** 2
+        method, work = method or MinimumMapNewton(), None
+        b = A.layout.load(u, wp.float64).reshape(A.layout.stored_shape)
+        problem = LCP(A, b, lower)
         for step, (before, after) in enumerate(pairwise(times)):
-            dt, share = after - before, 1.0 if step < IMPLICIT else 0.5
-            matrix = (identity + share * dt * L).tocsr()
-            A = SparseOperator(matrix, device=device, dtype=wp.float64) if A is None else A
-            A.update(matrix)
-            problem = LCP(A, (1 - share) * dt * (L @ u) - u, lower)
-            result = solve(problem, method, x0=u, stopping=StoppingCriteria(rtol=1e-7, atol=1e-9, max_iterations=1000))
+            share = 1.0 if step < IMPLICIT else 0.5
+            unit = 1 / (share * (after - before))  # of y, so that only the shift changes
+            shift.fill_(unit)
+            A.update(A.cells)
+            rest = (1 - share) / share * (L @ u.ravel()).reshape(shape) - unit * u
+            b.assign(A.layout.load(rest, wp.float64).reshape(b.shape))
+            work = work or method.init(problem)
+            stopping = StoppingCriteria(rtol=1e-7, atol=1e-9 * unit, max_iterations=1000)
+            result = solve(problem, method, x0=u, stopping=stopping, workspace=work)
             if not result:
                 raise RuntimeError(f"time step {step}: {result.status.name}")
-            u = result.x.numpy()
-        return Prices(S, v, np.pad(u.reshape(nv + 1, ns), ((0, 0), (0, 1))))
+            u = A.layout.unload(result.x.flatten()).numpy().copy()
+        return Prices(S, v, np.pad(u, ((0, 0), (0, 1))))
+
+    def extrapolated(self, spot: Any, variance: float, ns: int, nv: int, steps: int, **options: Any) -> np.ndarray:
+        """Return prices extrapolated from this grid and one of half the spacings in space and time, the error being of second order.
+
+        Args:
+            spot: prices of the stock.
+            variance: v.
+            ns: intervals of S of the coarser one.
+            nv: its intervals of v.
+            steps: its time steps.
+            options: as of `put`.
+        """
+        coarse, fine = (self.put(f * ns, f * nv, f * steps, **options).at(spot, variance) for f in (1, 2))
+        return np.asarray((4 * fine - coarse) / 3)
 
     def european(self, spot: float, variance: float) -> float:
         """Return the European put's price by Heston's characteristic function, to about 1e-9.

@@ -16,8 +16,10 @@ from warp_lcp.gallery.obstacle import ball_obstacle, dam, journal_bearing, sine_
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.gallery.shallow_ice import IceDome
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.solvers.default import solve
+from warp_lcp.solvers.lemke import Lemke
 
 PETSC, CUTEST, P4PDES = "PETSc", "CUTEst", "p4pdes"
 SPG = "CSPG.jl"  # its table of CUTEst's problems, by the spectral projected gradient method
@@ -53,13 +55,13 @@ class Published:
         return self.within or 0.5 * 10.0**exponent * (1 + 1e-6)  # rounded half up, and binary fractions
 
 
-def solution(problem: Problem) -> np.ndarray:
-    """Return the solution of a problem of the gallery, to 11 digits, on the host.
+def solution(problem: Problem, *, rtol: float = 1e-11, method: Solver | None = None) -> np.ndarray:
+    """Return the solution of a problem of the gallery, to as many digits as the residual has, on the host.
 
     Raises:
         RuntimeError: it was not found; the message has the status.
     """
-    result = solve(problem.lcp(), stopping=StoppingCriteria(rtol=1e-11))
+    result = solve(problem.lcp(), method, stopping=StoppingCriteria(rtol=rtol))
     if not result:
         raise RuntimeError(f"{problem.name}: {result.status.name}")
     return result.x.numpy()
@@ -143,7 +145,8 @@ def _balls() -> list[Published]:
 
 @cache
 def _dam(nx: int) -> np.ndarray:
-    return solution(dam(nx, (nx - 1) * 3 // 2 + 1, device="cpu", dtype=wp.float64))
+    direct: dict[str, Any] = {"rtol": 1e-14, "method": Lemke()} if nx < 10 else {}  # all 15 digits are printed
+    return solution(dam(nx, (nx - 1) * 3 // 2 + 1, device="cpu", dtype=wp.float64), **direct)
 
 
 def seepage_height(w: np.ndarray, *, high: float = 24.0, low: float = 4.0) -> float:

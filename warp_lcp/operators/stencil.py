@@ -250,6 +250,16 @@ class StoredStencil(GridOperator):
         self._made, self._unit = (d, weights, pattern, strength), unit
         super().__init__(cells, {}, (), d.device, wp.float64 if d.dtype is wp.uint8 else d.dtype)
 
+    def take(self, cells: np.ndarray, d: np.ndarray, weights: wp.array[Any]) -> None:
+        """Take other cells of the same shape, another diagonal, and weights, one field after another, in place."""
+        own, fields, _, _ = self._made
+        own.assign(d)
+        for place, field in enumerate(fields):
+            wp.copy(field, weights, src_offset=place * field.size, count=field.size)
+        padded = np.full(self.layout.stored_shape, AIR, dtype=np.int8)
+        padded[1:-1, 1:-1, 1:-1] = cells.reshape(self.layout.padding.counts)
+        self.update(wp.array(padded, device=self.device))
+
     def _take_coefficients(self, cells: np.ndarray) -> None:
         pass
 

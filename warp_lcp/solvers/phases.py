@@ -467,9 +467,14 @@ class CoarseStencilProblem(CoarseProblem):
         if not inside.any():
             return False
         cells = np.where(inside.reshape(coarse.padding.shape)[1, 1:-1, 1:-1], FLUID, AIR)
-        d = wp.array(np.where(inside, coarse.d.numpy(), 0), dtype=coarse.d.dtype, device=hierarchy.device)
+        d = np.where(inside, coarse.d.numpy(), 0)
+        if self._work is not None:
+            self._work.problem.A.take(cells, d, coarse.weights)
+            return True
         copied, n = wp.clone(coarse.weights), coarse.padding.size
-        A = StoredStencil(cells, d, tuple(copied[i * n : (i + 1) * n] for i in range(8)), AROUND, symmetric=self._A.symmetric)
+        weights = tuple(copied[i * n : (i + 1) * n] for i in range(8))
+        stored = wp.array(d, dtype=coarse.d.dtype, device=hierarchy.device)
+        A = StoredStencil(cells, stored, weights, AROUND, symmetric=self._A.symmetric)
         b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
         self._work = self._settings.init(LCP(A, b.reshape(A.layout.stored_shape), lower, upper))
         return True
