@@ -113,7 +113,7 @@ class Heston:
         X, V = np.meshgrid(S, v)
         west, east = differences(S, V * X**2 / 2, self.rate * X)
         south, north = (d.T for d in differences(v, (self.volatility**2 * V / 2).T, (self.reversion * (self.mean - V)).T))
-        a = {(0, -1): -west, (0, 1): -east, (-1, 0): -south, (1, 0): -north}
+        a: Coefficients = {(0, -1): -west, (0, 1): -east, (-1, 0): -south, (1, 0): -north}
         h, k = np.diff(S), np.diff(v)
         mixed = np.where((X > 0) & (V > 0), abs(self.correlation) * self.volatility * V * X / 2, 0.0)
         mixed[-1] = mixed[:, -1] = 0.0
@@ -125,7 +125,7 @@ class Heston:
             a[up, right] = -part
             a[0, right] = a[0, right] + part
             a[up, 0] = a[up, 0] + part
-        a[0, 0] = self.rate - sum(a.values())
+        a[0, 0] = self.rate - np.sum(list(a.values()), axis=0)
         return a
 
     def put(self, ns: int, nv: int, steps: int, *, american: bool = True, method: Any = None, device: Any = None) -> Prices:
@@ -138,6 +138,7 @@ class Heston:
             nv: intervals of v, >= 4.
             steps: of time, > 2, of which the first 2 are implicit Euler's, others Crank and Nicolson's.
             american: whether it may be exercised at any time; else there are no bounds.
+            method: of the problems; MinimumMapNewton if None.
             device: Warp device of the operator.
 
         Raises:

@@ -16,11 +16,8 @@ from warp_lcp.solvers.default import solve
 YEAR = 31556926.0  # [s]
 # Where a cell's fluxes are taken, in its own coordinates; along which axis; and the corners (x, y) that each leaves and enters.
 POINTS = (
-    ((0.5, 0.25), 0, (0, 0), (1, 0)),
-    ((0.5, 0.75), 0, (0, 1), (1, 1)),
-    ((0.25, 0.5), 1, (0, 0), (0, 1)),
-    ((0.75, 0.5), 1, (1, 0), (1, 1)),
-)
+    ((0.5, 0.25), 0, (0, 0), (1, 0)), ((0.5, 0.75), 0, (0, 1), (1, 1)), ((0.25, 0.5), 1, (0, 0), (0, 1)), ((0.75, 0.5), 1, (1, 0), (1, 1)),
+)  # fmt: skip
 SHARES = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 5e-3, 2e-3, 1e-3)  # of a constant diffusivity, one after another
 STEPS, MOST = 60, 1000.0  # of Newton's method for a share, and the most that the thickness moves in one [m]
 CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))

@@ -175,7 +175,7 @@ class InteriorPointWorkspace(IterateMemory):
         self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
         self._predicted = wp.zeros_like(self.system.e)
-        self._carries = isinstance(self.system, GridSystem)  # conjugate gradients leave the residual in r
+        self._carries = isinstance(self.system, GridSystem) and problem.A.symmetric  # conjugate gradients leave the residual in r
         fused = isinstance(self.system, GridSystem) and self.system.fused
         self._upper, self._fusable = upper, fused and problem.bounded and settings.mehrotra and self._rounded is None
         self._sums, self._longest = Sums(rows_of(self.x), 3), wp.zeros(1, dtype=wp.float64, device=problem.device)
