@@ -2,6 +2,7 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
+from warp_lcp.gradient import Gradient, vjp
 from warp_lcp.linear_complementarity import linear_complementarity
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators import (
@@ -75,6 +76,7 @@ __all__ = [
     "DenseOperator",
     "DirectEnumeration",
     "FischerNewton",
+    "Gradient",
     "GradientDescent",
     "GridLines",
     "GridPoisson",
@@ -113,4 +115,5 @@ __all__ = [
     "set_threads",
     "solve",
     "solve_coupled",
+    "vjp",
 ]

@@ -28,7 +28,7 @@ class IceDome:
     """A radial dome of ice on a flat bed, whose thickness H is known: div q = m where H > 0, q = -Gamma H^(n+2) |grad H|^(n-1) grad H.
 
     The surface mass balance m is what keeps the dome as it is; outside, more melts than flows in. Discretized by the control volumes of
-    Bueler (2016) on bilinear elements with two fluxes a side, as his program p4pdes/ice.c does: F(H) >= 0, H >= 0, H'F(H) = 0, F the
+    Bueler on bilinear elements with two fluxes a side, as his program p4pdes/ice.c does: F(H) >= 0, H >= 0, H'F(H) = 0, F the
     outflow of each volume less what falls on it, and D = (1 - regularization) Gamma H^(n+2) (|grad H|^2 + slope^2)^((n-1)/2) +
     regularization * 1 m^2/s for the diffusivity. H = 0 on the border.
 

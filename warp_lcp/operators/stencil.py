@@ -109,6 +109,30 @@ class Stencil(GridOperator):
         sizes = {o: float(np.abs(full[o][fluid]).mean()) if fluid.any() else 0.0 for o in around}
         self._strength: Any = tuple(sum(size for o, size in sizes.items() if o[axis]) / 2 for axis in range(3))
 
+    @property
+    def given(self) -> dict[tuple[int, ...], Any]:
+        """The coefficients by offset, as they were given."""
+        return {_named(offset, len(self.shape)): value for offset, value in self._given.items()}
+
+    def transposed(self) -> Stencil:
+        """Return A' as a stencil of arrays, without SOLID cells: its diagonal has what closed sides add."""
+        counts = self.layout.padding.counts
+        fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
+        found: dict[tuple[int, ...], Any] = {(0,) * len(self.shape): np.where(fluid.reshape(self.shape), self.diagonal().numpy(), 1.0)}
+        for offset, value in self._given.items():
+            if offset == CENTER:
+                continue
+            function = isinstance(value, wp.Function)
+            here = self._evaluated(_of_three(value, len(self.shape))) if function else real_array(value, "coefficients")
+            here = np.where(fluid, here.reshape(counts) if here.ndim else here, 0.0)
+            for axis, step in enumerate(offset[::-1]):  # a_o(i) is the neighbor's coefficient for i
+                here = np.roll(here, step, axis)
+                if step and not self.periodic[2 - axis]:
+                    np.moveaxis(here, axis, 0)[0 if step > 0 else -1] = 0.0
+            found[tuple(-step for step in _named(offset, len(self.shape)))] = here.reshape(self.shape)
+        cells = np.where(fluid, FLUID, AIR).reshape(self.shape)
+        return Stencil(cells, found, periodic=self.periodic, outside=AIR, device=self.device, dtype=self.dtype)
+
     def _mirrored(self, full: dict[Offset, np.ndarray], offset: Offset, fluid: np.ndarray) -> bool:
         """Return whether the coefficients of an offset are those of the opposite one, seen from the neighbor, between unknowns."""
         steps = tuple(-step for step in offset[::-1])
@@ -220,8 +244,8 @@ class Stencil(GridOperator):
         """Pickle cells and coefficients; those that are Warp functions as arrays."""
         cells, options = self._pickled()
         n = cells.ndim
-        given = {o[::-1][3 - n :]: self._evaluated(_of_three(f, n)).reshape(cells.shape) if isinstance(f, wp.Function) else
-                 f.numpy() if isinstance(f, wp.array) else f for o, f in self._given.items()}  # fmt: skip
+        given = {o: self._evaluated(_of_three(f, n)).reshape(cells.shape) if isinstance(f, wp.Function) else
+                 f.numpy() if isinstance(f, wp.array) else f for o, f in self.given.items()}  # fmt: skip
         shift = OnHost(self.shift) if self.shift.size else None
         return made_again(Stencil, cells, given, device=self.device, shift=shift, outside=self.outside, **options)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from warp_lcp.problem.pickling import FieldsOnHost
+from warp_lcp.problem.protocol import version_of
 
 if TYPE_CHECKING:
     import warp as wp
@@ -83,6 +84,15 @@ class SolveResult(FieldsOnHost):
     relative_residual: float
     history: list[Record] = field(repr=False)
     grid: tuple[int, ...] | None = None
+
+    problem: ClassVar[Any] = None  # whose it is, where it was made: not pickled
+    version: ClassVar[int | None] = None  # of its operator then
+
+    def of(self, problem: Any) -> SolveResult:
+        """Remember the problem, for gradients; return the result."""
+        object.__setattr__(self, "problem", problem)
+        object.__setattr__(self, "version", version_of(problem.A) if hasattr(problem, "A") else None)
+        return self
 
     def __bool__(self) -> bool:
         """Return whether the solve converged."""

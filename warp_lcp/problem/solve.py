@@ -377,7 +377,7 @@ class _Loop:
             self._restore()
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0
-        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history)
+        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history).of(self.problem)
 
     def _found(self) -> wp.array[Any]:
         """Return x as the result has it: in place."""

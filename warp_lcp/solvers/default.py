@@ -97,4 +97,4 @@ def _solve_as_grid(
     fields = (field.numpy().reshape(stencil.shape) for field in (problem.b, problem.lower, problem.upper))
     on_grid, start = LCP(stencil, *fields), None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy().reshape(stencil.shape)
     result = solve_by(on_grid, default_method(on_grid), stopping=stopping, x0=start, callback=callback)
-    return replace(result, x=result.x.flatten(), grid=stencil.shape) if result else None
+    return replace(result, x=result.x.flatten(), grid=stencil.shape).of(problem) if result else None

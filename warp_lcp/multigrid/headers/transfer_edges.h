@@ -1,6 +1,6 @@
 #include "transfer.h"
 // How cells share in coarse ones, which are every second cell: as themselves; or, between two along an axis, by the weights towards them,
-// summed across, over these and what holds the row (Dendy's black-box multigrid; de Zeeuw 1990 for weights that are not symmetric).
+// summed across, over these and what holds the row (Dendy's black-box multigrid).
 const bool odd_y = fy == 2 && P.j % 2;
 for (int k = 0; k < n; ++k) {
     const long long at = p + k; const bool odd_x = fx == 2 && (P.first + k) % 2; const T e = d[k];
