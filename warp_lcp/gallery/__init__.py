@@ -6,23 +6,31 @@ from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.families import FAMILIES
 from warp_lcp.gallery.fclib import FclibProblem, read_fclib
 from warp_lcp.gallery.fluid import Splash, basin, splash
+from warp_lcp.gallery.heston import Heston, Prices
 from warp_lcp.gallery.matrices import banded, definite, period_three, semidefinite, skewed
-from warp_lcp.gallery.obstacle import ball_obstacle, dam, torsion
+from warp_lcp.gallery.obstacle import ball_obstacle, dam, journal_bearing, sine_obstacle, torsion
 from warp_lcp.gallery.planted import Plant, planted, poisson
 from warp_lcp.gallery.problem import FACTS, Problem
+from warp_lcp.gallery.published import PUBLISHED, Published
 from warp_lcp.gallery.rigid_world import World
+from warp_lcp.gallery.shallow_ice import IceDome
 
 __all__ = [
     "FACTS",
     "FAMILIES",
+    "PUBLISHED",
     "SCENES",
     "BoxedModel",
     "ContactStepper",
     "ContactSystem",
     "FclibProblem",
     "FrozenBoxModel",
+    "Heston",
+    "IceDome",
     "Plant",
+    "Prices",
     "Problem",
+    "Published",
     "Splash",
     "StewartTrinkleModel",
     "World",
@@ -33,12 +41,14 @@ __all__ = [
     "contact_scene",
     "dam",
     "definite",
+    "journal_bearing",
     "period_three",
     "planted",
     "poisson",
     "proximal_sweeps",
     "read_fclib",
     "semidefinite",
+    "sine_obstacle",
     "skewed",
     "splash",
     "torsion",

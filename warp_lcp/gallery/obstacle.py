@@ -1,4 +1,4 @@
-"""Obstacle problems of the literature: a membrane over a ball, torsion of a bar that yields, seepage through a dam."""
+"""Obstacle problems of the literature: a membrane over a ball or sines, a bar that yields, a dam, the film in a journal bearing."""
 
 from __future__ import annotations
 
@@ -57,20 +57,22 @@ def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
     return Problem(f"ball obstacle {n}x{n}", GridPoisson(cells, device=device, dtype=dtype), b, lower, np.full((n, n), np.inf), u, UNIQUE)
 
 
-def torsion(n: int, load: float = 5.0, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
+def torsion(n: int, load: float = 5.0, *, border: float = 1.0, device: Any = None, dtype: Any = wp.float32) -> Problem:
     """Return the elastic-plastic torsion of a square bar: -Laplace u = load where |u| is less than the distance to the border.
 
     The unit square has n nodes a side, the border not included; u is Prandtl's stress function, whose slope is 1 at most. Where |u| is the
-    distance, the bar has yielded: along the diagonals it never does.
+    distance, the bar has yielded: along the diagonals it never does. With n = 2 Q - 2 it is CUTEst's TORSIONA to F, that of MINPACK-2,
+    and with border = 0.5 TORSION1 to 6, for loads of 5, 10 and 20.
 
     Args:
         n: inner nodes a side.
         load: twice the shear modulus times the twist, in units of the yield stress.
+        border: weight of differences to the border in the energy, > 0; 0.5: each inner node has a quarter of the squares of all its four.
         device: Warp device of the operator.
         dtype: its storage.
 
     Raises:
-        ValueError: there is no inner node.
+        ValueError: there is no inner node, or the border has no weight.
     """
     if n < 1:
         raise ValueError(f"n = {n}: must be >= 1, the inner nodes a side")
@@ -78,8 +80,89 @@ def torsion(n: int, load: float = 5.0, *, device: Any = None, dtype: Any = wp.fl
     X, Y = np.meshgrid(*(np.linspace(0, 1, n + 2),) * 2)
     distance = np.minimum(np.minimum(X, 1 - X), np.minimum(Y, 1 - Y))
     b = np.where(cells == FLUID, -load / (n + 1) ** 2, 0.0)
-    A = GridPoisson(cells, device=device, dtype=dtype)
+    A = GridPoisson(cells, **_faces(cells, 1.0, 1.0, border), device=device, dtype=dtype)
     return Problem(f"torsion {n}x{n}", A, b, -distance, distance, None, UNIQUE | {"boxed"})
+
+
+def _faces(cells: np.ndarray, x: float, y: float, border: float) -> dict[str, Any]:
+    """Return face coefficients x and y, those on a border one cell wide times `border`: numbers where that is 1."""
+    if not 0 < border < np.inf:
+        raise ValueError(f"border = {border}: must be > 0 and finite")
+    if border == 1:
+        return {"face_x": x, "face_y": y}
+    (ny, nx), edge = cells.shape, [1, -2]
+    face_x, face_y = np.full((ny, nx + 1), x), np.full((ny + 1, nx), y)
+    face_x[:, edge] *= border
+    face_y[edge] *= border
+    return {"face_x": face_x, "face_y": face_y}
+
+
+def sine_obstacle(nx: int, ny: int, *, between: bool = False, device: Any = None, dtype: Any = wp.float32) -> Problem:
+    """Return the membrane of Dembo and Tulowitzki: -Laplace u >= 1 above a hill, or between four hills and holes; CUTEst's OBSTCLA., B.
+
+    u >= sin(3.2 y) sin(3.3 x), or s^3 <= u <= s^2 + 0.02 with s = sin(9.2 y) sin(9.3 x), on the unit square; u = 0 on the border, whose
+    differences have half the weight of others in the energy, as in CUTEst.
+
+    Args:
+        nx: nodes along x, the border included.
+        ny: nodes along y, the border included.
+        between: whether there are two obstacles.
+        device: Warp device of the operator.
+        dtype: its storage.
+
+    Raises:
+        ValueError: there is no inner node.
+    """
+    if min(nx, ny) < 3:
+        raise ValueError(f"nx, ny = {nx}, {ny}: must be >= 3, the nodes with those on the border")
+    cells = np.pad(np.full((ny - 2, nx - 2), FLUID, dtype=np.int8), 1, constant_values=AIR)
+    hx, hy = 1 / (nx - 1), 1 / (ny - 1)
+    X, Y = np.meshgrid(np.linspace(0, 1, nx), np.linspace(0, 1, ny))
+    s = np.sin(9.2 * Y) * np.sin(9.3 * X)
+    lower, upper = (s**3, s**2 + 0.02) if between else (np.sin(3.2 * Y) * np.sin(3.3 * X), np.full_like(s, np.inf))
+    A = GridPoisson(cells, **_faces(cells, hy / hx, hx / hy, 0.5), device=device, dtype=dtype)
+    b = np.where(cells == FLUID, -hx * hy, 0.0)
+    return Problem(f"sine obstacle {nx}x{ny}", A, b, lower, upper, None, UNIQUE | ({"boxed"} if between else set()))
+
+
+def journal_bearing(
+    nx: int, ny: int, eccentricity: float = 0.1, *, half_width: float = 10.0, device: Any = None, dtype: Any = wp.float64
+) -> Problem:
+    """Return the pressure u >= 0 of the film in a journal bearing (Reynolds' equation), which cavitates where u = 0.
+
+    u minimizes the integral of h^3 |grad u|^2 / 2 - e sin(x) u over [0, 2 pi] x [0, 2 half_width], with the film's thickness
+    h = 1 + e cos x and u = 0 on the border, by linear elements on right triangles whose h^3 is the mean of their corners'. It is problem
+    DPJB of MINPACK-2, PETSc's jbearing2.c and, with two nodes less, CUTEst's JNLBRNG1 (e = 0.1) and 2 (e = 0.5). Lengths around the
+    shaft in radii, pressures in 6 viscosity speed radius / clearance^2.
+
+    Args:
+        nx: inner nodes around.
+        ny: inner nodes across.
+        eccentricity: e of the shaft, in [0, 1) clearances.
+        half_width: of the bearing, > 0 [radii].
+        device: Warp device of the operator.
+        dtype: its storage.
+
+    Raises:
+        ValueError: there is no inner node, or a number is out of range.
+    """
+    if min(nx, ny) < 1:
+        raise ValueError(f"nx, ny = {nx}, {ny}: must be >= 1, the inner nodes")
+    if not 0 <= eccentricity < 1:
+        raise ValueError(f"eccentricity = {eccentricity}: must be in [0, 1)")
+    if not 0 < half_width < np.inf:
+        raise ValueError(f"half_width = {half_width}: must be > 0 and finite")
+    cells = np.pad(np.full((ny, nx), FLUID, dtype=np.int8), 1, constant_values=AIR)
+    hx, hy = 2 * np.pi / (nx + 1), 2 * half_width / (ny + 1)
+    x = hx * np.arange(-1, nx + 3)  # one node beyond each side
+    cube = (1 + eccentricity * np.cos(x)) ** 3
+    face_x = np.zeros((ny + 2, nx + 3))
+    face_x[:, 1:-1] = hy / hx * (cube[1:-2] + cube[2:-1]) / 2
+    face_y = np.broadcast_to(hx / hy * (cube[:-2] + 4 * cube[1:-1] + cube[2:]) / 6, (ny + 3, nx + 2))
+    b = np.where(cells == FLUID, -eccentricity * hx * hy * np.sin(x[1:-1]), 0.0)
+    A = GridPoisson(cells, face_x=face_x, face_y=face_y, device=device, dtype=dtype)
+    name = f"journal bearing {nx}x{ny}, {eccentricity:g}"
+    return Problem(name, A, b, np.zeros_like(b), np.full_like(b, np.inf), None, UNIQUE)
 
 
 def dam(

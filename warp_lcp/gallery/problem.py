@@ -85,6 +85,17 @@ class Problem:
         A = make.get(self.kind, lambda: DenseOperator(self.A, device=device, dtype=dtype))()
         return LCP(A, self.b, _number_or_field(self.lower), _number_or_field(self.upper))
 
+    def energy(self, x: Any) -> float:
+        """Return x'A x / 2 + b'x, in float64: what a solution minimizes within the bounds if A is symmetric.
+
+        Args:
+            x: a field like b, numpy or wp.array.
+        """
+        A, b = self.lcp(device="cpu").A, self.b
+        host = np.asarray(x.numpy() if isinstance(x, wp.array) else x, dtype=np.float64)
+        Ax = A.apply(wp.array(host, dtype=wp.float64, device=A.device)).numpy()
+        return float((host * (Ax / 2 + b)).sum())
+
     def sparse(self) -> Problem:
         """Return the problem of a grid's FLUID cells, in their order, with a scipy.sparse matrix; any other as it is."""
         if not isinstance(self.A, GridPoisson):

@@ -1,0 +1,217 @@
+"""American and European puts where the variance is random, too (Heston): a mixed derivative, no symmetry, a problem each time step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import scipy.interpolate
+import scipy.sparse
+import warp as wp
+
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import AIR, FLUID
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.solvers.default import solve
+from warp_lcp.solvers.psor import ProjectedSOR
+
+Coefficients = dict[tuple[int, int], np.ndarray]
+TIGHT = StoppingCriteria(rtol=1e-7, atol=1e-9, max_iterations=1000)
+IMPLICIT = 2  # steps of implicit Euler before those of Crank and Nicolson: the payoff has a kink
+DENSE = 0.2  # of K: within it nodes of S are as dense as can be
+
+
+def stencil_matrix(cells: np.ndarray, coefficients: Coefficients) -> scipy.sparse.csr_array:
+    """Return the matrix of (A x)_i = sum over offsets o of a_o(i) x_{i+o} on the FLUID cells; x = 0 in AIR, x_i beyond the array.
+
+    Args:
+        cells: AIR or FLUID, shape (ny, nx).
+        coefficients: a_o, each of the shape of `cells`, by its offset (dy, dx).
+    """
+    ny, nx = cells.shape
+    number = np.where(cells == FLUID, np.cumsum(cells == FLUID).reshape(ny, nx) - 1, -1)
+    j, i = np.nonzero(cells == FLUID)
+    rows, columns, entries = [], [], []
+    for (dy, dx), a in coefficients.items():
+        inside = (j + dy >= 0) & (j + dy < ny) & (i + dx >= 0) & (i + dx < nx)
+        other = number[np.where(inside, j + dy, j), np.where(inside, i + dx, i)]
+        known = (other >= 0) & (a[j, i] != 0)
+        rows.append(number[j, i][known])
+        columns.append(other[known])
+        entries.append(a[j, i][known])
+    n = len(j)
+    return scipy.sparse.coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)).tocsr()
+
+
+def differences(x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights, below and above, of diffusion u'' + drift u' on nodes x; central, upwind where that would make one negative.
+
+    Args:
+        x: nodes, rising, shape (n,); the last one has the spacing of the one before.
+        diffusion: >= 0, shape (..., n).
+        drift: likewise, any sign.
+    """
+    below = np.diff(x, prepend=2 * x[0] - x[1])
+    above = np.diff(x, append=2 * x[-1] - x[-2])
+    low, high = (2 * diffusion - drift * above) / (below * (below + above)), (2 * diffusion + drift * below) / (above * (below + above))
+    upwind = (low < 0) | (high < 0)
+    low_upwind = 2 * diffusion / (below * (below + above)) + np.maximum(-drift, 0) / below
+    high_upwind = 2 * diffusion / (above * (below + above)) + np.maximum(drift, 0) / above
+    return np.where(upwind, low_upwind, low), np.where(upwind, high_upwind, high)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heston:
+    """A put in Heston's model: dS = r S dt + sqrt(v) S dW1, dv = kappa (theta - v) dt + sigma sqrt(v) dW2, with correlated dW1 and dW2.
+
+    Its price u(S, v) at time t before expiry obeys u_t + L u >= 0, u >= max(K - S, 0), one of them with equality, where L u =
+    -(v S^2 u_SS / 2 + rho sigma v S u_Sv + sigma^2 v u_vv / 2 + r S u_S + kappa (theta - v) u_v - r u). The defaults are the test
+    of Ikonen and Toivanen (2005).
+
+    Args:
+        strike: K > 0.
+        expiry: of the option > 0 [years].
+        rate: r >= 0 [1/year], without dividends.
+        reversion: kappa > 0 [1/year].
+        mean: theta > 0 [1/year].
+        volatility: sigma > 0 [1/year], of the variance.
+        correlation: rho, in (-1, 1).
+
+    Raises:
+        ValueError: a number is out of range.
+    """
+
+    strike: float = 10.0
+    expiry: float = 0.25
+    rate: float = 0.1
+    reversion: float = 5.0
+    mean: float = 0.16
+    volatility: float = 0.9
+    correlation: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Check that all numbers are in range."""
+        for name in ("strike", "expiry", "reversion", "mean", "volatility"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be > 0 and finite")
+        if not 0 <= self.rate < np.inf:
+            raise ValueError(f"rate = {self.rate}: must be >= 0 and finite")
+        if not -1 < self.correlation < 1:
+            raise ValueError(f"correlation = {self.correlation}: must be in (-1, 1)")
+
+    def nodes(self, ns: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return nodes of S from 0 to about 3 K, dense around K, which is halfway between two, and of v from 0 to 1 or 6 theta, dense at 0.
+
+        Args:
+            ns: intervals of S.
+            nv: intervals of v.
+        """
+        low, high = np.arcsinh(-1 / DENSE), np.arcsinh(2 / DENSE)
+        step = -low / (round(ns * low / (low - high)) - 0.5)
+        S = self.strike * (1 + DENSE * np.sinh(low + step * np.arange(ns + 1)))
+        S[0] = 0.0
+        v = np.sinh(np.linspace(0, np.arcsinh(20.0), nv + 1)) / 20.0
+        return S, v * max(1.0, 6 * self.mean)
+
+    def coefficients(self, S: np.ndarray, v: np.ndarray) -> Coefficients:
+        """Return L as a stencil of 7 points, {(dv, dS): array of shape (v, S)}, of second order on smooth grids but where v is next to 0.
+
+        The mixed derivative is the mean of those of the two squares in whose direction it is positive, which keeps A an M-matrix
+        where the ratio of spacings lets it. Above the last v the price does not change, beyond the last S it is 0.
+
+        Args:
+            S: nodes, rising from 0.
+            v: nodes, rising from 0.
+        """
+        X, V = np.meshgrid(S, v)
+        west, east = differences(S, V * X**2 / 2, self.rate * X)
+        south, north = (d.T for d in differences(v, (self.volatility**2 * V / 2).T, (self.reversion * (self.mean - V)).T))
+        a = {(0, -1): -west, (0, 1): -east, (-1, 0): -south, (1, 0): -north}
+        h, k = np.diff(S), np.diff(v)
+        mixed = np.where((X > 0) & (V > 0), abs(self.correlation) * self.volatility * V * X / 2, 0.0)
+        mixed[-1] = mixed[:, -1] = 0.0
+        side = 1 if self.correlation > 0 else -1
+        for up in (1, -1):
+            right = side * up
+            width, height = (np.append(s, s[-1]) if step > 0 else np.append(s[:1], s) for s, step in ((h, right), (k, up)))
+            part = mixed / (width * height[:, None])
+            a[up, right] = -part
+            a[0, right] = a[0, right] + part
+            a[up, 0] = a[up, 0] + part
+        a[0, 0] = self.rate - np.sum(list(a.values()), axis=0)
+        return a
+
+    def put(self, ns: int, nv: int, steps: int, *, american: bool = True, device: Any = None) -> Prices:
+        """Return the prices today: a complementarity problem each time step, begun with the last one's solution.
+
+        Time steps grow like their number, since the price is smooth later on and its free boundary moves slower.
+
+        Args:
+            ns: intervals of S, >= 8.
+            nv: intervals of v, >= 4.
+            steps: of time, > 2, of which the first 2 are implicit Euler's, others Crank and Nicolson's.
+            american: whether it may be exercised at any time; else there are no bounds.
+            device: Warp device of the operator.
+
+        Raises:
+            ValueError: a number is too small.
+            RuntimeError: a problem was not solved; the message has its status.
+        """
+        for name, value, least in (("ns", ns, 8), ("nv", nv, 4), ("steps", steps, IMPLICIT + 1)):
+            if value < least:
+                raise ValueError(f"{name} = {value}: must be >= {least}")
+        S, v = self.nodes(ns, nv)
+        cells = np.full((nv + 1, ns + 1), FLUID, dtype=np.int8)
+        cells[:, -1] = AIR
+        L = stencil_matrix(cells, self.coefficients(S, v))
+        identity = scipy.sparse.eye_array(L.shape[0], format="csr")
+        payoff = np.broadcast_to(np.maximum(self.strike - S[:-1], 0), (nv + 1, ns)).ravel().copy()
+        lower = payoff if american else np.full_like(payoff, -np.inf)
+        u, times, A = payoff, self.expiry * (np.arange(steps + 1) / steps) ** 2, None
+        for step, (before, after) in enumerate(pairwise(times)):
+            dt, share = after - before, 1.0 if step < IMPLICIT else 0.5
+            matrix = (identity + share * dt * L).tocsr()
+            A = SparseOperator(matrix, device=device, dtype=wp.float64) if A is None else A
+            A.update(matrix)
+            problem = LCP(A, (1 - share) * dt * (L @ u) - u, lower)
+            result = solve(problem, ProjectedSOR(omega=1.3), x0=u, stopping=TIGHT)
+            if not result:
+                raise RuntimeError(f"time step {step}: {result.status.name}")
+            u = result.x.numpy()
+        return Prices(S, v, np.pad(u.reshape(nv + 1, ns), ((0, 0), (0, 1))))
+
+    def extrapolated(self, spot: Any, variance: float, ns: int, nv: int, steps: int, **options: Any) -> np.ndarray:
+        """Return prices from two grids, this one and one twice as fine in everything: 4/3 of the fine one's less 1/3 of this one's.
+
+        Args:
+            spot: S, a number or an array.
+            variance: v.
+            ns: intervals of S of the coarse grid.
+            nv: intervals of v.
+            steps: of time.
+            options: of `put`.
+        """
+        coarse, fine = (self.put(k * ns, k * nv, k * steps, **options).at(spot, variance) for k in (1, 2))
+        return (4 * fine - coarse) / 3
+
+
+@dataclass(frozen=True, eq=False)
+class Prices:
+    """Prices on a grid.
+
+    Attributes:
+        S: prices of the stock, shape (ns + 1,).
+        v: variances, shape (nv + 1,).
+        u: prices of the put, shape (nv + 1, ns + 1).
+    """
+
+    S: np.ndarray
+    v: np.ndarray
+    u: np.ndarray
+
+    def at(self, spot: Any, variance: float) -> Any:
+        """Return prices between the nodes, by cubic splines: first in v, then in S."""
+        return scipy.interpolate.CubicSpline(self.S, scipy.interpolate.CubicSpline(self.v, self.u)(variance))(spot)
