@@ -1,6 +1,8 @@
 """Numbers that others have printed, digit by digit; and what holds for the problems besides."""
 
 import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -128,6 +130,13 @@ def test_american_put_is_worth_more_and_is_exercised_below():
     assert exercised[0].any()
 
 
+@pytest.mark.slow
+def test_american_puts_on_one_grid():
+    """All four digits without extrapolation."""
+    prices = Heston().put(384, 96, 128, device="cpu").at(np.arange(8.0, 13.0), 0.0625)
+    assert [f"{price:.4f}" for price in prices] == ["2.0000", "1.1076", "0.5200", "0.2137", "0.0820"]
+
+
 def test_stencil_is_its_definition():
     rng, offsets = np.random.default_rng(61), list(itertools.product((-1, 0, 1), repeat=2))
     cells = rng.choice(2, (4, 5), p=[0.3, 0.7])
@@ -200,3 +209,12 @@ def test_arguments_out_of_range_are_named():
     ]:
         with pytest.raises(ValueError, match=name):
             wrong()
+
+
+def test_the_page_has_the_table():
+    """Each number with what came out here when the page was made."""
+    text = (Path(__file__).parents[2] / "docs" / "problems.md").read_text()
+    rows = dict(re.findall(r"^(\| .* \| `.*` \| .* \|) `(.*)` \|$", text, flags=re.M))
+    assert list(rows) == [f"| {p.case} | `{p.printed}` | {p.source} |" for p in PUBLISHED]
+    for p, here in zip(PUBLISHED, rows.values(), strict=True):
+        assert abs(float(here) - float(p.printed)) <= p.tolerance * 1.01

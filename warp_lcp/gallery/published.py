@@ -201,7 +201,7 @@ def _puts() -> list[Published]:
     four, six = ("2.0000", "1.1076", "0.5200", "0.2137", "0.0820"), ("2.00000", "1.10763", "0.520038", "0.213681", "0.082046")
     return [
         Published("American put", f"S = {8 + k}, {digits}", value[k], source, partial(_price, k), within)
-        for digits, value, source, within in (("to 4 digits", four, "Ikonen, Toivanen", 0.0), ("more digits", six, "QuantLib", 2e-5))
+        for digits, value, source, within in (("to 4 digits", four, "QuantLib, rounded", 0.0), ("more digits", six, "QuantLib", 2e-5))
         for k in range(5)
     ]
 

@@ -153,7 +153,7 @@ class IceDome:
         for _ in range(STEPS):
             F, J = self.outflow(H, share)
             x, y = H.ravel()[inner], F.ravel()[inner] - falls
-            if np.linalg.norm(np.where(x > 0, y, np.minimum(y, 0))) <= 1e-9 * np.linalg.norm(falls):
+            if np.linalg.norm(np.minimum(x / self.height, y / np.abs(falls).max())) <= 1e-7:
                 return H
             A = SparseOperator(J[inner][:, inner], device=device, dtype=wp.float64)
             result = solve(LCP(A, y - A.apply(wp.array(x, dtype=wp.float64, device=A.device)).numpy()), x0=x, stopping=TIGHT)
