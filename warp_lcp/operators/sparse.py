@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.dense import is_rounding
+from warp_lcp.operators.renumbering import Renumbering, renumbering
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
@@ -94,6 +95,8 @@ class SparseOperator(Pickled):
         self._transpose_values: wp.array[Any] | None = None
         self.version = 0
         self._scale: np.ndarray | None = None
+        self._turned: SparseOperator | None = None
+        self._turned_from = 0
         self._take(host)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -183,6 +186,20 @@ class SparseOperator(Pickled):
         if self._scale is None:
             self._scale = scale_of_matrix(self.matrix())
         return self._scale
+
+    def renumbered(self) -> tuple[Renumbering, SparseOperator] | None:
+        """Return A as it is now in a numbering in which neighbors lie together in memory; None where its own is as good, and on CUDA."""
+        found = self._numbering
+        if found is None:
+            return None
+        if self._turned is None or self._turned_from != self.version:
+            self._turned = SparseOperator(found.matrix(self.matrix()), device=self.device, dtype=self.dtype)
+            self._turned_from = self.version
+        return found, self._turned
+
+    @cached_property
+    def _numbering(self) -> Renumbering | None:
+        return None if self.device.is_cuda else renumbering(self.matrix())
 
     def masked(self, free: Any, shift: Any = None) -> SparseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""

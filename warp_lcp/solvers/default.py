@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Never
 
+import warp as wp
+
+from warp_lcp.operators.renumbering import Renumbering
+from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has, takes
 from warp_lcp.problem.result import Record, SolveResult
@@ -14,9 +21,13 @@ from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_direct import suits
+from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.psor import ProjectedSOR
+
+ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
+LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
 
 
 def default_method(problem: LCP) -> Solver:
@@ -63,4 +74,23 @@ def solve(
     if solver is None and isinstance(problem, ConvexSetProblem):
         raise ValueError(f"solver: a {type(problem).__name__} is solved by methods of its own, name one")
     solver = default_method(problem) if solver is None else solver  # type: ignore[arg-type]  # an LCP, or refused there
+    if workspace is None and isinstance(solver, ANY_NUMBERING) and isinstance(problem, LCP) and isinstance(problem.A, SparseOperator):
+        begun, found = time.perf_counter(), problem.A.renumbered() if problem.bounds.affine is None else None
+        if found is not None:
+            return _solve_renumbered(problem, *found, solver, stopping or StoppingCriteria(), x0, callback, begun)
     return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)
+
+
+def _solve_renumbered(
+    problem: LCP, numbering: Renumbering, A: SparseOperator, solver: Solver, stopping: StoppingCriteria | MeanCriteria, x0: Array | None,
+    callback: Callable[[Record], None] | None, begun: float,
+) -> SolveResult:  # fmt: skip
+    """Solve a problem in another numbering of its unknowns; return x in its own. What that takes counts as set-up, from `begun` on."""
+    order = numbering.order
+    sides = (problem.bounds.host(side)[order] if problem.bounds.varying[side] else problem.bounds.values[side] for side in (0, 1))
+    other = LCP(A, problem.b.numpy()[order], *sides)
+    guess = None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy()[order]
+    if isinstance(stopping, StoppingCriteria) and stopping.max_seconds < math.inf:
+        stopping = replace(stopping, max_seconds=max(LEAST, stopping.max_seconds - (time.perf_counter() - begun)))
+    result = solve_by(other, solver, stopping=stopping, x0=guess, callback=callback)
+    return replace(result, x=wp.array(result.x.numpy()[numbering.place], dtype=result.x.dtype, device=problem.device))
