@@ -35,7 +35,7 @@ class Renumbering:
 
 
 def renumbering(host: scipy.sparse.csr_array, block: int = 1) -> Renumbering | None:
-    """Return the reverse order of Cuthill and McKee (1969), None where the numbering is a good one or that order is no better.
+    """Return the reverse Cuthill-McKee order (SciPy), None where the numbering is a good one or that order is no better.
 
     Args:
         host: the matrix, shape (n, n), columns sorted.

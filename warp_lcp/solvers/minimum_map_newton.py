@@ -159,6 +159,8 @@ class NewtonWorkspace(IterateMemory):
         """Classify, solve on the free set, move along the projected step."""
         p, residual = self.problem, self.residual
         step = self._gradient_step(x) if self.descends else None
+        if step is None and self._may_descend and self._knows_null_space:
+            step = self._descend(x)
         if step is not None:
             return step
         if self.resort is not None or (self._stalls() and self._may_resort()):
@@ -180,10 +182,7 @@ class NewtonWorkspace(IterateMemory):
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
         if self._may_descend and iterations >= WEAK:
-            self.descends, self._may_descend = True, False
-            self.gradients = self.gradients or GradientPhase(p, self.system, self.settings.precision)  # type: ignore[arg-type]
-            self.gradients.start(x, self.floating, self.target)
-            return self._gradient_step(x, spent=iterations) or self.newton_step(x)
+            return self._descend(x, spent=iterations) or self.newton_step(x)
         return self._move(x, size, iterations, int(active))
 
     def _minimizes(self) -> bool:
@@ -192,6 +191,18 @@ class NewtonWorkspace(IterateMemory):
             return False
         host = self.problem.A.matrix()  # type: ignore[attr-defined]
         return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
+
+    @property
+    def _knows_null_space(self) -> bool:
+        """Whether cycles are so good that conjugate gradients within the bounds take as many as a linear solve: about one Newton step's."""
+        return isinstance(self.problem.A, SparseOperator) and self.problem.A.near_null_space is not None
+
+    def _descend(self, x: wp.array[Any], spent: int = 0) -> Step | None:
+        """Let conjugate gradients that know the bounds take over at x."""
+        self.descends, self._may_descend = True, False
+        self.gradients = self.gradients or GradientPhase(self.problem, self.system, self.settings.precision)  # type: ignore[arg-type]
+        self.gradients.start(x, self.floating, self.target)
+        return self._gradient_step(x, spent=spent)
 
     def _gradient_step(self, x: wp.array[Any], spent: int = 0) -> Step | None:
         """Take a batch of conjugate gradients; None, and Newton's steps again, where they lead nowhere."""
