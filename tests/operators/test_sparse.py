@@ -1,6 +1,7 @@
 """Sparse operators against SciPy: products, symmetry, coloring, sweeps in row order and by color, updates, bad input."""
 
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -197,3 +198,17 @@ def test_a_planted_obstacle_problem(counts, convection, device):
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), x, atol=1e-7)
     assert result.iterations <= 16
+
+
+@pytest.mark.parametrize("B", [np.ones((5, 1)), np.ones((4, 13)), np.zeros((4, 2)), np.full((4, 1), np.nan), np.ones((4, 1, 1))])
+def test_a_near_null_space_must_be_fields(B):
+    with pytest.raises(ValueError, match="near_null_space"):
+        wl.SparseOperator(scipy.sparse.eye_array(4), device="cpu", near_null_space=B)
+
+
+def test_blocks_are_found_and_a_pickle_keeps_the_near_null_space():
+    blocks = scipy.sparse.kron(scipy.sparse.diags_array([-1.0, 2.5, -1.0], offsets=[-1, 0, 1], shape=(8, 8)), np.eye(3) + 0.2)
+    A = wl.SparseOperator(blocks, device="cpu", near_null_space=np.ones(24))
+    assert (A.block, A.near_null_space.shape) == (3, (24, 1))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(A)).near_null_space, A.near_null_space)
+    assert wl.SparseOperator(blocks, device="cpu").block == 1

@@ -101,6 +101,7 @@ def solved(data, method=None, *, x0=None, device="cpu", **stopping):
     """Solve, check the residual by SciPy, return the result."""
     A, b, lower, upper = data
     problem = wl.LCP(wl.SparseOperator(A, device=device), b, lower, upper)
+    method = method or wl.MinimumMapNewton()  # some of the matrices are a grid's, and would be solved as such
     result = wl.solve(problem, method, x0=x0, stopping=wl.StoppingCriteria(**stopping))
     assert result, result.status
     assert natural(*data, result.x.numpy()) <= 1.01e-6 * natural(*data, np.clip(np.zeros(len(b)), lower, upper))
@@ -156,6 +157,35 @@ def test_coarse_unknowns_are_fine_ones():
 
 
 WEAK = {"clamped": (plate(60, clamped=True), 180), "supported": (plate(60, clamped=False), 190), "elastic": (elastic_block(50), 150)}
+
+
+def rigid_motions(n):
+    """Of the nodes of `elastic_block(n)`: two translations and a rotation."""
+    y, x = np.divmod(np.arange(n * (n + 1)), n + 1)
+    B = np.zeros((2 * len(x), 3))
+    B[0::2, 0] = B[1::2, 1] = 1
+    B[0::2, 2], B[1::2, 2] = -y / n, x / n
+    return B
+
+
+@pytest.mark.parametrize("numbered", ["by rows", "at random"])
+def test_rigid_motions_make_contact_as_cheap_as_a_linear_solve(numbered):
+    """Without them 110 iterations at 50^2 nodes, 569 at 223^2 and 1,474 at 500^2; with them 19 and 28."""
+    n = 190 if numbered == "at random" else 50
+    A, b, lower, upper = elastic_block(n)
+    B, nodes = rigid_motions(n), np.arange(n * (n + 1))
+    if numbered == "at random":
+        nodes = np.random.default_rng(30217).permutation(nodes)
+    order = (2 * nodes[:, None] + np.arange(2)).ravel()
+    A = A[order][:, order].tocsr()
+    operator = wl.SparseOperator(A, device="cpu", near_null_space=B[order])
+    assert operator.block == 2
+    assert (operator.renumbered() is None) == (numbered == "by rows")
+    result = wl.solve(wl.LCP(operator, b[order], lower[order]))
+    assert result
+    assert result.linear_iterations <= 28
+    start = np.clip(0.0, lower[order], upper)
+    assert natural(A, b[order], lower[order], upper, result.x.numpy()) <= 1.01e-6 * natural(A, b[order], lower[order], upper, start)
 
 
 @pytest.mark.parametrize("name", WEAK)

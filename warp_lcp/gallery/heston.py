@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import scipy.integrate
 import scipy.interpolate
 import warp as wp
 
@@ -41,19 +40,13 @@ def differences(x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray) -> tupl
     return np.where(upwind, low_upwind, low), np.where(upwind, high_upwind, high)
 
 
-def _with_free_top(coefficients: Coefficients, shift: wp.array[Any], device: Any) -> Stencil:
-    """Return the operator on all nodes but those of the largest S, where prices are 0; nothing reaches beyond the other sides."""
-    cells = np.full(coefficients[0, 0].shape, FLUID, dtype=np.int8)
-    return Stencil(cells, coefficients, shift=shift, outside=AIR, device=device, dtype=wp.float64)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Heston:
     """A put in Heston's model: dS = r S dt + sqrt(v) S dW1, dv = kappa (theta - v) dt + sigma sqrt(v) dW2, with correlated dW1 and dW2.
 
     Its price u(S, v) at time t before expiry obeys u_t + L u >= 0, u >= max(K - S, 0), one of them with equality, where L u =
     -(v S^2 u_SS / 2 + rho sigma v S u_Sv + sigma^2 v u_vv / 2 + r S u_S + kappa (theta - v) u_v - r u). The defaults are the test
-    of Clarke and Parrott, as the tests of QuantLib have it.
+    of Ikonen and Toivanen (2005).
 
     Args:
         strike: K > 0.
@@ -113,7 +106,7 @@ class Heston:
         X, V = np.meshgrid(S, v)
         west, east = differences(S, V * X**2 / 2, self.rate * X)
         south, north = (d.T for d in differences(v, (self.volatility**2 * V / 2).T, (self.reversion * (self.mean - V)).T))
-        a: Coefficients = {(0, -1): -west, (0, 1): -east, (-1, 0): -south, (1, 0): -north}
+        a = {(0, -1): -west, (0, 1): -east, (-1, 0): -south, (1, 0): -north}
         h, k = np.diff(S), np.diff(v)
         mixed = np.where((X > 0) & (V > 0), abs(self.correlation) * self.volatility * V * X / 2, 0.0)
         mixed[-1] = mixed[:, -1] = 0.0
@@ -128,7 +121,7 @@ class Heston:
         a[0, 0] = self.rate - np.sum(list(a.values()), axis=0)
         return a
 
-    def put(self, ns: int, nv: int, steps: int, *, american: bool = True, method: Any = None, device: Any = None) -> Prices:
+    def put(self, ns: int, nv: int, steps: int, *, american: bool = True, device: Any = None) -> Prices:
         """Return the prices today: a complementarity problem each time step, begun with the last one's solution.
 
         Time steps grow like their number, since the price is smooth later on and its free boundary moves slower.
@@ -138,7 +131,6 @@ class Heston:
             nv: intervals of v, >= 4.
             steps: of time, > 2, of which the first 2 are implicit Euler's, others Crank and Nicolson's.
             american: whether it may be exercised at any time; else there are no bounds.
-            method: of the problems; MinimumMapNewton if None.
             device: Warp device of the operator.
 
         Raises:
@@ -149,71 +141,43 @@ class Heston:
             if value < least:
                 raise ValueError(f"{name} = {value}: must be >= {least}")
         S, v = self.nodes(ns, nv)
-        shape = (nv + 1, ns)
-        coefficients = {o: a[:, :-1] for o, a in self.coefficients(S, v).items()}
-        shift = wp.zeros((3, nv + 3, ns + 2), dtype=wp.float64, device=device)
-        A = _with_free_top(coefficients, shift, device)
-        L = grid_matrix(A)
-        payoff = np.broadcast_to(np.maximum(self.strike - S[:-1], 0), shape)
-        lower = payoff if american else np.full(shape, -np.inf)
+        cells = np.full((nv + 1, ns + 1), FLUID)
+        cells[:, -1] = AIR  # the price is 0 there; beyond the other sides it does not change
+        shift = wp.zeros((3, nv + 3, ns + 3), dtype=wp.float64, device=device)
+        A = Stencil(cells, self.coefficients(S, v), shift=shift, device=device, dtype=wp.float64)
+        L = grid_matrix(A)  # no shift so far
+        payoff = np.broadcast_to(np.maximum(self.strike - S, 0) * (S < S[-1]), cells.shape)
         u, times = payoff.copy(), self.expiry * (np.arange(steps + 1) / steps) ** 2
-        method, work = method or MinimumMapNewton(), None
         b = A.layout.load(u, wp.float64).reshape(A.layout.stored_shape)
-        problem = LCP(A, b, lower)
+        problem, method = LCP(A, b, payoff if american else -np.inf), MinimumMapNewton()
+        work = method.init(problem)
         for step, (before, after) in enumerate(pairwise(times)):
             share = 1.0 if step < IMPLICIT else 0.5
-            unit = 1 / (share * (after - before))  # of y, so that only the shift changes
+            unit = 1 / (share * (after - before))  # of y, so that only the shift changes from step to step
             shift.fill_(unit)
             A.update(A.cells)
-            rest = (1 - share) / share * (L @ u.ravel()).reshape(shape) - unit * u
-            b.assign(A.layout.load(rest, wp.float64).reshape(b.shape))
-            work = work or method.init(problem)
+            rest = np.pad((L @ u[:, :-1].ravel()).reshape(nv + 1, ns), ((0, 0), (0, 1)))
+            b.assign(A.layout.load((1 - share) / share * rest - unit * u, wp.float64).reshape(b.shape))
             stopping = StoppingCriteria(rtol=1e-7, atol=1e-9 * unit, max_iterations=1000)
             result = solve(problem, method, x0=u, stopping=stopping, workspace=work)
             if not result:
                 raise RuntimeError(f"time step {step}: {result.status.name}")
             u = A.layout.unload(result.x.flatten()).numpy().copy()
-        return Prices(S, v, np.pad(u, ((0, 0), (0, 1))))
+        return Prices(S, v, u)
 
     def extrapolated(self, spot: Any, variance: float, ns: int, nv: int, steps: int, **options: Any) -> np.ndarray:
-        """Return prices extrapolated from this grid and one of half the spacings in space and time, the error being of second order.
+        """Return prices from two grids, this one and one twice as fine in everything: 4/3 of the fine one's less 1/3 of this one's.
 
         Args:
-            spot: prices of the stock.
+            spot: S, a number or an array.
             variance: v.
-            ns: intervals of S of the coarser one.
-            nv: its intervals of v.
-            steps: its time steps.
-            options: as of `put`.
+            ns: intervals of S of the coarse grid.
+            nv: intervals of v.
+            steps: of time.
+            options: of `put`.
         """
-        coarse, fine = (self.put(f * ns, f * nv, f * steps, **options).at(spot, variance) for f in (1, 2))
-        return np.asarray((4 * fine - coarse) / 3)
-
-    def european(self, spot: float, variance: float) -> float:
-        """Return the European put's price by Heston's characteristic function, to about 1e-9.
-
-        Args:
-            spot: S > 0.
-            variance: v >= 0.
-        """
-        kappa, sigma, rho, T = self.reversion, self.volatility, self.correlation, self.expiry
-
-        def characteristic(z: complex) -> Any:  # of log S at expiry, without the jumps of a logarithm's branches
-            beta = kappa - rho * sigma * 1j * z
-            d = np.sqrt(beta**2 + sigma**2 * (1j * z + z**2))
-            g, decay = (beta - d) / (beta + d), np.exp(-d * T)
-            C = kappa * self.mean / sigma**2 * ((beta - d) * T - 2 * np.log((1 - g * decay) / (1 - g)))
-            D = (beta - d) / sigma**2 * (1 - decay) / (1 - g * decay)
-            return np.exp(1j * z * (np.log(spot) + self.rate * T) + C + D * variance)
-
-        def chance(shift: complex, scale: float) -> float:  # that S > K at expiry, by the measure of S or of money
-            def density(z: float) -> float:
-                return float((np.exp(-1j * z * np.log(self.strike)) * characteristic(z - shift) / (1j * z * scale)).real)
-
-            return 0.5 + scipy.integrate.quad(density, 1e-12, 400.0, limit=1000, epsabs=1e-12, epsrel=1e-12)[0] / np.pi
-
-        forward, discount = spot * np.exp(self.rate * T), np.exp(-self.rate * T)
-        return self.strike * discount * (1 - chance(0, 1.0)) - spot * (1 - chance(1j, forward))
+        coarse, fine = (self.put(k * ns, k * nv, k * steps, **options).at(spot, variance) for k in (1, 2))
+        return (4 * fine - coarse) / 3
 
 
 @dataclass(frozen=True, eq=False)

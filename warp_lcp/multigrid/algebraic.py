@@ -132,7 +132,7 @@ class AlgebraicHierarchy:
         host = A.matrix()
         pattern = _with_diagonal(host if A.symmetric else _union(host))
         self._order = self._find_entries(host, pattern)
-        self.levels = _coarsen(host, pattern, real, self.device, self.settings, self._most)
+        self.levels = _coarsen(A, host, pattern, real, self.settings, self._most)
         self._gamma = self.settings.gamma if A.symmetric else self.settings.gamma_unsymmetric
         n, last = A.unknowns, self.levels[-1].size
         self.scale = wp.zeros(n, dtype=real, device=self.device)
@@ -226,21 +226,24 @@ class AlgebraicHierarchy:
         return wp.array(order, dtype=wp.int32, device=self.device)
 
 
-def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings: AlgebraicSettings, most: int) -> list[AlgebraicLevel]:
-    """Return the levels of a matrix whose entries are stored in `pattern`."""
+def _coarsen(source: SparseOperator, A: Matrix, pattern: Matrix, real: Any, settings: AlgebraicSettings, most: int) -> list[AlgebraicLevel]:
+    """Return the levels of a matrix, `A` on the host, whose entries are stored in `pattern`; nodes aggregate where there are blocks."""
+    device, B, block = source.device, source.near_null_space, source.block
     values = np.zeros(pattern.nnz)
     values[_places(A, pattern)] = A.data
     current = scipy.sparse.csr_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
-    candidates = np.ones((A.shape[0], 1))
+    candidates = np.ones((A.shape[0], 1)) if B is None else B
     levels = [AlgebraicLevel(current, real, device)]
     while current.shape[0] > most:
         fine = levels[-1]
         entries = symmetric_part(current)
+        entries = entries.tobsr((block, block)) if block > 1 else entries
         C = symmetric_strength_of_connection(entries, theta=settings.strength)
         aggregates = aggregated(C, settings.stall)
         if aggregates is None:
             break
         T, candidates = fit_candidates(aggregates, candidates)
+        block = candidates.shape[1]
         # local weights are sums of magnitudes; spectral ones start from random vectors, so runs would differ
         P = T
         if _skewness(current, entries) <= settings.skew:

@@ -3,8 +3,8 @@
 Coarse cells are every second one along an axis. A cell between two of them shares in each by its row's weights (Dendy's black-box
 multigrid): the prolongation by those of (A + A')/2, the restriction by those of A' (as de Zeeuw has it), so that coarse matrices R A P of
 convection keep the wind's direction. They are compact again. Rows of one color after those of the other are solved for as tridiagonal
-systems, then columns; on the way up in the reverse order. With W-cycles a Krylov method's iterations stay at about ten from 128 to 1024 cells
-a side, for winds at Peclet numbers up to 1e4 that turn, for anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
+systems, then columns; on the way up in the reverse order. With W-cycles a Krylov method takes about ten iterations from 128 to 1024 cells a
+side, for winds at Peclet numbers up to 1e4 that turn, for anisotropy of 1 : 100 at any angle, and for coefficients over seven decades.
 """
 
 from __future__ import annotations

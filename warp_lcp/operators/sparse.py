@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.dense import is_rounding
+from warp_lcp.operators.renumbering import Renumbering, renumbering
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
@@ -47,6 +48,7 @@ RELAX = RowPass(
     "sparse.relax", HEADERS / "relax.h", "S", optional=("list",), numbers={"omega": wp.float64, "forward": bool, "first": int},
     whole={**ROWS, "a": "A", "d": "A", "list": wp.int32, **dict.fromkeys(("b", "lower", "upper", "x"), "S")},
 )  # fmt: skip
+BLOCKS, FILL = (6, 5, 4, 3, 2), 1.2  # sizes of nodes' blocks, and the most entries that these may have in units of A's
 GATHER = RowPass("sparse.gather", HEADERS / "gather.h", "S", whole={"source": "S"}, reads={"order": wp.int32}, writes={"taken": "S"})
 
 
@@ -60,8 +62,12 @@ class SparseOperator(Pickled):
         matrix: A, any scipy.sparse matrix or array of shape (n, n), real and finite. Rows may be empty.
         device: Warp device; the default device if None.
         dtype: storage of A's entries, wp.float64 or wp.float32.
+        near_null_space: fields that A nearly maps to 0, shape (n, k), k <= 12: the rigid body motions of elasticity, three in 2-D,
+            six in 3-D, which coarse levels then have too. None: the constants. Where unknowns come node by node (all of a node's
+            displacements in turn) whole nodes are aggregated.
 
     Attributes:
+        block: unknowns of a node, 1 to 6: A consists of full blocks of as many rows and columns; looked for if there is a near_null_space.
         indptr: where each row begins, shape (n + 1,), wp.int32.
         indices: column of each entry, shape (nnz,), wp.int32, ascending in each row.
         values: the entries, shape (nnz,), `dtype`.
@@ -70,7 +76,8 @@ class SparseOperator(Pickled):
         version: how often the entries have been taken.
 
     Raises:
-        ValueError: the matrix is not square, empty, complex, not finite, or has more than 2^31 - 1 entries.
+        ValueError: the matrix is not square, empty, complex, not finite, or has more than 2^31 - 1 entries; or near_null_space has
+            another shape, vanishes or is not finite.
 
     Example:
         >>> import scipy.sparse, warp as wp, warp_lcp as wl
@@ -79,11 +86,12 @@ class SparseOperator(Pickled):
         [ 0. -1.  6.] True
     """
 
-    def __init__(self, matrix: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
+    def __init__(self, matrix: Any, *, device: Any = None, dtype: Any = wp.float64, near_null_space: Any = None) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         host = _checked(matrix)
         check_storable(host.data, dtype, "matrix")
+        self.near_null_space = None if near_null_space is None else _near_null_space(near_null_space, host.shape[0])
         self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
         self.layout = Layout(self.shape, self.device)
         self.indptr = wp.array(host.indptr, dtype=wp.int32, device=self.device)
@@ -94,11 +102,13 @@ class SparseOperator(Pickled):
         self._transpose_values: wp.array[Any] | None = None
         self.version = 0
         self._scale: np.ndarray | None = None
+        self._turned: SparseOperator | None = None
+        self._turned_from = 0
         self._take(host)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the matrix as it is now."""
-        return made_again(SparseOperator, self.matrix(), device=self.device, dtype=self.dtype)
+        return made_again(SparseOperator, self.matrix(), device=self.device, dtype=self.dtype, near_null_space=self.near_null_space)
 
     @property
     def unknowns(self) -> int:
@@ -183,6 +193,29 @@ class SparseOperator(Pickled):
         if self._scale is None:
             self._scale = scale_of_matrix(self.matrix())
         return self._scale
+
+    def renumbered(self) -> tuple[Renumbering, SparseOperator] | None:
+        """Return A as it is now in a numbering in which neighbors lie together in memory; None where its own is as good, and on CUDA."""
+        found = self._numbering
+        if found is None:
+            return None
+        if self._turned is None or self._turned_from != self.version:
+            B = None if self.near_null_space is None else self.near_null_space[found.order]
+            self._turned = SparseOperator(found.matrix(self.matrix()), device=self.device, dtype=self.dtype, near_null_space=B)
+            self._turned_from = self.version
+        return found, self._turned
+
+    @cached_property
+    def _numbering(self) -> Renumbering | None:
+        return None if self.device.is_cuda else renumbering(self.matrix(), self.block)
+
+    @cached_property
+    def block(self) -> int:
+        """Unknowns of a node."""
+        if self.near_null_space is None:
+            return 1
+        pattern = _ones(self._indptr, self._indices)
+        return next((size for size in BLOCKS if self.unknowns % size == 0 and pattern.tobsr((size, size)).data.size <= FILL * self.nnz), 1)
 
     def masked(self, free: Any, shift: Any = None) -> SparseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
@@ -292,6 +325,17 @@ def _checked(matrix: Any) -> scipy.sparse.csr_array:
     if host.nnz > np.iinfo(np.int32).max:
         raise ValueError(f"matrix has {host.nnz} entries: at most 2^31 - 1 can be indexed")
     return host
+
+
+def _near_null_space(given: Any, n: int) -> np.ndarray:
+    """Return fields as an array of shape (n, k), float64."""
+    B = real_array(given, "near_null_space").astype(np.float64)
+    B = B[:, None] if B.ndim == 1 else B
+    if B.ndim != 2 or B.shape[0] != n or not 1 <= B.shape[1] <= 12:
+        raise ValueError(f"near_null_space has shape {B.shape}: expected ({n}, k) with k from 1 to 12")
+    if not np.isfinite(B).all() or not (B != 0).any(axis=0).all():
+        raise ValueError("near_null_space holds fields that vanish or are not finite")
+    return B
 
 
 def _ones(indptr: np.ndarray, indices: np.ndarray) -> scipy.sparse.csr_array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Never
@@ -10,6 +12,7 @@ import warp as wp
 
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.matrix_stencil import stencil_of
+from warp_lcp.operators.renumbering import Renumbering
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has, takes
@@ -20,11 +23,14 @@ from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_direct import suits
+from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.psor import ProjectedSOR
 
 LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
+ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
+LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
 
 
 def default_method(problem: LCP) -> Solver:
@@ -81,6 +87,11 @@ def solve(
         if found is not None:
             return found
     solver = default_method(problem) if solver is None else solver  # type: ignore[arg-type]  # an LCP, or refused there
+    if workspace is None and isinstance(solver, ANY_NUMBERING) and isinstance(problem, LCP) and isinstance(problem.A, SparseOperator):
+        plain = problem.bounds.affine is None and problem.preconditioner is None
+        begun, found = time.perf_counter(), problem.A.renumbered() if plain else None
+        if found is not None:
+            return _solve_renumbered(problem, *found, solver, stopping or StoppingCriteria(), x0, callback, begun)
     return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)
 
 
@@ -98,3 +109,18 @@ def _solve_as_grid(
     on_grid, start = LCP(stencil, *fields), None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy().reshape(stencil.shape)
     result = solve_by(on_grid, default_method(on_grid), stopping=stopping, x0=start, callback=callback)
     return replace(result, x=result.x.flatten(), grid=stencil.shape).of(problem) if result else None
+
+
+def _solve_renumbered(
+    problem: LCP, numbering: Renumbering, A: SparseOperator, solver: Solver, stopping: StoppingCriteria | MeanCriteria, x0: Array | None,
+    callback: Callable[[Record], None] | None, begun: float,
+) -> SolveResult:  # fmt: skip
+    """Solve a problem in another numbering of its unknowns; return x in its own. What that takes counts as set-up, from `begun` on."""
+    order = numbering.order
+    sides = (problem.bounds.host(side)[order] if problem.bounds.varying[side] else problem.bounds.values[side] for side in (0, 1))
+    other = LCP(A, problem.b.numpy()[order], *sides)
+    guess = None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy()[order]
+    if isinstance(stopping, StoppingCriteria) and stopping.max_seconds < math.inf:
+        stopping = replace(stopping, max_seconds=max(LEAST, stopping.max_seconds - (time.perf_counter() - begun)))
+    result = solve_by(other, solver, stopping=stopping, x0=guess, callback=callback)
+    return replace(result, x=wp.array(result.x.numpy()[numbering.place], dtype=result.x.dtype, device=problem.device)).of(problem)

@@ -1,0 +1,73 @@
+"""Another numbering of a sparse matrix's unknowns, in which neighbors lie together in memory.
+
+Where unknowns are numbered at random, each entry of a product reads x from another line of memory: at a million unknowns a product takes
+three to five times as long, and a solve three times, as in an order that follows the matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+SMALLEST = 1 << 16  # unknowns from which fields do not fit a core's own caches
+SCATTERED = 0.05  # mean distance of entries from the diagonal, as a share of n, from which an order pays; a random one has a third
+GAIN = 0.5  # the largest share of that distance that an order may leave: graphs that are small worlds have no good one
+SAMPLE = 1 << 16  # entries that tell the mean distance
+
+
+@dataclass(frozen=True)
+class Renumbering:
+    """Unknown i of the new numbering is unknown `order[i]` of the old one; `place` is the inverse, both of shape (n,)."""
+
+    order: np.ndarray
+    place: np.ndarray
+
+    def matrix(self, host: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
+        """Return a matrix in the new numbering, columns sorted."""
+        moved = host[self.order]
+        moved = scipy.sparse.csr_array((moved.data, self.place[moved.indices], moved.indptr), shape=host.shape)
+        moved.sort_indices()
+        return moved
+
+
+def renumbering(host: scipy.sparse.csr_array, block: int = 1) -> Renumbering | None:
+    """Return the reverse Cuthill-McKee order (SciPy), None where the numbering is a good one or that order is no better.
+
+    Args:
+        host: the matrix, shape (n, n), columns sorted.
+        block: unknowns that stay together, as the displacements of a node do; divides n.
+    """
+    n = host.shape[0]
+    before = _mean_distance(host)
+    if n < SMALLEST or before < SCATTERED * n:
+        return None
+    graph: Any = host if block == 1 else _blocks(host, block)
+    # breadth first by rows alone: on an unsymmetric pattern still an order, without the price of A + A'
+    nodes = scipy.sparse.csgraph.reverse_cuthill_mckee(scipy.sparse.csr_matrix(graph), symmetric_mode=True)
+    order = (block * nodes[:, None] + np.arange(block, dtype=nodes.dtype)).ravel()
+    place = np.empty_like(order)
+    place[order] = np.arange(n, dtype=order.dtype)
+    return Renumbering(order, place) if _mean_distance(host, place) < GAIN * before else None
+
+
+def _blocks(host: scipy.sparse.csr_array, block: int) -> scipy.sparse.csr_array:
+    """Return the pattern of the blocks of a matrix."""
+    blocks = host.tobsr((block, block))
+    return scipy.sparse.csr_array(
+        (np.ones(len(blocks.indices), dtype=np.int8), blocks.indices, blocks.indptr), shape=(host.shape[0] // block,) * 2
+    )
+
+
+def _mean_distance(host: scipy.sparse.csr_array, place: np.ndarray | None = None) -> float:
+    """Return the mean |i - j| over entries, from a sample spread over all of them."""
+    if host.nnz == 0:
+        return 0.0
+    entries = np.arange(0, host.nnz, max(1, host.nnz // SAMPLE))
+    rows, columns = np.searchsorted(host.indptr, entries, side="right") - 1, host.indices[entries]
+    if place is not None:
+        rows, columns = place[rows], place[columns]
+    return float(np.abs(rows.astype(np.int64) - columns).mean())
