@@ -141,6 +141,27 @@ def use_newton_kernels(reals):
                 assert wl.solve(problem, wl.InteriorPoint(precision=precision, crossover=1e-1), stopping=wl.StoppingCriteria(rtol=1e-4))
 
 
+@wp.func
+def drift(j: int, i: int):
+    return -1.0 - 0.1 * float(i)
+
+
+def use_stencil_kernels(reals):
+    """Instantiate the kernels of compact stencils: of numbers, arrays and functions, of lines and aggregates, and of matrices."""
+    nine = np.array([[-1.0, -1.0, -1.0], [-1.0, 9.0, -1.0], [-1.0, -1.0, -1.0]])
+    cells, wind = np.ones((12, 12), dtype=int), {(0, 0): 5.0, (0, 1): -0.5, (1, 0): -1.0, (-1, 0): -1.0}
+    for dtype in reals:
+        given = [nine, {**wind, (0, -1): np.full(cells.shape, -2.0)}, {**wind, (0, -1): drift, (0, 0): 9.0}]
+        for coefficients in given:
+            A = wl.Stencil(cells, coefficients, outside=wl.AIR, device="cpu", dtype=dtype)
+            A.apply_transpose(wp.ones(A.shape, dtype=wp.float64, device="cpu"))
+            for method in (None, wl.BlockedGaussSeidel(), wl.ProjectedSOR(), wl.MinimumMapNewton(precision="double")):
+                assert wl.solve(wl.LCP(A, np.where(np.arange(144).reshape(12, 12) % 2, -1.0, 0.5)), method)
+    T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(50, 50))
+    matrix = scipy.sparse.kron(scipy.sparse.eye_array(50), T) + scipy.sparse.kron(T, scipy.sparse.eye_array(50))
+    assert wl.solve(wl.LCP(wl.SparseOperator(matrix, device="cpu"), -np.ones(2500))).grid == (50, 50)
+
+
 def use_coupled_kernels(reals):
     """Instantiate the kernels of grids with a term of low rank, heavy enough that the preconditioner is corrected for it."""
     cells = np.ones((4, 4, 4), dtype=int)
@@ -205,6 +226,7 @@ def modules_of_every_kernel(reals):
     use_sweeping_kernels(reals)
     use_gradient_projection_kernels(reals)
     use_newton_kernels(reals)
+    use_stencil_kernels(reals)
     use_coupled_kernels(reals)
     use_sand_kernels()
     for form in [made for made in gc.get_objects() if isinstance(made, Form)]:

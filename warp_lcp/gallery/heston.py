@@ -146,7 +146,7 @@ class Heston:
         shift = wp.zeros((3, nv + 3, ns + 3), dtype=wp.float64, device=device)
         A = Stencil(cells, self.coefficients(S, v), shift=shift, device=device, dtype=wp.float64)
         L = grid_matrix(A)  # no shift so far
-        payoff = np.broadcast_to(np.maximum(self.strike - S, 0) * (S < S[-1]), cells.shape)
+        payoff = np.broadcast_to(np.maximum(self.strike - S, 0) * (S[-1] > S), cells.shape)
         u, times = payoff.copy(), self.expiry * (np.arange(steps + 1) / steps) ** 2
         b = A.layout.load(u, wp.float64).reshape(A.layout.stored_shape)
         problem, method = LCP(A, b, payoff if american else -np.inf), MinimumMapNewton()
