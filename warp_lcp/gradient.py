@@ -13,7 +13,7 @@ says, which is one of the map's generalized derivatives, and counted as degenera
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import singledispatch
+from functools import cached_property, singledispatch
 from typing import Any
 
 import numpy as np
@@ -46,9 +46,6 @@ class Gradient:
         b: by b, numpy, shape of the problem's fields, like all that follow.
         lower: by l; 0 where x is not held there.
         upper: by u.
-        coefficients: by what the operator was made from: `matrix` of a wl.SparseOperator (scipy.sparse, A's pattern) or a wl.DenseOperator;
-            `face_x`, `face_y`, `face_z` and `shift` of a wl.GridPoisson, and of a wl.Stencil its offsets and `shift`, each an array as
-            it is given, or a number where a number was; empty for others.
         degenerate: unknowns at a bound with y = 0, where the derivative is one of several.
         adjoint: how the linear solve ended; its x is lambda.
     """
@@ -56,9 +53,20 @@ class Gradient:
     b: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    coefficients: dict[Any, Any] = field(repr=False)
     degenerate: int
     adjoint: SolveResult = field(repr=False)
+    _operator: Any = field(repr=False)
+    _x: np.ndarray = field(repr=False)
+
+    @cached_property
+    def coefficients(self) -> dict[Any, Any]:
+        """Derivatives by what the operator was made from, computed when they are first asked for.
+
+        `matrix` of a wl.SparseOperator (scipy.sparse, A's pattern) or a wl.DenseOperator; `face_x`, `face_y`, `face_z` and `shift` of a
+        wl.GridPoisson, and of a wl.Stencil its offsets and `shift`, each an array as it is given, or a number where a number was; empty
+        for others.
+        """
+        return coefficient_gradient(self._operator, -self.b, self._x)
 
 
 def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | None = None) -> Gradient:
@@ -101,8 +109,7 @@ def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | N
         return layout.unload(wp.array(values, dtype=wp.float64, device=layout.device)).numpy().copy()
 
     fields = shaped(-np.where(free, lam.numpy(), 0.0)), shaped(np.where(low, rest, 0.0)), shaped(np.where(high, rest, 0.0))
-    coefficients = coefficient_gradient(A, shaped(lam.numpy()), shaped(x.numpy()))
-    return Gradient(*fields, coefficients, degenerate, solution)
+    return Gradient(*fields, degenerate, solution, A, shaped(x.numpy()))
 
 
 def _problem_of(result: SolveResult) -> LCP:
