@@ -20,7 +20,7 @@ from warp_lcp.gallery import PUBLISHED, Heston, IceDome, ball_obstacle, dam, jou
 from warp_lcp.gallery.published import solution
 
 PAGE = Path(__file__).parents[1] / "problems.md"
-FOLDER = PAGE.parent / "gallery"
+FOLDER = PAGE.parent / "problems"
 TABLE = re.compile(r"<!-- figures: (.*?) -->\n.*?(?=\n\n)", flags=re.S)
 DEVICE = "cpu"
 
@@ -164,8 +164,8 @@ def ice() -> Figure:
 
 
 PICTURES: dict[str, Callable[[], Figure]] = {
-    "problem-bearing": bearing, "problem-torsion": bars, "problem-sines": sines, "problem-ball": ball, "problem-dam": seepage,
-    "problem-put": put, "problem-ice": ice,
+    "bearing": bearing, "torsion": bars, "sines": sines, "ball": ball, "dam": seepage,
+    "put": put, "ice": ice,
 }  # fmt: skip
 
 
