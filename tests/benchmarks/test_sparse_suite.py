@@ -1,0 +1,39 @@
+"""The suite of sparse matrices: its problems are what they say they are, all are solved, and PyAMG answers."""
+
+import numpy as np
+import pytest
+
+from warp_lcp.benchmarks import sparse
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.benchmarks.sparse_family import FAMILY, numbered_at_random
+
+
+@pytest.mark.parametrize("kind", FAMILY)
+def test_problems_of_a_kind(kind):
+    made = numbered_at_random(kind, 900, 30203)
+    A, d = made.A, made.A.diagonal()
+    assert (d > 0).all()
+    assert (abs(A - A.T).max() < 1e-12 * d.max()) == made.symmetric
+    assert np.abs(np.subtract(*A.nonzero())).mean() > 0.2 * A.shape[0]
+    if made.near_null_space is not None:
+        products = np.abs(A @ made.near_null_space).max(axis=1) / d
+        assert np.median(products) < 1e-13  # nodes beside the held side feel it
+    seconds, result = sparse.ours(made, "cpu")
+    assert seconds > 0
+    assert result
+    x, y = result.x.numpy(), A @ result.x.numpy() + made.b
+    start = np.maximum(made.lower, 0)
+    first = np.linalg.norm(d * (start - np.maximum(start - (A @ start + made.b) / d, made.lower)))
+    assert np.linalg.norm(d * (x - np.maximum(x - y / d, made.lower))) <= 1.01e-6 * first
+
+
+def test_the_suite_compares_with_the_best_of_pyamg(monkeypatch, tmp_path):
+    monkeypatch.setattr(sparse, "FAMILY", dict.fromkeys(("triangles", "elastic")))
+    results = sparse.measure(Options("cpu", (22,), 1, lambda text: None), tmp_path)
+    records = {r.facts["kind"]: r for r in results.records if "kind" in r.facts}
+    assert set(records) == {"triangles", "elastic"}
+    for record in records.values():
+        assert record.facts["status"] == "CONVERGED"
+        assert record.value("ratio") == pytest.approx(record.value("ours") / record.value("pyamg"))
+    assert records["elastic"].facts["pyamg"].startswith(("smoothed", "rootnode"))
+    assert [row[0] for row in results.tables[0].rows] == ["triangles", "elastic"]
