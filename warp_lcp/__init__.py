@@ -2,6 +2,7 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
+from warp_lcp.gradients.vjp import Gradients, vjp
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, LowRankOperator, Operator, SparseOperator, SumOperator
 from warp_lcp.problem.affine_bounds import AffineBounds
@@ -63,6 +64,7 @@ __all__ = [
     "DirectEnumeration",
     "FischerNewton",
     "GradientDescent",
+    "Gradients",
     "GridLines",
     "GridPoisson",
     "IncrementalPivoting",
@@ -97,4 +99,5 @@ __all__ = [
     "set_threads",
     "solve",
     "solve_coupled",
+    "vjp",
 ]

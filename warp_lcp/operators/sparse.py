@@ -184,6 +184,11 @@ class SparseOperator(Pickled):
             self._scale = scale_of_matrix(self.matrix())
         return self._scale
 
+    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+        """Return -lambda_i x_j as `matrix`, for the entries in the order of `indices`, shape (nnz,), float64."""
+        entries = -np.repeat(multiplier.numpy(), np.diff(self._indptr)) * x.numpy()[self._indices]
+        return {"matrix": wp.array(entries, dtype=wp.float64, device=self.device)}
+
     def masked(self, free: Any, shift: Any = None) -> SparseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
         p = scipy.sparse.diags_array((self.layout.load(free, wp.uint8, "free").numpy() != 0).astype(np.float64))

@@ -175,6 +175,21 @@ class NamesComponents(Operator, Protocol):
         """
 
 
+class HasCoefficients(Operator, Protocol):
+    """What A is made of, and how a scalar depends on it: for `wl.vjp`."""
+
+    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+        """Return the derivatives of -lambda'A x with respect to what the constructor takes, by the names of its arguments.
+
+        Each has the shape that was given, as a wp.float64 array on A's device, or is a number where a number was given; None where nothing
+        was. Those of a matrix are on its pattern.
+
+        Args:
+            multiplier: lambda, stored field, wp.float64, 0 off the unknowns.
+            x: likewise.
+        """
+
+
 FAMILIES = {"dense": "wl.DenseOperator", "sparse": "wl.SparseOperator", "grid": "wl.GridPoisson"}
 CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {  # what to call each, and which of our own families have it
     HasRows: ("rows", ("dense", "sparse")),
@@ -188,6 +203,7 @@ CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {  # what to c
     AppliesPlus: ("sums with products", ("sparse", "grid")),
     HasScale: ("a scale", ("dense", "sparse")),
     NamesComponents: ("components", ("grid",)),
+    HasCoefficients: ("coefficients", ("dense", "sparse", "grid")),
 }
 
 

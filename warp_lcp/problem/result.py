@@ -70,6 +70,8 @@ class SolveResult(FieldsOnHost):
         residual: norm of the natural residual at x, recomputed in float64, units of y.
         relative_residual: residual over the one at clip(0, l, u); 0 where both vanish.
         history: a Record for the start and one for each step.
+        problem: what was solved, for `wl.vjp`; None where the result was pickled.
+        version: of the problem's operator then, None where it has none.
     """
 
     x: wp.array[Any]
@@ -79,6 +81,8 @@ class SolveResult(FieldsOnHost):
     residual: float
     relative_residual: float
     history: list[Record] = field(repr=False)
+    problem: Any = field(default=None, repr=False, compare=False, metadata={"pickled": False})
+    version: int | None = field(default=None, repr=False, compare=False)
 
     def __bool__(self) -> bool:
         """Return whether the solve converged."""

@@ -133,6 +133,14 @@ class MatrixBlock:
         return slab[:, rows], outer
 
 
+def on_cells(A: HasFaces, cells: np.ndarray) -> GridPoisson:
+    """Return a grid's operator with other cell types, padded, and the same coefficients, in place."""
+    inner = cells.reshape(A.layout.stored_shape)[1:-1, 1:-1, 1:-1].reshape(A.shape)
+    faces = {f"face_{axis}": f if f.size else c for axis, f, c in zip("xyz", A.faces, A.uniform, strict=True)}
+    shift = A.shift if A.shift.size else None
+    return GridPoisson(inner, **faces, shift=shift, periodic=A.periodic, device=A.device, dtype=A.dtype)
+
+
 class GridBlock:
     """A block of a grid problem: the same grid with AIR, x = 0, in place of the other unknowns, whose part is in b.
 
@@ -148,11 +156,7 @@ class GridBlock:
         member = np.zeros(layout.size, dtype=np.uint8)
         member[rows] = 1
         self._member = wp.array(member, dtype=wp.uint8, device=whole.device)
-        inner = tuple(slice(1, -1) for _ in range(3))
-        cells = self._cells().reshape(layout.stored_shape)[inner].reshape(A.shape)
-        faces = {f"face_{axis}": f if f.size else c for axis, f, c in zip("xyz", A.faces, A.uniform, strict=True)}
-        shift = A.shift if A.shift.size else None
-        sub = GridPoisson(cells, **faces, shift=shift, periodic=A.periodic, device=whole.device, dtype=A.dtype)
+        sub = on_cells(A, self._cells())
         self._b, self._y, self._z, self._guess = (layout.zeros(wp.float64) for _ in range(4))
         stored = layout.stored_shape
         self.problem = LCP(sub, self._b.reshape(stored), whole.lower.reshape(stored), whole.upper.reshape(stored))
