@@ -76,6 +76,11 @@ class Gradients:
         """Return whether the linear solve converged."""
         return self.status is SolveStatus.CONVERGED
 
+    @property
+    def by_name(self) -> dict[str, Any]:
+        """All of them by the names of what they belong to."""
+        return {"b": self.b, "lower": self.lower, "upper": self.upper, **self.coefficients}
+
 
 def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | None = None, allow_inexact: bool = False) -> Gradients:
     """Return the gradients of a scalar L(x) through the solution x of a problem, by one linear solve on the free unknowns.
