@@ -2,7 +2,7 @@
 
 With y = A x + b, the free set F = {l < x < u, y = 0} and the unknowns L and U held at their bounds, the solution map has the derivative
 A_FF dx_F = -(db_F + (dA x)_F + A_FL dl_L + A_FU du_U), dx_L = dl_L, dx_U = du_U, wherever y is not 0 on L and U. So with g = dL/dx and
-A_FF' lambda_F = g_F, lambda = 0 elsewhere, the gradients are -lambda for b, g - A'lambda on L and U for the bounds, -lambda_i x_j for a_ij.
+A_FF' mu_F = -g_F, mu = 0 elsewhere, the gradients are mu for b, g + A'mu on L and U for the bounds, and mu_i x_j for a_ij.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import Array, Layout
-from warp_lcp.rows.vectors import Sums, Tally
+from warp_lcp.rows.vectors import ADD, Sums, Tally, rows_of
 from warp_lcp.solvers.default import solve
 from warp_lcp.solvers.partition import on_cells
 
@@ -33,11 +33,11 @@ LARGEST = RowPass(
 )
 SETS = RowPass(
     "gradients.sets", HEADERS / "sets.h", f64, bounds=True, reads={**STATE, "b": f64, "g": f64}, writes={"cells": i8, "right": f64},
-    numbers={"unit": f64, "tolerance": f64, "rounding": f64}, sums=("free", "degenerate"),
+    numbers={"unit": f64, "tolerance": f64, "rounding": f64}, sums=("free", "degenerate", "wrong"),
 )  # fmt: skip
 HELD = RowPass(
-    "gradients.held", HEADERS / "held.h", f64, bounds=True, reads={"x": f64, "g": f64, "unknown": i8, "cells": i8},
-    writes={"multiplier": f64, "z": f64, "y": f64}, sums=("of_lower", "of_upper"),
+    "gradients.held", HEADERS / "held.h", f64, bounds=True, reads={"x": f64, "unknown": i8, "cells": i8}, writes={"z": f64, "y": f64},
+    sums=("of_lower", "of_upper"),
 )  # fmt: skip
 ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of 2 |d x| + |b|, as of the residual's floor: what a sum of a few terms leaves
 CHANGED = 2.0  # times the result's residual: a larger one is that of another problem
@@ -57,9 +57,9 @@ class Gradients:
         free: unknowns off their bounds.
         degenerate: unknowns at a bound where y is 0, too, as far as the residual tells: the solution has derivatives to one side only, and
             these gradients are those of the side on which the bound holds.
-        status: how the linear solve ended, whose solution is -b.
+        status: how the linear solve ended, whose solution is b.
         linear_iterations: of it.
-        relative_residual: ||g_F - A_FF'lambda_F|| over ||g_F||, recomputed in float64.
+        relative_residual: ||g_F + A_FF'mu_F|| over ||g_F||, recomputed in float64.
     """
 
     b: wp.array[Any]
@@ -112,17 +112,15 @@ def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | N
     problem = _checked(result, allow_inexact)
     layout = problem.layout
     x, g = layout.load(result.x, f64, "result.x"), layout.load(cotangent, f64, "cotangent")
-    if bad := problem.not_finite(g):
-        raise ValueError(f"cotangent holds {bad} values that are not finite")
     y, cells, right, free, degenerate = _classified(problem, result, x, g)
     adjoint, multiplier = _adjoint(problem, cells, right, free, stopping or StoppingCriteria())
     ended = f"{adjoint.status.name} at {adjoint.relative_residual:.1e} of its right-hand side ({adjoint.status.value})"
     if not (adjoint or allow_inexact):
         raise ArithmeticError(f"the linear solve of the gradients: {ended}; allow_inexact=True takes what there is")
-    z, A, shape, bounds = right, problem.A, layout.stored_shape, problem.bounds
-    A.apply_transpose(multiplier.reshape(shape), z.reshape(shape))
+    z, A, bounds = right, problem.A, problem.bounds
+    _gather(problem, multiplier, g, z)
     found = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
-    given = {"x": x, "g": g, "unknown": problem.unknown, "cells": cells, "multiplier": multiplier, "z": z, "y": y}
+    given = {"x": x, "unknown": problem.unknown, "cells": cells, "z": z, "y": y}
     sums = Sums(Rows.of_fields(layout), 2).of(HELD, bounds=bounds.operands, **given)
     lower, upper = (_as_given(problem, v) if varies else float(s) for v, varies, s in zip((z, y), bounds.varying, sums, strict=True))
     numbers = adjoint.status, adjoint.linear_iterations, adjoint.relative_residual
@@ -155,7 +153,7 @@ def _checked(result: Any, allow_inexact: bool) -> LCP:
 
 
 def _classified(problem: LCP, result: SolveResult, x: Any, g: Any) -> tuple[Any, Any, Any, int, int]:
-    """Return y, the cell types with 0 where an unknown is held, -g on the others, and how many are free and degenerate."""
+    """Return y, the cell types with 0 where an unknown is held, g on the others, and how many are free and degenerate."""
     residual, rows, layout = NaturalResidual(problem), Rows.of_fields(problem.layout), problem.layout
     problem.bounds.refresh()
     residual.affine(x)
@@ -168,12 +166,14 @@ def _classified(problem: LCP, result: SolveResult, x: Any, g: Any) -> tuple[Any,
         raise ValueError(f"result has a residual of {norm:.1e} instead of {result.residual:.1e}: its problem has changed in place since")
     cells, right = wp.clone(problem.unknown), layout.zeros(f64)
     given |= {"b": problem.b, "g": g, "cells": cells, "right": right, "tolerance": float(largest), "rounding": ROUNDING}
-    free, degenerate = Sums(rows, 2).of(SETS, bounds=bounds, **given)
+    free, degenerate, wrong = Sums(rows, 3).of(SETS, bounds=bounds, **given)
+    if wrong:
+        raise ValueError(f"cotangent holds {int(wrong)} values that are not finite")
     return residual.y, cells, right, int(free), int(degenerate)
 
 
 def _adjoint(problem: LCP, cells: Any, right: Any, count: int, stopping: StoppingCriteria) -> tuple[SolveResult, wp.array[Any]]:
-    """Solve A_FF' lambda_F = g_F; return how that went, and lambda as a stored field, 0 elsewhere."""
+    """Solve A_FF' mu_F = -g_F; return how that went, and mu as a stored field, 0 elsewhere."""
     A, layout = problem.A, problem.layout
     if count == 0:  # what is solved is 1 x = 0
         return solve(LCP(np.ones((1, 1)), np.zeros(1), -np.inf)), layout.zeros(f64)
@@ -184,7 +184,7 @@ def _adjoint(problem: LCP, cells: Any, right: Any, count: int, stopping: Stoppin
         return result, result.x.flatten()
     free = cells.numpy() == 1
     if has(A, HasRows):
-        free = free if A.row_sizes is None else free & (A.row_sizes.numpy() > 0)  # lambda of an empty row is anything: 0
+        free = free if A.row_sizes is None else free & (A.row_sizes.numpy() > 0)  # mu of an empty row is anything: 0
         matrix = as_operator(A.rows().matrix()[free][:, free].T, problem.device)
         result = solve(LCP(matrix, right.numpy()[free], -np.inf, np.inf), stopping=stopping)
         multiplier = np.zeros(layout.size)
@@ -196,6 +196,16 @@ def _adjoint(problem: LCP, cells: Any, right: Any, count: int, stopping: Stoppin
     sides = (np.where(free, side, 0.0).reshape(layout.stored_shape) for side in (-np.inf, np.inf))
     result = solve(LCP(A if A.symmetric else Transpose(A), held, *sides), stopping=stopping)
     return result, layout.load(result.x, f64)
+
+
+def _gather(problem: LCP, multiplier: wp.array[Any], g: wp.array[Any], z: wp.array[Any]) -> None:
+    """Set z = g + A'mu."""
+    A, shape = problem.A, problem.layout.stored_shape
+    if A.symmetric:
+        problem.apply_plus(multiplier, g, z)
+    else:
+        A.apply_transpose(multiplier.reshape(shape), z.reshape(shape))
+        ADD.bind(rows_of(z), z=g, x=z).launch()
 
 
 def _project(A: Operator, right: wp.array[Any], cells: wp.array[Any]) -> None:

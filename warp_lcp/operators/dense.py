@@ -107,8 +107,8 @@ class DenseOperator(Pickled):
         return scale_of_matrix(self.matrix.numpy().astype(np.float64))
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return -lambda_i x_j as `matrix`, shape (n, n), float64."""
-        return {"matrix": wp.array(-np.outer(multiplier.numpy(), x.numpy()), dtype=wp.float64, device=self.device)}
+        """Return mu_i x_j as `matrix`, shape (n, n), float64."""
+        return {"matrix": wp.array(np.outer(multiplier.numpy(), x.numpy()), dtype=wp.float64, device=self.device)}
 
     def masked(self, free: Any, shift: Any = None) -> DenseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""

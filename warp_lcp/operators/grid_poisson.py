@@ -211,9 +211,9 @@ class GridPoisson(Pickled):
         self.stencil.relax(x, b, lower, upper, omega, forward=forward)
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return -(lambda_i - lambda_j) (x_i - x_j) of each face and -lambda_i x_i of the shift.
+        """Return (mu_i - mu_j) (x_i - x_j) of each face and mu_i x_i of the shift.
 
-        0 on closed faces; x = lambda = 0 in AIR. The first and the last faces of a periodic axis, which are one, have half of it each.
+        0 on closed faces; x = mu = 0 in AIR. The first and the last faces of a periodic axis, which are one, have half of it each.
         """
         if self._mask is not None:
             raise ValueError("a masked operator has no coefficients of its own: take the one it was made from")

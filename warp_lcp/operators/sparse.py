@@ -185,8 +185,8 @@ class SparseOperator(Pickled):
         return self._scale
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return -lambda_i x_j as `matrix`, for the entries in the order of `indices`, shape (nnz,), float64."""
-        entries = -np.repeat(multiplier.numpy(), np.diff(self._indptr)) * x.numpy()[self._indices]
+        """Return mu_i x_j as `matrix`, for the entries in the order of `indices`, shape (nnz,), float64."""
+        entries = np.repeat(multiplier.numpy(), np.diff(self._indptr)) * x.numpy()[self._indices]
         return {"matrix": wp.array(entries, dtype=wp.float64, device=self.device)}
 
     def masked(self, free: Any, shift: Any = None) -> SparseOperator:

@@ -179,13 +179,13 @@ class HasCoefficients(Operator, Protocol):
     """What A is made of, and how a scalar depends on it: for `wl.vjp`."""
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return the derivatives of -lambda'A x with respect to what the constructor takes, by the names of its arguments.
+        """Return the derivatives of mu'A x with respect to what the constructor takes, by the names of its arguments.
 
         Each has the shape that was given, as a wp.float64 array on A's device, or is a number where a number was given; None where nothing
         was. Those of a matrix are on its pattern.
 
         Args:
-            multiplier: lambda, stored field, wp.float64, 0 off the unknowns.
+            multiplier: mu, stored field, wp.float64, 0 off the unknowns.
             x: likewise.
         """
 
