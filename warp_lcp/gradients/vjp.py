@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasCoefficients, HasFaces, HasRows, NamesComponents, Operator, has, version_of
+from warp_lcp.problem.protocol import HasCoefficients, HasFaces, HasRows, HasStencil, NamesComponents, Operator, has, version_of
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.stopping import StoppingCriteria
@@ -121,10 +121,15 @@ def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | N
     _gather(problem, multiplier, g, z)
     found = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
     given = {"x": x, "unknown": problem.unknown, "cells": cells, "z": z, "y": y}
-    sums = Sums(Rows.of_fields(layout), 2).of(HELD, bounds=bounds.operands, **given)
+    sums = Sums(_rows(problem), 2).of(HELD, bounds=bounds.operands, **given)
     lower, upper = (_as_given(problem, v) if varies else float(s) for v, varies, s in zip((z, y), bounds.varying, sums, strict=True))
     numbers = adjoint.status, adjoint.linear_iterations, adjoint.relative_residual
     return Gradients(_as_given(problem, multiplier), lower, upper, found, free, degenerate, *numbers)
+
+
+def _rows(problem: LCP) -> Rows:
+    """Return the rows that have unknowns: elsewhere fields are 0."""
+    return problem.A.stencil.rows if has(problem.A, HasStencil) else Rows.of_fields(problem.layout)
 
 
 def _as_given(problem: LCP, stored: wp.array[Any]) -> wp.array[Any]:
@@ -154,7 +159,7 @@ def _checked(result: Any, allow_inexact: bool) -> LCP:
 
 def _classified(problem: LCP, result: SolveResult, x: Any, g: Any) -> tuple[Any, Any, Any, int, int]:
     """Return y, the cell types with 0 where an unknown is held, g on the others, and how many are free and degenerate."""
-    residual, rows, layout = NaturalResidual(problem), Rows.of_fields(problem.layout), problem.layout
+    residual, rows, layout = NaturalResidual(problem), _rows(problem), problem.layout
     problem.bounds.refresh()
     residual.affine(x)
     given = {"x": x, "y": residual.y, "d": residual.diagonal, "unknown": problem.unknown, "unit": residual.unit}
