@@ -350,6 +350,15 @@ def test_the_residual_of_the_linear_solve_is_one_of_float64():
     assert found.relative_residual < 1e-11
 
 
+def test_what_a_cotangent_has_off_the_unknowns_does_not_count():
+    cells, data = random_grid((7, 8), 113)
+    result = solved(grid_problem(cells), data)
+    g = np.random.default_rng(114).standard_normal(cells.shape)
+    one, other = (wl.vjp(result, np.where(cells == wl.FLUID, g, v)).by_name for v in (0.0, np.nan))
+    for name, gradient in one.items():
+        assert np.array_equal(host(gradient), host(other[name])), name
+
+
 def test_nothing_is_left_out_on_the_host_or_device(device):
     cells, data = random_grid((6, 6), 109)
     A = wl.GridPoisson(cells, device=device, shift=0.1)

@@ -32,11 +32,11 @@ LARGEST = RowPass(
     "gradients.largest", HEADERS / "largest.h", f64, bounds=True, reads=STATE, numbers={"unit": f64}, sums=("square",), largest=("most",)
 )
 SETS = RowPass(
-    "gradients.sets", HEADERS / "sets.h", f64, bounds=True, reads={**STATE, "b": f64, "g": f64}, writes={"cells": i8, "right": f64},
+    "gradients.sets", HEADERS / "sets.h", f64, bounds=True, reads={**STATE, "b": f64, "g": f64}, writes={"cells": i8, "side": i8},
     numbers={"unit": f64, "tolerance": f64, "rounding": f64}, sums=("free", "degenerate", "wrong"),
 )  # fmt: skip
 HELD = RowPass(
-    "gradients.held", HEADERS / "held.h", f64, bounds=True, reads={"x": f64, "unknown": i8, "cells": i8}, writes={"z": f64, "y": f64},
+    "gradients.held", HEADERS / "held.h", f64, reads={"side": i8}, writes={"z": f64, "upper": f64}, optional=("upper",),
     sums=("of_lower", "of_upper"),
 )  # fmt: skip
 ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of 2 |d x| + |b|, as of the residual's floor: what a sum of a few terms leaves
@@ -112,17 +112,17 @@ def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | N
     problem = _checked(result, allow_inexact)
     layout = problem.layout
     x, g = layout.load(result.x, f64, "result.x"), layout.load(cotangent, f64, "cotangent")
-    y, cells, right, free, degenerate = _classified(problem, result, x, g)
-    adjoint, multiplier = _adjoint(problem, cells, right, free, stopping or StoppingCriteria())
+    y, cells, side, free, degenerate = _classified(problem, result, x, g)
+    adjoint, multiplier = _adjoint(problem, cells, g, free, stopping or StoppingCriteria())
     ended = f"{adjoint.status.name} at {adjoint.relative_residual:.1e} of its right-hand side ({adjoint.status.value})"
     if not (adjoint or allow_inexact):
         raise ArithmeticError(f"the linear solve of the gradients: {ended}; allow_inexact=True takes what there is")
-    z, A, bounds = right, problem.A, problem.bounds
+    A, varying, z = problem.A, problem.bounds.varying, y
     _gather(problem, multiplier, g, z)
     found = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
-    given = {"x": x, "unknown": problem.unknown, "cells": cells, "z": z, "y": y}
-    sums = Sums(_rows(problem), 2).of(HELD, bounds=bounds.operands, **given)
-    lower, upper = (_as_given(problem, v) if varies else float(s) for v, varies, s in zip((z, y), bounds.varying, sums, strict=True))
+    at_upper = layout.zeros(f64) if varying[1] else None
+    sums = Sums(_rows(problem), 2).of(HELD, side=side, z=z, upper=at_upper).tolist()
+    lower, upper = (_as_given(problem, v) if varies else s for v, varies, s in zip((z, at_upper), varying, sums, strict=True))
     numbers = adjoint.status, adjoint.linear_iterations, adjoint.relative_residual
     return Gradients(_as_given(problem, multiplier), lower, upper, found, free, degenerate, *numbers)
 
@@ -158,7 +158,7 @@ def _checked(result: Any, allow_inexact: bool) -> LCP:
 
 
 def _classified(problem: LCP, result: SolveResult, x: Any, g: Any) -> tuple[Any, Any, Any, int, int]:
-    """Return y, the cell types with 0 where an unknown is held, g on the others, and how many are free and degenerate."""
+    """Return y, the cell types with 0 where an unknown is held, which bound holds it, and how many are free and degenerate."""
     residual, rows, layout = NaturalResidual(problem), _rows(problem), problem.layout
     problem.bounds.refresh()
     residual.affine(x)
@@ -169,35 +169,34 @@ def _classified(problem: LCP, result: SolveResult, x: Any, g: Any) -> tuple[Any,
     norm, allowed = float(square) ** 0.5, CHANGED * result.residual
     if not norm <= allowed and not norm <= allowed + residual.rounding_floor(x, ROUNDING):
         raise ValueError(f"result has a residual of {norm:.1e} instead of {result.residual:.1e}: its problem has changed in place since")
-    cells, right = wp.clone(problem.unknown), layout.zeros(f64)
-    given |= {"b": problem.b, "g": g, "cells": cells, "right": right, "tolerance": float(largest), "rounding": ROUNDING}
+    cells, side = wp.clone(problem.unknown), layout.zeros(i8)
+    given |= {"b": problem.b, "g": g, "cells": cells, "side": side, "tolerance": float(largest), "rounding": ROUNDING}
     free, degenerate, wrong = Sums(rows, 3).of(SETS, bounds=bounds, **given)
     if wrong:
         raise ValueError(f"cotangent holds {int(wrong)} values that are not finite")
-    return residual.y, cells, right, int(free), int(degenerate)
+    return residual.y, cells, side, int(free), int(degenerate)
 
 
-def _adjoint(problem: LCP, cells: Any, right: Any, count: int, stopping: StoppingCriteria) -> tuple[SolveResult, wp.array[Any]]:
+def _adjoint(problem: LCP, cells: Any, g: Any, count: int, stopping: StoppingCriteria) -> tuple[SolveResult, wp.array[Any]]:
     """Solve A_FF' mu_F = -g_F; return how that went, and mu as a stored field, 0 elsewhere."""
     A, layout = problem.A, problem.layout
     if count == 0:  # what is solved is 1 x = 0
         return solve(LCP(np.ones((1, 1)), np.zeros(1), -np.inf)), layout.zeros(f64)
     if has(A, HasFaces):
         block = on_cells(A, cells.numpy())
-        _project(block, right, cells)
+        right = _projected(block, g, cells)  # what it has in AIR does not count
         result = solve(LCP(block, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping)
         return result, result.x.flatten()
     free = cells.numpy() == 1
     if has(A, HasRows):
         free = free if A.row_sizes is None else free & (A.row_sizes.numpy() > 0)  # mu of an empty row is anything: 0
         matrix = as_operator(A.rows().matrix()[free][:, free].T, problem.device)
-        result = solve(LCP(matrix, right.numpy()[free], -np.inf, np.inf), stopping=stopping)
+        result = solve(LCP(matrix, g.numpy()[free], -np.inf, np.inf), stopping=stopping)
         multiplier = np.zeros(layout.size)
         multiplier[free] = result.x.numpy()
         return result, wp.array(multiplier, dtype=f64, device=problem.device)
-    _project(A, right, cells)
-    b = right.numpy()
-    held = np.where(free, b, np.abs(b).max(initial=0.0) or 1.0).reshape(layout.stored_shape)  # not 0, or it would seem to be free
+    b = _projected(A, g, cells).numpy()
+    held = np.where(free, b, np.abs(b[free]).max() or 1.0).reshape(layout.stored_shape)  # not 0, or it would seem to be free
     sides = (np.where(free, side, 0.0).reshape(layout.stored_shape) for side in (-np.inf, np.inf))
     result = solve(LCP(A if A.symmetric else Transpose(A), held, *sides), stopping=stopping)
     return result, layout.load(result.x, f64)
@@ -213,11 +212,13 @@ def _gather(problem: LCP, multiplier: wp.array[Any], g: wp.array[Any], z: wp.arr
         ADD.bind(rows_of(z), z=g, x=z).launch()
 
 
-def _project(A: Operator, right: wp.array[Any], cells: wp.array[Any]) -> None:
-    """Take the mean off the components on which A is singular and that are free as a whole."""
+def _projected(A: Operator, g: wp.array[Any], cells: wp.array[Any]) -> wp.array[Any]:
+    """Return g without its mean on the components on which A is singular and that are free as a whole."""
     floating = A.floating_components() if has(A, NamesComponents) else None
     if floating is not None:
-        floating.project(right, cells.view(wp.uint8))
+        g = wp.clone(g)
+        floating.project(g, cells.view(wp.uint8))
+    return g
 
 
 class Transpose:
