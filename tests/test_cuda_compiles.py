@@ -141,6 +141,17 @@ def use_newton_kernels(reals):
                 assert wl.solve(problem, wl.InteriorPoint(precision=precision, crossover=1e-1), stopping=wl.StoppingCriteria(rtol=1e-4))
 
 
+def use_kernels_of_gradients(reals):
+    """Instantiate those of vector-Jacobian products on every kind of bounds and diagonal."""
+    cells, T = np.array([[0, 1, 1, 1]]), scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tocsr()
+    for dtype in reals:
+        operators = [wl.SparseOperator(T, device="cpu", dtype=dtype), wl.GridPoisson(cells, device="cpu", dtype=dtype)]
+        operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, face_x=np.ones((1, 5)), shift=0.1))
+        for A in operators:
+            for lower in (0.0, np.zeros(A.shape), np.linspace(-1.0, 0.0, A.shape[-1]) * np.ones(A.shape)):
+                assert wl.vjp(wl.solve(wl.LCP(A, -np.ones(A.shape), lower)), np.ones(A.shape))
+
+
 def use_coupled_kernels(reals):
     """Instantiate the kernels of grids with a term of low rank, heavy enough that the preconditioner is corrected for it."""
     cells = np.ones((4, 4, 4), dtype=int)
@@ -204,6 +215,7 @@ def modules_of_every_kernel(reals):
     use_sparse_kernels(reals)
     use_sweeping_kernels(reals)
     use_gradient_projection_kernels(reals)
+    use_kernels_of_gradients(reals)
     use_newton_kernels(reals)
     use_coupled_kernels(reals)
     use_sand_kernels()

@@ -1,6 +1,7 @@
 """Gradients through solutions against finite differences, and what is refused."""
 
 import pickle
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -357,6 +358,22 @@ def test_what_a_cotangent_has_off_the_unknowns_does_not_count():
     one, other = (wl.vjp(result, np.where(cells == wl.FLUID, g, v)).by_name for v in (0.0, np.nan))
     for name, gradient in one.items():
         assert np.array_equal(host(gradient), host(other[name])), name
+
+
+def test_memory_does_not_grow_with_the_iterations():
+    """Of the solve: what a result holds beyond its history is x, and what gradients take is the same, to what Python itself varies by."""
+    cells, data = random_grid((60, 60), 131)
+    problem, peaks, steps = grid_problem(cells)(data["b"], shift=data["shift"]), [], []
+    for method in (wl.ProjectedMultigrid(), wl.ProjectedSOR(omega=1.0)):
+        result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=5000))
+        wl.vjp(result, data["b"])
+        tracemalloc.start()
+        wl.vjp(result, data["b"])
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        steps.append(result.iterations)
+    assert steps[1] > 5 * steps[0]
+    assert abs(peaks[1] - peaks[0]) < 8 * cells.size
 
 
 def test_nothing_is_left_out_on_the_host_or_device(device):
