@@ -15,12 +15,12 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasCoefficients, HasFaces, HasRows, HasStencil, NamesComponents, Operator, has, version_of
+from warp_lcp.problem.protocol import HasCoefficients, HasFaces, HasRows, HasStencil, NamesComponents, Operator, has, layout_of, version_of
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Array, Layout
+from warp_lcp.rows.fields import Array
 from warp_lcp.rows.vectors import ADD, Sums, Tally, rows_of
 from warp_lcp.solvers.default import solve
 from warp_lcp.solvers.partition import on_cells
@@ -229,7 +229,7 @@ class Transpose:
     def __init__(self, A: Operator) -> None:
         self.shape, self.dtype, self.device, self._A = A.shape, A.dtype, A.device, A
         self.apply, self.apply_transpose, self.diagonal = A.apply_transpose, A.apply, A.diagonal
-        self.layout = getattr(A, "layout", None) or Layout(A.shape, A.device)
+        self.layout = layout_of(A)
 
     def masked(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> Transpose:
         """Return that of the principal system."""
