@@ -162,6 +162,19 @@ def use_stencil_kernels(reals):
     assert wl.solve(wl.LCP(wl.SparseOperator(matrix, device="cpu"), -np.ones(2500))).grid == (50, 50)
 
 
+def use_kernels_of_gradients(reals):
+    """Instantiate those of vector-Jacobian products on every kind of bounds and diagonal."""
+    cells, T = np.array([[0, 1, 1, 1]]), scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tocsr()
+    for dtype in reals:
+        operators = [wl.SparseOperator(T, device="cpu", dtype=dtype), wl.GridPoisson(cells, device="cpu", dtype=dtype)]
+        operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, face_x=np.ones((1, 5)), shift=0.1))
+        for A in operators:
+            for lower in (0.0, np.zeros(A.shape), np.linspace(-1.0, 0.0, A.shape[-1]) * np.ones(A.shape)):
+                assert wl.vjp(wl.solve(wl.LCP(A, -np.ones(A.shape), lower)), np.ones(A.shape))
+        A = wl.Stencil(np.ones((12, 12), dtype=int), {(0, 0): 3.0, (0, 1): -1.0}, device="cpu", dtype=dtype)
+        assert wl.vjp(wl.solve(wl.LCP(A, -np.ones(A.shape))), np.ones(A.shape))
+
+
 def use_coupled_kernels(reals):
     """Instantiate the kernels of grids with a term of low rank, heavy enough that the preconditioner is corrected for it."""
     cells = np.ones((4, 4, 4), dtype=int)
@@ -225,6 +238,7 @@ def modules_of_every_kernel(reals):
     use_sparse_kernels(reals)
     use_sweeping_kernels(reals)
     use_gradient_projection_kernels(reals)
+    use_kernels_of_gradients(reals)
     use_newton_kernels(reals)
     use_stencil_kernels(reals)
     use_coupled_kernels(reals)

@@ -71,6 +71,8 @@ EXAMPLES = [(page, code) for page in sorted(DOCS.rglob("*.md")) if page.name != 
 def test_python_examples_run(page, code, capsys):
     if "warp_lcp.distributed" in code:
         pytest.importorskip("petsc4py", reason="PETSc is missing")
+    if "gradients.pytorch" in code:
+        pytest.importorskip("torch", reason="PyTorch is missing")
     run(code, page)
     assert capsys.readouterr().out.startswith("CONVERGED")
 

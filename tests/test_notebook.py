@@ -1,4 +1,4 @@
-"""The notebook runs without Jupyter, prints what it holds as printed, and names no place of the machine it was made on."""
+"""Notebooks run without Jupyter, print what they hold as printed, and name no place of the machine they were made on."""
 
 import importlib.util
 import json
@@ -17,15 +17,27 @@ def load(name):
     return module
 
 
+TITLES = {"first-steps": ("First steps", 5), "inverse-problem": ("An obstacle from the shape of a membrane", 4)}  # and cells that print
+
+
+@pytest.fixture(scope="module", params=TITLES)
+def name(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def notebook():
-    return json.loads((DOCS / "first-steps.ipynb").read_text())
+def notebook(name):
+    return json.loads((DOCS / f"{name}.ipynb").read_text())
 
 
-def test_cells_print_what_the_notebook_holds(notebook):
+def test_every_notebook_is_tested():
+    assert {path.stem for path in DOCS.glob("*.ipynb")} == TITLES.keys()
+
+
+def test_cells_print_what_the_notebook_holds(notebook, name):
     outputs = load("notebook_outputs")
     printed = outputs.printed(notebook)
-    assert sum(bool(text) for text in printed) == 5
+    assert sum(bool(text) for text in printed) == TITLES[name][1]
     assert printed == outputs.kept(notebook)
 
 
@@ -39,11 +51,11 @@ def test_the_notebook_is_clean(notebook):
     assert set(notebook["metadata"]["language_info"]) == {"name"}
 
 
-def test_the_page_shows_code_and_what_it_prints(notebook):
+def test_the_page_shows_code_and_what_it_prints(notebook, name):
     page = load("site_pages").page_of_notebook(json.dumps(notebook))
-    assert page.startswith("# First steps\n")
+    assert page.startswith(f"# {TITLES[name][0]}\n")
     assert page.count("```python\n") == sum(cell["cell_type"] == "code" for cell in notebook["cells"])
-    assert page.count("```text\n") == 5
+    assert page.count("```text\n") == TITLES[name][1]
 
 
 def test_powers_and_comparisons_are_set_but_for_code():

@@ -2,7 +2,7 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-from warp_lcp.gradient import Gradient, vjp
+from warp_lcp.gradients.vjp import Gradients, vjp
 from warp_lcp.linear_complementarity import linear_complementarity
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators import (
@@ -76,8 +76,8 @@ __all__ = [
     "DenseOperator",
     "DirectEnumeration",
     "FischerNewton",
-    "Gradient",
     "GradientDescent",
+    "Gradients",
     "GridLines",
     "GridPoisson",
     "IncrementalPivoting",

@@ -1,4 +1,4 @@
-"""Runs the notebook's cells, without Jupyter, and keeps what they print: `python docs/generate/notebook_outputs.py`."""
+"""Runs the notebooks' cells, without Jupyter, and keeps what they print: `python docs/generate/notebook_outputs.py`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-NOTEBOOK = Path(__file__).parents[1] / "first-steps.ipynb"
+NOTEBOOKS = sorted(Path(__file__).parents[1].glob("*.ipynb"))
 
 
 def printed(notebook: dict[str, Any]) -> list[str]:
@@ -19,7 +19,7 @@ def printed(notebook: dict[str, Any]) -> list[str]:
         if cell["cell_type"] == "code":
             stream = io.StringIO()
             with contextlib.redirect_stdout(stream):
-                exec(compile("".join(cell["source"]), f"{NOTEBOOK.name}, cell {number}", "exec"), names)
+                exec(compile("".join(cell["source"]), f"cell {number}", "exec"), names)
             texts.append(stream.getvalue())
     return texts
 
@@ -31,11 +31,12 @@ def kept(notebook: dict[str, Any]) -> list[str]:
 
 
 if __name__ == "__main__":
-    notebook = json.loads(NOTEBOOK.read_text())
-    texts = iter(printed(notebook))
-    for cell in notebook["cells"]:
-        if cell["cell_type"] == "code":
-            text = next(texts)
-            lines = text.splitlines(keepends=True)
-            cell["outputs"] = [{"name": "stdout", "output_type": "stream", "text": lines}] if lines else []
-    NOTEBOOK.write_text(json.dumps(notebook, indent=1) + "\n")
+    for file in NOTEBOOKS:
+        notebook = json.loads(file.read_text())
+        texts = iter(printed(notebook))
+        for cell in notebook["cells"]:
+            if cell["cell_type"] == "code":
+                text = next(texts)
+                lines = text.splitlines(keepends=True)
+                cell["outputs"] = [{"name": "stdout", "output_type": "stream", "text": lines}] if lines else []
+        file.write_text(json.dumps(notebook, indent=1) + "\n")

@@ -1,6 +1,6 @@
 """What the site shows besides Markdown files under docs: a hook of MkDocs.
 
-The notebook becomes a page, and so do the files of the repository that pages link to. Formulas become MathML, which browsers draw
+Notebooks become pages, and so do the files of the repository that pages link to. Formulas become MathML, which browsers draw
 themselves, without a script, with the font that comes along.
 """
 
@@ -13,8 +13,7 @@ from importlib.metadata import distribution
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-NOTEBOOK = "first-steps.ipynb"
-PAGE = "first-steps.md"
+NOTEBOOK = re.compile(r"\]\(([\w-]+)\.ipynb\)")  # a link to one
 FONT = "STIXTwoMath-Regular.ttf"  # of ziamath; docs/site.css names it
 OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")  # a link from a page right under docs to a file of the repository
 # What pymdownx.arithmatex makes of $...$ and $$...$$.
@@ -45,12 +44,13 @@ def inside(text: str) -> str:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the notebook's page, and the files outside docs that the navigation and the pages name, with what these show."""
+    """Add the notebooks' pages, and the files outside docs that the navigation and the pages name, with what these show."""
     from mkdocs.structure.files import File
 
     docs = Path(config.docs_dir)
     root = Path(config.config_file_path).parent
-    files.append(File.generated(config, PAGE, content=page_of_notebook((docs / NOTEBOOK).read_text())))
+    for notebook in sorted(docs.glob("*.ipynb")):
+        files.append(File.generated(config, f"{notebook.stem}.md", content=page_of_notebook(notebook.read_text())))
     files.append(File.generated(config, FONT, abs_src_path=str(distribution("ziamath").locate_file(f"ziamath/fonts/{FONT}"))))
     wanted = set().union(*(outside_links(page.read_text()) for page in docs.glob("*.md")))
     wanted |= set(re.findall(r"(benchmarks/\S+\.md|[A-Z]+\.md)", json.dumps(config.nav)))
@@ -69,8 +69,8 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Make links out of docs, and to the notebook, links within the site."""
-    return inside(markdown).replace(f"]({NOTEBOOK})", f"]({PAGE})") if "/" not in page.file.src_uri else markdown
+    """Make links out of docs, and to notebooks, links within the site."""
+    return NOTEBOOK.sub(r"](\1.md)", inside(markdown)) if "/" not in page.file.src_uri else markdown
 
 
 def formula(found: re.Match[str]) -> str:

@@ -145,7 +145,7 @@ def test_what_cannot_be_taken_apart_is_refused():
         def diagonal(self):
             return wp.full(3, 1.0, dtype=wp.float64, device="cpu")
 
-    with pytest.raises(ValueError, match=r"Staggering needs an operator with rows .* or faces .*; Ring has none"):
+    with pytest.raises(ValueError, match=r"Staggering needs an operator with rows .* or blocks .*; Ring has none"):
         Staggering().init(wl.LCP(Ring(), -np.ones(3)))
     for settings in ({"blocks": 0}, {"eta": 1.0}, {"max_block_iterations": 0}):
         with pytest.raises(ValueError, match=next(iter(settings))):

@@ -106,6 +106,10 @@ class DenseOperator(Pickled):
         """Return the natural residual's d, shape (n,), of the entries as they are now."""
         return scale_of_matrix(self.matrix.numpy().astype(np.float64))
 
+    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+        """Return mu_i x_j as `matrix`, shape (n, n), float64."""
+        return {"matrix": wp.array(np.outer(multiplier.numpy(), x.numpy()), dtype=wp.float64, device=self.device)}
+
     def masked(self, free: Any, shift: Any = None) -> DenseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
         p = self.layout.load(free, wp.uint8, "free").numpy() != 0

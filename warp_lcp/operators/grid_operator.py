@@ -177,6 +177,20 @@ class GridOperator(Pickled):
         twin.stencil = self.stencil.with_diagonal(new)
         return twin
 
+    def on_cells(self, cells: np.ndarray) -> Self:
+        """Return the operator of other cells, padded as `cells` is, with the same coefficients, its arrays in place."""
+        inner = cells.reshape(self.layout.stored_shape)[1:-1, 1:-1, 1:-1].reshape(self.shape)
+        return type(self)(inner, periodic=self.periodic, device=self.device, dtype=self.dtype, **self._arguments())
+
+    def _arguments(self) -> dict[str, Any]:
+        """Return the coefficients as arguments of the class."""
+        raise NotImplementedError
+
+    def _check_own(self) -> None:
+        """Refuse a principal system where coefficients are asked for."""
+        if self._mask is not None:
+            raise ValueError("a masked operator has no coefficients of its own: take the one it was made from")
+
     def _pickled(self) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the cells and the options that every class has, as `__reduce__` needs them.
 

@@ -15,6 +15,7 @@ from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import real_array
+from warp_lcp.rows.vectors import Sums
 
 HEADERS = Path(__file__).parent / "headers"
 CELLS = {"cells": wp.int8}
@@ -33,6 +34,11 @@ DIAGONAL = RowPass(
 WEIGHTS = RowPass(
     "grid_poisson.weights", HEADERS / "weights.h", "S", reads={**CELLS, **dict.fromkeys(FIELDS, "S")},
     writes=dict.fromkeys(("wx", "wy", "wz"), "S"), constants=GIVEN, **FACES,
+)  # fmt: skip
+FACE_GRADIENT = RowPass(
+    "grid_poisson.face_gradient", HEADERS / "face_gradient.h", wp.float64, reads={**CELLS, "multiplier": wp.float64, "x": wp.float64},
+    writes=dict.fromkeys(("face_x", "face_y", "face_z", "shift"), wp.float64), optional=("face_x", "face_y", "face_z", "shift"),
+    sums=("sum_x", "sum_y", "sum_z", "sum_shift"),
 )  # fmt: skip
 
 
@@ -88,9 +94,49 @@ class GridPoisson(GridOperator):
         faces = [f if isinstance(f, wp.array) else real_array(f, f"face_{axis}") for f, axis in zip(given, AXES, strict=True)]
         numbers = [float(f) if f.ndim == 0 else 0.0 for f in faces]
         self.uniform = (numbers[0], numbers[1], numbers[2])
+        self._given = {f"face_{axis}": tuple(f.shape) for axis, f in zip(AXES, faces, strict=True)}
+        self._given |= {} if shift is None else {"shift": tuple(np.shape(shift))}
         self.faces = [self._stored_face(f, axis) for axis, f in enumerate(faces)]
         self.shift = self._stored_shift(shift)
         self._check_sums()
+
+    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+        """Return (mu_i - mu_j) (x_i - x_j) of each face and mu_i x_i of the shift.
+
+        0 on closed faces; x = mu = 0 in AIR. The first and the last faces of a periodic axis, which are one, have half of it each.
+        """
+        self._check_own()
+        s, arrays = self.stencil, {name: shape for name, shape in self._given.items() if shape}
+        for field in (multiplier, x):
+            s.wrap(field)
+        fields: dict[str, Any] = {"cells": self.cells_around.flatten(), "multiplier": multiplier, "x": x}
+        found: dict[str, Any] = {}
+        if len(arrays) < len(self._given):
+            totals = Sums(Rows.of(self.layout.padding, self.device), 4)
+            values = totals.of(FACE_GRADIENT, **fields | dict.fromkeys(FACE_GRADIENT.writes)).tolist()
+            found = dict(zip(FACE_GRADIENT.writes, values, strict=True))
+        if arrays:
+            rows = Rows.of(self.layout.padding, self.device, more=1)
+            written = {name: self.layout.zeros(wp.float64) if name in arrays else None for name in FACE_GRADIENT.writes}
+            partials = wp.empty(4 * rows.places, dtype=wp.float64, device=self.device)
+            FACE_GRADIENT.bind(rows, **fields, **written, out=partials).launch()
+            found |= {name: self._coefficient_field(name, written[name], shape) for name, shape in arrays.items()}
+        return {name: found.get(name) if name in self._given else None for name in FACE_GRADIENT.writes}
+
+    def _coefficient_field(self, name: str, stored: wp.array[Any], shape: tuple[int, ...]) -> wp.array[Any]:
+        """Return a stored field of coefficients, lower faces' ones, in the shape that was given."""
+        values = stored.numpy().reshape(self.layout.stored_shape)
+        inner, axis = [slice(1, -1)] * 3, -1 if name == "shift" else AXES.index(name[-1])
+        if axis >= 0:
+            inner[2 - axis] = slice(1, None)
+        part = values[tuple(inner)]
+        if axis >= 0 and self.periodic[axis]:
+            np.moveaxis(part, 2 - axis, 0)[[0, -1]] *= 0.5
+        if shape == self.layout.stored_shape:  # padded: of other ghost cells nothing was asked
+            kept = np.zeros(shape)
+            kept[tuple(inner)] = part
+            part = kept
+        return wp.array(np.ascontiguousarray(part).reshape(shape), dtype=wp.float64, device=self.device, copy=self.device.is_cuda)
 
     def floating_components(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the components on which A is singular, or None if there are none.
@@ -113,9 +159,12 @@ class GridPoisson(GridOperator):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle cells and coefficients; these come back in the padded shape."""
         cells, options = self._pickled()
-        faces = {f"face_{axis}": OnHost(f) if f.size else c for axis, f, c in zip(AXES, self.faces, self.uniform, strict=True)}
-        shift = OnHost(self.shift) if self.shift.size else None
-        return made_again(GridPoisson, cells, device=self.device, **faces, shift=shift, **options)
+        given = {name: OnHost(v) if isinstance(v, wp.array) else v for name, v in self._arguments().items()}
+        return made_again(GridPoisson, cells, device=self.device, **given, **options)
+
+    def _arguments(self) -> dict[str, Any]:
+        faces = {f"face_{axis}": f if f.size else c for axis, f, c in zip(AXES, self.faces, self.uniform, strict=True)}
+        return faces | {"shift": self.shift if self.shift.size else None}
 
     def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
         """Return the coefficients of lower faces as a padded array, or an empty array for a number."""

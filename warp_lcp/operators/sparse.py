@@ -217,6 +217,11 @@ class SparseOperator(Pickled):
         pattern = _ones(self._indptr, self._indices)
         return next((size for size in BLOCKS if self.unknowns % size == 0 and pattern.tobsr((size, size)).data.size <= FILL * self.nnz), 1)
 
+    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+        """Return mu_i x_j as `matrix`, for the entries in the order of `indices`, shape (nnz,), float64."""
+        entries = np.repeat(multiplier.numpy(), np.diff(self._indptr)) * x.numpy()[self._indices]
+        return {"matrix": wp.array(entries, dtype=wp.float64, device=self.device)}
+
     def masked(self, free: Any, shift: Any = None) -> SparseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
         p = scipy.sparse.diags_array((self.layout.load(free, wp.uint8, "free").numpy() != 0).astype(np.float64))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, no_type_check
@@ -17,9 +18,10 @@ from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import check_kept, check_storable, real_array
 from warp_lcp.rows.layout import Pattern
+from warp_lcp.rows.vectors import Sums
 
 HEADERS = Path(__file__).parent / "headers"
 DIAGONAL = RowPass(
@@ -27,6 +29,10 @@ DIAGONAL = RowPass(
     optional=("center", "shift"), writes={"made": "S"}, numbers={"number": "S"},
 )  # fmt: skip
 TRANSPOSED = RowPass("stencil.transposed", HEADERS / "stencil_transposed.h", "S", stencil=("D", "W"), reads={"x": "S"}, writes={"y": "S"})
+GRADIENT = RowPass(
+    "stencil.gradient", HEADERS / "stencil_gradient.h", wp.float64, reads={"cells": wp.int8, "multiplier": wp.float64, "x": wp.float64},
+    writes={"part": wp.float64}, optional=("part",), numbers=dict.fromkeys(("step", "row", "plane"), int), sums=("sum",),
+)  # fmt: skip
 CENTER = (0, 0, 0)
 AROUND = Pattern(tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y), symmetric=False, kind="arrays")  # all neighbors in 2-D
 Offset = tuple[int, int, int]  # along x, y, z
@@ -80,7 +86,7 @@ class Stencil(GridOperator):
 
     def _take_coefficients(self, cells: np.ndarray, *, coefficients: Any, shift: Any) -> None:
         self._given = given = _by_offset(coefficients, cells.ndim)
-        self.shift = self._stored_shift(shift)
+        self.shift, self._shift_given = self._stored_shift(shift), None if shift is None else tuple(np.shape(shift))
         functions = {o: _of_three(f, cells.ndim) for o, f in given.items() if isinstance(f, wp.Function)}
         values = {o: real_array(f, f"coefficients[{_named(o, cells.ndim)}]") for o, f in given.items() if o not in functions}
         for o, f in values.items():
@@ -113,6 +119,29 @@ class Stencil(GridOperator):
     def given(self) -> dict[tuple[int, ...], Any]:
         """The coefficients by offset, as they were given."""
         return {_named(offset, len(self.shape)): value for offset, value in self._given.items()}
+
+    def _arguments(self) -> dict[str, Any]:
+        return {"coefficients": self.given, "shift": self.shift if self.shift.size else None, "outside": self.outside}
+
+    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+        """Return mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; of functions, too, by their values.
+
+        Where the neighbor is SOLID, that is mu_i x_i; x = 0 in AIR.
+        """
+        self._check_own()
+        self.stencil.wrap(x)
+        rows, cells = Rows.of(self.layout.padding, self.device), self.cells_around.flatten()
+
+        def of(offset: Offset, shape: tuple[int, ...]) -> Any:
+            part = self.layout.zeros(wp.float64) if shape else None
+            place = dict(zip(("step", "row", "plane"), offset, strict=True))
+            total = Sums(rows, 1).of(GRADIENT, cells=cells, multiplier=multiplier, x=x, part=part, **place)
+            return total.item() if part is None else part.reshape(shape) if part.size == math.prod(shape) else self.layout.unload(part)
+
+        shapes = {o: self.shape if isinstance(f, wp.Function) else tuple(np.shape(f)) for o, f in self._given.items()}
+        given = self._shift_given
+        found = {_named(o, len(self.shape)): of(o, shape) for o, shape in shapes.items()}
+        return {"coefficients": found, "shift": None if given is None else of(CENTER, given)}
 
     def transposed(self) -> Stencil:
         """Return A' as a stencil of arrays, without SOLID cells: its diagonal has what closed sides add."""
@@ -247,7 +276,7 @@ class Stencil(GridOperator):
         given = {o: self._evaluated(_of_three(f, n)).reshape(cells.shape) if isinstance(f, wp.Function) else
                  f.numpy() if isinstance(f, wp.array) else f for o, f in self.given.items()}  # fmt: skip
         shift = OnHost(self.shift) if self.shift.size else None
-        return made_again(Stencil, cells, given, device=self.device, shift=shift, outside=self.outside, **options)
+        return made_again(Stencil, cells, **self._arguments() | {"coefficients": given, "shift": shift}, device=self.device, **options)
 
 
 class StoredStencil(GridOperator):

@@ -35,8 +35,9 @@ class FieldsOnHost(Pickled):
     """A dataclass that pickles its fields, device arrays as host arrays."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the fields in their order, as arguments."""
-        values = [getattr(self, field.name) for field in dataclasses.fields(self)]  # type: ignore[arg-type]
+        """Pickle the fields in their order, as arguments; None for one whose metadata say that it is not pickled."""
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        values = [getattr(self, field.name) if field.metadata.get("pickled", True) else None for field in fields]
         return type(self), tuple(OnHost(v) if isinstance(v, wp.array) else v for v in values)
 
 

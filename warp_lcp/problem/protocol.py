@@ -138,20 +138,11 @@ class HasStencil(HasCells, HasLayout, Versioned, Protocol):
     layout: PaddedLayout
 
 
-class HasFaces(HasCells, HasLayout, Versioned, Protocol):
-    """What a `wl.GridPoisson` on some of the cells is made from, the others taken as AIR: a block of the unknowns.
+class HasBlocks(HasCells, HasLayout, Versioned, Protocol):
+    """Operators on some of the cells, the others taken as AIR: blocks of the unknowns."""
 
-    Attributes:
-        faces: coefficients of the faces normal to x, y, z as padded arrays, empty where they are a number.
-        uniform: those numbers.
-        shift: padded, empty where there is none.
-        periodic: whether x, y, z wrap around.
-    """
-
-    faces: list[wp.array[Any]]
-    uniform: tuple[float, float, float]
-    shift: wp.array[Any]
-    periodic: tuple[bool, bool, bool]
+    def on_cells(self, cells: np.ndarray) -> Any:
+        """Return an operator with the same coefficients on other cells, padded as `cells` is; what it is of no cells changes nothing."""
 
 
 class HasColumns(Operator, Protocol):
@@ -191,12 +182,27 @@ class NamesComponents(Operator, Protocol):
         """
 
 
+class HasCoefficients(Operator, Protocol):
+    """What A is made of, and how a scalar depends on it: for `wl.vjp`."""
+
+    def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
+        """Return the derivatives of mu'A x with respect to what the constructor takes, by the names of its arguments.
+
+        Each has the shape that was given, as a wp.float64 array on A's device, or is a number where a number was given; None where nothing
+        was. Those of a matrix are on its pattern.
+
+        Args:
+            multiplier: mu, stored field, wp.float64, 0 off the unknowns.
+            x: likewise.
+        """
+
+
 FAMILIES = {"dense": "wl.DenseOperator", "sparse": "wl.SparseOperator", "grid": "wl.GridPoisson"}
 CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {  # what to call each, and which of our own families have it
     HasRows: ("rows", ("dense", "sparse")),
     Relaxes: ("a sweep", ("dense", "sparse", "grid")),
     HasStencil: ("a stencil", ("grid",)),
-    HasFaces: ("faces", ("grid",)),
+    HasBlocks: ("blocks", ("grid",)),
     HasColumns: ("a stencil and columns", ()),
     HasLayout: ("a layout", ("dense", "sparse", "grid")),
     Versioned: ("a version", ("sparse", "grid")),
@@ -204,6 +210,7 @@ CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {  # what to c
     AppliesPlus: ("sums with products", ("sparse", "grid")),
     HasScale: ("a scale", ("dense", "sparse")),
     NamesComponents: ("components", ("grid",)),
+    HasCoefficients: ("coefficients", ("dense", "sparse", "grid")),
 }
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from warp_lcp.problem.pickling import FieldsOnHost
-from warp_lcp.problem.protocol import version_of
 
 if TYPE_CHECKING:
     import warp as wp
@@ -74,6 +73,8 @@ class SolveResult(FieldsOnHost):
         history: a Record for the start and one for each step.
         grid: cells (nz, ny, nx) or (ny, nx) of the grid whose compact stencil a sparse matrix was seen to be, and as which it was solved;
             None of others.
+        problem: what was solved, for `wl.vjp`; None where the result was pickled.
+        version: of the problem's operator then, None where it has none.
     """
 
     x: wp.array[Any]
@@ -84,15 +85,8 @@ class SolveResult(FieldsOnHost):
     relative_residual: float
     history: list[Record] = field(repr=False)
     grid: tuple[int, ...] | None = None
-
-    problem: ClassVar[Any] = None  # whose it is, where it was made: not pickled
-    version: ClassVar[int | None] = None  # of its operator then
-
-    def of(self, problem: Any) -> SolveResult:
-        """Remember the problem, for gradients; return the result."""
-        object.__setattr__(self, "problem", problem)
-        object.__setattr__(self, "version", version_of(problem.A) if hasattr(problem, "A") else None)
-        return self
+    problem: Any = field(default=None, repr=False, compare=False, metadata={"pickled": False})
+    version: int | None = field(default=None, repr=False, compare=False)
 
     def __bool__(self) -> bool:
         """Return whether the solve converged."""

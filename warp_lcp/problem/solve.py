@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_lcp.deadline import Deadline, TimeIsUp
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import NamesComponents, has
+from warp_lcp.problem.protocol import NamesComponents, has, version_of
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
@@ -377,7 +377,9 @@ class _Loop:
             self._restore()
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0
-        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history).of(self.problem)
+        version = version_of(self.problem.A) if isinstance(self.problem, LCP) else None
+        found = {"problem": self.problem, "version": version}
+        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history, **found)
 
     def _found(self) -> wp.array[Any]:
         """Return x as the result has it: in place."""

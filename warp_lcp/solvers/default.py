@@ -15,7 +15,7 @@ from warp_lcp.operators.matrix_stencil import stencil_of
 from warp_lcp.operators.renumbering import Renumbering
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasStencil, has, takes
+from warp_lcp.problem.protocol import HasStencil, has, takes, version_of
 from warp_lcp.problem.result import Record, SolveResult
 from warp_lcp.problem.solve import ConvexSetProblem, Solver, Workspace
 from warp_lcp.problem.solve import solve as solve_by
@@ -108,7 +108,7 @@ def _solve_as_grid(
     fields = (field.numpy().reshape(stencil.shape) for field in (problem.b, problem.lower, problem.upper))
     on_grid, start = LCP(stencil, *fields), None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy().reshape(stencil.shape)
     result = solve_by(on_grid, default_method(on_grid), stopping=stopping, x0=start, callback=callback)
-    return replace(result, x=result.x.flatten(), grid=stencil.shape).of(problem) if result else None
+    return replace(result, x=result.x.flatten(), grid=stencil.shape, problem=problem, version=A.version) if result else None
 
 
 def _solve_renumbered(
@@ -123,4 +123,5 @@ def _solve_renumbered(
     if isinstance(stopping, StoppingCriteria) and stopping.max_seconds < math.inf:
         stopping = replace(stopping, max_seconds=max(LEAST, stopping.max_seconds - (time.perf_counter() - begun)))
     result = solve_by(other, solver, stopping=stopping, x0=guess, callback=callback)
-    return replace(result, x=wp.array(result.x.numpy()[numbering.place], dtype=result.x.dtype, device=problem.device)).of(problem)
+    x = wp.array(result.x.numpy()[numbering.place], dtype=result.x.dtype, device=problem.device)
+    return replace(result, x=x, problem=problem, version=version_of(problem.A))

@@ -10,10 +10,10 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
+from warp_lcp.operators.grid_poisson import AIR, FLUID
 from warp_lcp.operators.sparse import SparseOperator, greedy_colors
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasFaces, HasRows, described, has, version_of
+from warp_lcp.problem.protocol import HasBlocks, HasRows, described, has, version_of
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import rows_of
@@ -142,17 +142,13 @@ class GridBlock:
 
     def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
         A = whole.A
-        assert has(A, HasFaces)
+        assert has(A, HasBlocks)
         layout = whole.layout
         self._whole, self._x = whole, x
         member = np.zeros(layout.size, dtype=np.uint8)
         member[rows] = 1
         self._member = wp.array(member, dtype=wp.uint8, device=whole.device)
-        inner = tuple(slice(1, -1) for _ in range(3))
-        cells = self._cells().reshape(layout.stored_shape)[inner].reshape(A.shape)
-        faces = {f"face_{axis}": f if f.size else c for axis, f, c in zip("xyz", A.faces, A.uniform, strict=True)}
-        shift = A.shift if A.shift.size else None
-        sub = GridPoisson(cells, **faces, shift=shift, periodic=A.periodic, device=whole.device, dtype=A.dtype)
+        sub = A.on_cells(self._cells())
         self._b, self._y, self._z, self._guess = (layout.zeros(wp.float64) for _ in range(4))
         stored = layout.stored_shape
         self.problem = LCP(sub, self._b.reshape(stored), whole.lower.reshape(stored), whole.upper.reshape(stored))
@@ -161,7 +157,7 @@ class GridBlock:
     def refresh(self) -> None:
         """Take A's coefficients again; cells that are no longer FLUID leave the block, new ones belong to none."""
         A = self._whole.A
-        assert has(A, HasFaces)
+        assert has(A, HasBlocks)
         if A.version != self._version:
             self._version = A.version
             cells = self._cells().reshape(self._whole.layout.stored_shape)
@@ -204,8 +200,8 @@ def block_problem(whole: LCP, x: wp.array[Any], rows: np.ndarray) -> Block:
     Raises:
         ValueError: the operator has no principal sub-operators.
     """
-    if has(whole.A, HasFaces):
+    if has(whole.A, HasBlocks):
         return GridBlock(whole, x, rows)
     if has(whole.A, HasRows):
         return MatrixBlock(whole, x, rows)
-    raise ValueError(f"{type(whole.A).__name__} cannot be taken apart: blocks need {described(HasRows, HasFaces)}")
+    raise ValueError(f"{type(whole.A).__name__} cannot be taken apart: blocks need {described(HasRows, HasBlocks)}")

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasFaces, HasRows, check_taken
+from warp_lcp.problem.protocol import HasBlocks, HasRows, check_taken
 from warp_lcp.problem.solve import IterateMemory, Solver, Step
 from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solvers.coupled_problem import StaggeredRound
@@ -35,7 +35,7 @@ class Staggering(Settings):
         max_block_iterations: the most steps in a block.
     """
 
-    supports: ClassVar = (HasRows, HasFaces)
+    supports: ClassVar = (HasRows, HasBlocks)
     needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence"
     affine_bounds: ClassVar[bool] = True
 

@@ -1,0 +1,71 @@
+"""Solutions as JAX functions of the host, with gradients by `wl.vjp`; they can be traced. Needs JAX, the extra `jax`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.gradients.names import flat, nested
+from warp_lcp.gradients.vjp import vjp
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveResult
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.solvers.default import solve as solve_problem
+
+
+def solve(
+    A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, *, coefficients: Mapping[str, Any] | None = None,
+    adjoint: StoppingCriteria | None = None, **options: Any,
+) -> Any:  # fmt: skip
+    """Return x of y = A x + b with bounds as an array of b's type, with gradients to all that is given.
+
+    Callbacks are pure: going back begins with a solve from x, which takes no step where x has not been rounded to float32.
+
+    Args:
+        A: an operator, or what makes one of `coefficients`, say `functools.partial(wl.GridPoisson, cells)`; on any device.
+        b: as of `wl.LCP`.
+        lower: an array or a number.
+        upper: likewise.
+        coefficients: arguments of A by name, arrays or numbers.
+        adjoint: criteria of the linear solve of the gradients.
+        options: of `wl.solve`.
+
+    Raises:
+        Exception: JAX's own, with the message of an ArithmeticError where a solve does not converge, or of a ValueError.
+    """
+    import jax
+
+    given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
+    names, values = tuple(given), tuple(map(jax.numpy.asarray, given.values()))
+
+    def solved(data: Sequence[Any], x0: Any = None) -> SolveResult:
+        host = [np.asarray(v) for v in data]
+        parts = nested(names[3:], host[3:])
+        result = solve_problem(LCP(A(**parts) if parts else A, *host[:3]), **{**options, **({} if x0 is None else {"x0": np.asarray(x0)})})
+        if not result:
+            raise ArithmeticError(f"the solve ended with {result.status.name}: {result.status.value}")
+        return result
+
+    def derived(data: Sequence[Any], x: Any, cotangent: Any) -> tuple[Any, ...]:
+        found = vjp(solved(data, x), np.asarray(cotangent), stopping=adjoint).by_name
+        parts = (found[name] for name in names)
+        return tuple(np.asarray(p.numpy() if isinstance(p, wp.array) else p, dtype=v.dtype) for p, v in zip(parts, data, strict=True))
+
+    @jax.custom_vjp
+    def solution(data: Sequence[Any]) -> Any:
+        like = jax.ShapeDtypeStruct(data[0].shape, data[0].dtype)
+        return jax.pure_callback(lambda d: solved(d).x.numpy().astype(like.dtype), like, data)
+
+    def forward(data: Sequence[Any]) -> Any:
+        x = solution(data)
+        return x, (data, x)
+
+    def backward(kept: Any, cotangent: Any) -> Any:
+        like = tuple(jax.ShapeDtypeStruct(v.shape, v.dtype) for v in kept[0])
+        return (jax.pure_callback(derived, like, *kept, cotangent),)
+
+    solution.defvjp(forward, backward)
+    return solution(values)

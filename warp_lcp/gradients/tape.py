@@ -1,0 +1,57 @@
+"""Solves on a tape of Warp's: `Tape.backward` goes through them by `wl.vjp`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.gradients.names import flat
+from warp_lcp.gradients.vjp import vjp
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveResult
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.rows.vectors import ADD, convert, rows_of
+from warp_lcp.solvers.default import solve as solve_problem
+
+
+def solve(
+    tape: wp.Tape, A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, *, coefficients: Mapping[str, Any] | None = None,
+    adjoint: StoppingCriteria | None = None, **options: Any,
+) -> SolveResult:  # fmt: skip
+    """Solve y = A x + b with bounds and record that; `tape.backward` adds to the gradients of what has one.
+
+    Call it outside of the tape's `with`, which would record, and keep, each launch of the solve.
+
+    Args:
+        tape: continued by what follows the solve.
+        A: an operator, or what makes one of `coefficients`, say `functools.partial(wl.GridPoisson, cells)`.
+        b: as of `wl.LCP`; like bounds and coefficients an array with `requires_grad=True` if its gradient is wanted.
+        lower: likewise.
+        upper: likewise.
+        coefficients: arguments of A by name.
+        adjoint: criteria of the linear solve of the gradients.
+        options: of `wl.solve`.
+
+    Returns:
+        The result, whose x has a gradient.
+
+    Raises:
+        ValueError: as of `wl.LCP` and `wl.solve`, and while going back as of `wl.vjp`.
+    """
+    given = flat({"b": b, "lower": lower, "upper": upper, **(coefficients or {})})
+    result = solve_problem(LCP(A(**coefficients) if coefficients else A, b, lower, upper), **options)
+    result.x.requires_grad = True
+    wanted = {name: v for name, v in given.items() if isinstance(v, wp.array) and v.requires_grad}
+
+    def backward() -> None:
+        found = vjp(result, result.x.grad, stopping=adjoint).by_name
+        for name, array in wanted.items():
+            part = wp.empty_like(array.grad.flatten())
+            convert(found[name].flatten(), part)
+            ADD.bind(rows_of(part), z=part, x=array.grad.flatten()).launch()
+
+    tape.record_func(backward, [result.x, *wanted.values()])
+    return result
