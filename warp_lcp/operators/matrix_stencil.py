@@ -25,6 +25,7 @@ RECOGNIZE = RowPass(
     numbers={**dict.fromkeys(("nx", "ny", "nz", "full", "kept"), int), "size": wp.int64}, sums=("wrong", "centers", "differ", "positive"),
 )  # fmt: skip
 LEAST = 3  # cells of an axis: with fewer, offsets along it and across it are the same
+LOWER = ((-1, 0, 0), (0, -1, 0), (0, 0, -1))  # neighbors of lower faces
 SAMPLED = 8  # rows from the middle one on whose offsets tell the box: side by side, for most are not on its border then
 
 
@@ -111,9 +112,15 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
     sizes = [float(np.abs(w.numpy()).sum()) / A.unknowns if differ else abs(w) for w in weights]
     strength = tuple(sum(s for s, o in zip(sizes, neighbors, strict=True) if o[axis]) / (1 if A.symmetric else 2) for axis in range(3))
     cells = np.full(shape if nz > 1 else shape[1:], FLUID, dtype=np.int8)
-    pattern = Pattern(neighbors, A.symmetric, "arrays" if differ else "numbers")
+    pattern: Pattern | None = Pattern(neighbors, A.symmetric, "arrays" if differ else "numbers")
+    faces = 1.0  # of a cell
+    if A.symmetric and not positive and set(neighbors) <= set(LOWER):  # as of a GridPoisson
+        none, along = padding.zeros(wp.float64, device) if differ else 0.0, dict(zip(neighbors, weights, strict=True))
+        pattern, weights = None, tuple(along.get(o, none) for o in LOWER)
+        used = {w for w in weights if w} if not differ else set()
+        faces = float(middle[13]) / used.pop() if len(used) == 1 else 0.0
     unit = 1.0
-    if not centers:  # a byte a cell
-        inside, unit = d.numpy() != 0, float(middle[13])
-        d = wp.array(inside.astype(np.uint8), device=device)
+    if not centers and faces in range(1, 256):  # a byte a cell
+        unit = float(middle[13]) / faces
+        d = wp.array(np.where(d.numpy() != 0, faces, 0).astype(np.uint8), device=device)
     return StoredStencil(cells, d, weights, pattern, unit=unit, symmetric=A.symmetric, monotone=not positive, strength=strength)  # type: ignore[arg-type]

@@ -19,6 +19,7 @@ from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import Layout, check_kept, check_storable, real_array
 from warp_lcp.rows.program import Launch
+from warp_lcp.rows.vectors import Sums
 
 INDICES = wp.array(dtype=wp.int32)
 
@@ -47,6 +48,10 @@ PRODUCT = RowPass(
 RELAX = RowPass(
     "sparse.relax", HEADERS / "relax.h", "S", optional=("list",), numbers={"omega": wp.float64, "forward": bool, "first": int},
     whole={**ROWS, "a": "A", "d": "A", "list": wp.int32, **dict.fromkeys(("b", "lower", "upper", "x"), "S")},
+)  # fmt: skip
+SURVEY = RowPass(
+    "sparse.survey", HEADERS / "survey.h", wp.float64, whole={**ROWS, "a": wp.float64},
+    writes=dict.fromkeys(("largest", "diagonal"), wp.float64), sums=("differ", "more"),
 )  # fmt: skip
 BLOCKS, FILL = (6, 5, 4, 3, 2), 1.2  # sizes of nodes' blocks, and the most entries that these may have in units of A's
 GATHER = RowPass("sparse.gather", HEADERS / "gather.h", "S", whole={"source": "S"}, reads={"order": wp.int32}, writes={"taken": "S"})
@@ -94,9 +99,8 @@ class SparseOperator(Pickled):
         self.near_null_space = None if near_null_space is None else _near_null_space(near_null_space, host.shape[0])
         self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
         self.layout = Layout(self.shape, self.device)
-        self.indptr = wp.array(host.indptr, dtype=wp.int32, device=self.device)
-        self.indices = wp.array(host.indices, dtype=wp.int32, device=self.device)
-        self.values = wp.array(host.data, dtype=dtype, device=self.device)
+        parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, dtype)
+        self.indptr, self.indices, self.values = (wp.array(v, dtype=t, device=self.device, copy=self.device.is_cuda) for v, t in parts)
         self._indptr, self._indices = host.indptr, host.indices
         self._diagonal = wp.zeros(self.unknowns, dtype=dtype, device=self.device)
         self._transpose_values: wp.array[Any] | None = None
@@ -273,11 +277,11 @@ class SparseOperator(Pickled):
 
     def _take(self, host: scipy.sparse.csr_array) -> None:
         """Derive what follows from the entries."""
-        largest = _largest(host)
-        self.symmetric = _is_symmetric(host, largest)
+        largest, diagonal, same = _survey(host)
+        self.symmetric = same or _is_symmetric(host, largest)
         check_kept(largest, self.dtype, "matrix, the largest entries of its rows")
         self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
-        self._diagonal.assign(host.diagonal().astype(wp.dtype_to_numpy(self.dtype)))
+        self._diagonal.assign(diagonal.astype(wp.dtype_to_numpy(self.dtype)))
         if self._transpose_values is not None:
             self._gather(self._transpose[2])
         self._scale = None
@@ -348,20 +352,19 @@ def _ones(indptr: np.ndarray, indices: np.ndarray) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array((np.ones(len(indices), dtype=np.float32), indices, indptr), shape=(n, n))
 
 
-def _largest(host: scipy.sparse.csr_array) -> np.ndarray:
-    """Return the largest magnitude of each row."""
-    largest, filled = np.zeros(host.shape[0]), np.diff(host.indptr) > 0
-    if host.nnz:
-        largest[filled] = np.maximum.reduceat(np.abs(host.data), host.indptr[:-1][filled])
-    return largest
+def _survey(host: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return the largest magnitude of each row, the diagonal, and whether all entries equal those across it."""
+    parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, wp.float64)
+    ptr, col, a = (wp.array(v, dtype=t, device="cpu", copy=False) for v, t in parts)
+    largest, diagonal = (wp.empty(host.shape[0], dtype=wp.float64, device="cpu") for _ in range(2))
+    found = Sums(Rows.flat(largest.size, largest.device), 2).of(SURVEY, ptr=ptr, col=col, a=a, largest=largest, diagonal=diagonal)
+    return largest.numpy(), diagonal.numpy(), not found.any()
 
 
 def _is_symmetric(host: scipy.sparse.csr_array, largest: np.ndarray) -> bool:
     """Return whether |a_ij - a_ji| is rounding of the smaller one of the largest entries of rows i and j, for all i, j."""
     turned = host.T.tocsr()
     if np.array_equal(turned.indptr, host.indptr) and np.array_equal(turned.indices, host.indices):
-        if np.array_equal(turned.data, host.data):
-            return True
         largest_here = np.repeat(largest, np.diff(host.indptr))
         return is_rounding(turned.data - host.data, largest_here, largest[host.indices])
     difference = (host - turned).tocoo()

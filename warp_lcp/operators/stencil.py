@@ -286,7 +286,7 @@ class StoredStencil(GridOperator):
         cells: as of `Stencil`; beyond the array there is AIR.
         d: diagonal in units of `unit`, stored; 0 off the FLUID cells.
         weights: of the pattern's neighbors, stored, or numbers.
-        pattern: which neighbors, and how their weights are had.
+        pattern: which neighbors, and how their weights are had; None: weights along x, y, z of 5 or 7 points, as `PaddedStencil` has them.
         symmetric: whether A is.
         unit: of the diagonal.
         monotone: whether all weights are >= 0.
@@ -296,7 +296,7 @@ class StoredStencil(GridOperator):
     outside = AIR
 
     def __init__(
-        self, cells: np.ndarray, d: wp.array[Any], weights: tuple[Any, ...], pattern: Pattern, *, symmetric: bool, unit: float = 1.0,
+        self, cells: np.ndarray, d: wp.array[Any], weights: tuple[Any, ...], pattern: Pattern | None, *, symmetric: bool, unit: float = 1.0,
         monotone: bool = False, strength: tuple[float, float, float] = (1.0, 1.0, 1.0),
     ) -> None:  # fmt: skip
         self.symmetric, self.monotone = symmetric, monotone
@@ -318,7 +318,7 @@ class StoredStencil(GridOperator):
 
     def _empty_stencil(self) -> PaddedStencil:
         d, weights, pattern, strength = self._made
-        fields, numbers = (weights, ()) if pattern.names else (None, weights)
+        fields, numbers = (None, weights) if isinstance(weights[0], float) else (weights, ())
         return PaddedStencil(self.layout.padding, d, fields, numbers, self._unit, spans=self._spans, strength=strength, pattern=pattern)
 
     def _fill_stencil(self) -> None:
