@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import Reduction, rows_of
 
@@ -104,7 +105,7 @@ class ConjugateGradient:
 
     def __init__(self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None) -> None:
         self._product, self._preconditioner, r = product, preconditioner, preconditioner.r
-        self.device, self.x, self._p, self._q = r.device, wp.zeros_like(r), wp.zeros_like(r), wp.zeros_like(r)
+        self.device, self.x, self._p, self._q = r.device, zeros_like(r), zeros_like(r), zeros_like(r)
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=r.device)
         self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
         self._reduction = Reduction(r.size, r.device, self._scalars)

@@ -11,6 +11,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.krylov.conjugate_gradient import HEADERS, LinearMap, Preconditioner
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.fields import zeros, zeros_like
 from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 RESIDUAL = RowPass("gmres.residual", HEADERS / "residual.h", "S", reads={"b": "S", "w": "S"}, writes={"q": "S"}, optional=("w",))
@@ -25,6 +26,7 @@ STORE = RowPass(
     "gmres.store", HEADERS / "store.h", "S", whole={"basis": "S", "sums": wp.float64}, reads={"x": "S"},
     numbers={"size": wp.int64, "place": wp.int64, "last": int},
 )  # fmt: skip
+KEPT = 8  # vectors of whom the preconditioned ones are kept: solves that take no more of them need no last preconditioning
 STALLED = 0.99  # a restart that leaves more than this share of the residual gains nothing that another one would not
 
 
@@ -46,10 +48,11 @@ class GMRES:
     ) -> None:
         r = preconditioner.r
         self._product, self._preconditioner, self._restart = product, preconditioner, restart
-        self.device, self.x = r.device, wp.zeros_like(r)
-        self._b, self._q = wp.zeros_like(r), wp.zeros_like(r)
+        self.device, self.x = r.device, zeros_like(r)
+        self._b, self._q = zeros_like(r), zeros_like(r)
         self._weight = weight
-        self._basis = wp.zeros((restart + 1) * r.size, dtype=r.dtype, device=r.device)  # fields, one after another
+        self._basis = zeros((restart + 1) * r.size, r.dtype, r.device)  # fields, one after another
+        self._images = zeros(min(KEPT, restart) * r.size, r.dtype, r.device)  # the first ones, preconditioned
         self._sums = Sums(rows_of(r), restart + 1, slots=restart + 2)  # products with them, and a square at last
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
         self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
@@ -92,6 +95,8 @@ class GMRES:
             wp.copy(self._preconditioner.r, self._basis, src_offset=k * self._q.size, count=self._q.size)
             self._weigh(self._preconditioner.r, inverse=True)
             self._preconditioner.apply()
+            if k < KEPT:
+                wp.copy(self._images, self._preconditioner.z, dest_offset=k * self._q.size, count=self._q.size)
             self._product(self._preconditioner.z, self._q)
             self._weigh(self._q)
             H[: k + 2, k] = self._orthogonalize(k + 1)
@@ -109,23 +114,21 @@ class GMRES:
         """Take the first vectors out of `_q`, twice, and store the rest as the next one; return the column of H."""
         column = np.zeros(count)
         for _ in range(2):
-            DOTS.bind(rows_of(self._q), **self._fields, count=count, x=self._q, out=self._sums.partials).launch()
+            DOTS.bind(rows_of(self._q), basis=self._basis, size=self._q.size, count=count, x=self._q, out=self._sums.partials).launch()
             self._sums.add_up(0, columns=count)
             self._combine(self._sums.scalars, self._q, count, sign=-1.0)
             column += self._sums.scalars.numpy()[:count]
         return np.r_[column, np.sqrt(self._stored(count)[-1])]
 
-    @property
-    def _fields(self) -> dict[str, Any]:
-        return {"basis": self._basis, "size": self._q.size}
-
-    def _combine(self, factors: wp.array[Any], x: wp.array[Any], count: int, *, sign: float = 1.0) -> None:
+    def _combine(self, factors: wp.array[Any], x: wp.array[Any], count: int, *, sign: float = 1.0, of: wp.array[Any] | None = None) -> None:
         """x += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
-        self._sums.of(COMBINE, self._restart + 1, **self._fields, factors=factors, x=x, count=count, sign=sign)
+        fields = {"basis": self._basis if of is None else of, "size": x.size}
+        self._sums.of(COMBINE, self._restart + 1, **fields, factors=factors, x=x, count=count, sign=sign)
 
     def _stored(self, place: int) -> np.ndarray:
         """Store `_q`, normalized, as a vector; return the sums."""
-        STORE.bind(rows_of(self._q), **self._fields, place=place, sums=self._sums.scalars, x=self._q, last=self._restart + 1).launch()
+        given = {"basis": self._basis, "size": self._q.size, "place": place, "sums": self._sums.scalars, "x": self._q}
+        STORE.bind(rows_of(self._q), **given, last=self._restart + 1).launch()
         return self._sums.scalars.numpy()
 
     def _rotate(self, k: int) -> None:
@@ -149,6 +152,9 @@ class GMRES:
             if abs(H[k, k]) > 1e-14 * largest:
                 y[k] = (g[k] - H[k, k + 1 :] @ y[k + 1 : columns]) / H[k, k]
         self._factors.assign(y)
+        if columns <= KEPT:
+            self._combine(self._factors, self.x, columns, of=self._images)
+            return
         r = self._preconditioner.r
         r.zero_()
         self._combine(self._factors, r, columns)

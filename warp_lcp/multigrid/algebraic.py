@@ -23,6 +23,7 @@ from warp_lcp.multigrid.coarsest_kernels import PINNED
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.sparse import GATHER, PRODUCT, ROWS, SparseOperator
 from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows.fields import kept, zeros
 from warp_lcp.rows.program import Launch, Program
 
 HEADERS = Path(__file__).parent / "headers"
@@ -53,8 +54,8 @@ class DeviceMatrix:
 
     def __init__(self, host: Matrix, real: Any, device: wp.Device) -> None:
         self.shape, self.device = host.shape, device
-        self.indptr, self.indices = (wp.array(v, dtype=wp.int32, device=device) for v in (host.indptr, host.indices))
-        self.values = wp.array(host.data, dtype=real, device=device)
+        self.indptr, self.indices = (kept(v, wp.int32, device) for v in (host.indptr, host.indices))
+        self.values = kept(host.data, real, device)
         self.rows, self.operands = Rows.flat(self.shape[0], device), {"ptr": self.indptr, "col": self.indices, "a": self.values}
 
     def product(self, x: wp.array[Any], y: wp.array[Any], launch: Launch, *, add: bool = False) -> None:
@@ -88,7 +89,7 @@ class AlgebraicLevel:
     def __init__(self, host: Matrix, real: Any, device: wp.Device) -> None:
         self.size, self.device = host.shape[0], device
         self.A = DeviceMatrix(host, real, device)
-        self.x, self.b, self.t, self.inverse = (wp.zeros(self.size, dtype=real, device=device) for _ in range(4))
+        self.x, self.b, self.t, self.inverse = (zeros(self.size, real, device) for _ in range(4))
         self.P: DeviceMatrix | None = None
 
     def connect(self, hosts: tuple[Matrix, ...], coarse: AlgebraicLevel, real: Any) -> None:
@@ -135,8 +136,8 @@ class AlgebraicHierarchy:
         self.levels = _coarsen(A, host, pattern, real, self.settings, self._most)
         self._gamma = self.settings.gamma if A.symmetric else self.settings.gamma_unsymmetric
         n, last = A.unknowns, self.levels[-1].size
-        self.scale = wp.zeros(n, dtype=real, device=self.device)
-        self.weight = wp.zeros(n, dtype=real, device=self.device)
+        self.scale = zeros(n, real, self.device)
+        self.weight = zeros(n, real, self.device)
         self.inverts = last <= self._most
         shape = (last, last) if self.inverts else (0, 0)
         self._matrix, self._inverse = (wp.zeros(shape, dtype=wp.float64, device=self.device) for _ in range(2))

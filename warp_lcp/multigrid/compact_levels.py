@@ -12,7 +12,7 @@ from warp_lcp.multigrid.coarsest_kernels import PINNED
 from warp_lcp.multigrid.cycle_passes import ASSEMBLE, ELIMINATE, SOLVE
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import Bound, Rows
-from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.fields import Padding, zeros
 from warp_lcp.rows.layout import Pattern
 from warp_lcp.rows.program import Launch
 
@@ -32,7 +32,7 @@ def coarser_pattern(pattern: Pattern, factors: Counts) -> Pattern:
 def weights_block(pattern: Pattern, padding: Padding, real: Any, device: wp.Device) -> tuple[wp.array[Any], tuple[wp.array[Any], ...]]:
     """Return memory for a pattern's weights, one field after another, and each of them."""
     n, count = padding.size, len(pattern.offsets)
-    block = wp.zeros(count * n, dtype=real, device=device)
+    block = zeros(count * n, real, device)
     return block, tuple(block[i * n : (i + 1) * n] for i in range(count))
 
 

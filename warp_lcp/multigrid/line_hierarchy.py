@@ -22,7 +22,7 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.stencil import AROUND
 from warp_lcp.problem.protocol import HasStencil, Operator, has
 from warp_lcp.rows import Bound, RowPass, Rows
-from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.fields import Padding, zeros
 from warp_lcp.rows.program import Program
 
 HEADERS = Path(__file__).parent / "headers"
@@ -74,7 +74,7 @@ class LineLevel:
     def __init__(self, padding: Padding, real: Any, device: wp.Device, *, symmetric: bool) -> None:
         self.padding, self.device, n = padding, device, padding.size
         self.factors = 2 if padding.counts[2] > SHORT else 1, 2 if padding.counts[1] > SHORT else 1
-        make = lambda count: wp.zeros(count * n, dtype=real, device=device)  # noqa: E731
+        make = lambda count: zeros(count * n, real, device)  # noqa: E731
         self.weights, self.shares = make(8), make(4)
         self.restricts = self.shares if symmetric else make(4)
         self.x, self.b, self.t, self.d = (padding.zeros(real, device) for _ in range(4))

@@ -15,7 +15,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import StoredStencil
 from warp_lcp.problem.protocol import FLUID
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.fields import Padding, zeros
 from warp_lcp.rows.layout import Pattern
 from warp_lcp.rows.vectors import Sums
 
@@ -106,7 +106,7 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
     neighbors = tuple((o % 3 - 1, o // 3 % 3 - 1, o // 9 - 1) for o in places)
     weights: tuple[Any, ...] = tuple(-middle[o] for o in places)
     if differ:
-        block = wp.zeros(len(places) * padding.size, dtype=wp.float64, device=device)
+        block = zeros(len(places) * padding.size, wp.float64, device)
         sums.of(RECOGNIZE, **given, weights=block)
         weights = tuple(block[i * padding.size : (i + 1) * padding.size] for i in range(len(places)))
     sizes = [float(np.abs(w.numpy()).sum()) / A.unknowns if differ else abs(w) for w in weights]

@@ -17,7 +17,7 @@ from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Layout, check_kept, check_storable, real_array
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, kept, real_array, zeros, zeros_like
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
 
@@ -102,7 +102,7 @@ class SparseOperator(Pickled):
         parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, dtype)
         self.indptr, self.indices, self.values = (wp.array(v, dtype=t, device=self.device, copy=self.device.is_cuda) for v, t in parts)
         self._indptr, self._indices = host.indptr, host.indices
-        self._diagonal = wp.zeros(self.unknowns, dtype=dtype, device=self.device)
+        self._diagonal = zeros(self.unknowns, dtype, self.device)
         self._transpose_values: wp.array[Any] | None = None
         self.version = 0
         self._scale: np.ndarray | None = None
@@ -171,7 +171,7 @@ class SparseOperator(Pickled):
         out = self._result(x, out)
         indptr, indices, order = self._transpose
         if self._transpose_values is None:
-            self._transpose_values = wp.zeros_like(self.values)
+            self._transpose_values = zeros_like(self.values)
             self._gather(order)
         PRODUCT.bind(Rows.flat(x.size, self.device), ptr=indptr, col=indices, a=self._transpose_values, x=x, plus=None, y=out).launch()
         return out
@@ -295,7 +295,7 @@ class SparseOperator(Pickled):
         """Rows and columns of A', and which of A's entries each of its entries is."""
         numbered = scipy.sparse.csr_array((np.arange(self.nnz), self._indices, self._indptr), shape=self.shape * 2)
         turned = numbered.T.tocsr()
-        parts = [wp.array(v, dtype=wp.int32, device=self.device) for v in (turned.indptr, turned.indices, turned.data)]
+        parts = [kept(v, wp.int32, self.device) for v in (turned.indptr, turned.indices, turned.data)]
         return parts[0], parts[1], parts[2]
 
     @property
@@ -356,7 +356,7 @@ def _survey(host: scipy.sparse.csr_array) -> tuple[np.ndarray, np.ndarray, bool]
     """Return the largest magnitude of each row, the diagonal, and whether all entries equal those across it."""
     parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, wp.float64)
     ptr, col, a = (wp.array(v, dtype=t, device="cpu", copy=False) for v, t in parts)
-    largest, diagonal = (wp.empty(host.shape[0], dtype=wp.float64, device="cpu") for _ in range(2))
+    largest, diagonal = (zeros(host.shape[0], wp.float64, wp.get_device("cpu")) for _ in range(2))
     found = Sums(Rows.flat(largest.size, largest.device), 2).of(SURVEY, ptr=ptr, col=col, a=a, largest=largest, diagonal=diagonal)
     return largest.numpy(), diagonal.numpy(), not found.any()
 

@@ -39,6 +39,16 @@ def zeros(n: int, dtype: Any, device: wp.Device, *, small_pages: bool = False) -
     return wp.array(host, dtype=dtype, device=device, copy=False)
 
 
+def zeros_like(field: wp.array[Any]) -> wp.array[Any]:
+    """Return zeros in the shape of a field, by `zeros`."""
+    return zeros(field.size, field.dtype, field.device).reshape(field.shape)
+
+
+def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> wp.array[Any]:
+    """Return a copy of an array of the host on a device; on the CPU in NumPy's memory, as `zeros`."""
+    return wp.array(np.array(host, dtype=wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=not device.is_cpu)
+
+
 def real_array(values: Any, name: str) -> np.ndarray:
     """Return an array (numpy, Warp), or what makes one (a list, a data frame), as a numpy array of real numbers of any type.
 

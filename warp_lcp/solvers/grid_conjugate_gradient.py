@@ -12,6 +12,7 @@ from warp_lcp.krylov.conjugate_gradient import first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import RowPass, Wave
+from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Program
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as engine
@@ -69,7 +70,7 @@ class GridConjugateGradient:
     def __init__(self, source: PaddedStencil, hierarchy: Hierarchy, *, weighted: bool) -> None:
         finest, device = hierarchy.finest, hierarchy.device
         r, s = finest.b, finest.stencil
-        self.device, self.x, self._p = device, wp.zeros_like(r), wp.zeros_like(r)
+        self.device, self.x, self._p = device, zeros_like(r), zeros_like(r)
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=device)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         sums = Reduction(r.size, device, self._scalars, columns=4, threads=s.rows.places)

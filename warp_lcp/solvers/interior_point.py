@@ -22,6 +22,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.rows import Known, RowPass, Wave
+from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
 from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
@@ -174,7 +175,7 @@ class InteriorPointWorkspace(IterateMemory):
         self._w, self._s = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
-        self._predicted = wp.zeros_like(self.system.e)
+        self._predicted = zeros_like(self.system.e)
         self._carries = isinstance(self.system, GridSystem) and problem.A.symmetric  # conjugate gradients leave the residual in r
         fused = isinstance(self.system, GridSystem) and self.system.fused
         self._upper, self._fusable = upper, fused and problem.bounded and settings.mehrotra and self._rounded is None

@@ -21,6 +21,7 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
 from warp_lcp.solvers import projected_multigrid_kernels as engine
@@ -193,8 +194,8 @@ class MPRGPWorkspace(IterateMemory):
         z = self.preconditioner.z
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
         self._best: wp.array[Any] = self._fields[0]
-        self._p, self._q = wp.zeros_like(z), wp.zeros_like(z)
-        self._chopped = z if self.is_grid else wp.zeros_like(z)  # a multigrid cycle leaves nothing of what was in z
+        self._p, self._q = zeros_like(z), zeros_like(z)
+        self._chopped = z if self.is_grid else zeros_like(z)  # a multigrid cycle leaves nothing of what was in z
         slack = SINGLE_SLACK if precision is Precision.SINGLE else 0.0
         residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=slack)
         super().__init__(problem, precision, x=self._best, residual=residual)

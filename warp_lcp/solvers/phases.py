@@ -422,7 +422,7 @@ class CoarseStencilProblem(CoarseProblem):
 
     def __init__(self, A: HasStencil, system: LineSystem, settings: MinimumMapNewton) -> None:
         self._system, self._hierarchy = system, system.hierarchy
-        super().__init__(A, settings, coarse=True)
+        super().__init__(A, settings)
 
     def start(self) -> None:
         """A correction is due at once, others where the set creeps."""

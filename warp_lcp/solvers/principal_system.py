@@ -29,6 +29,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.dense_problem import equilibration, factored
@@ -113,7 +114,7 @@ class GridSystem(KrylovSystem):
         self._version = A.version
         self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
-        self._weight = wp.zeros_like(self.r) if shifted else None
+        self._weight = zeros_like(self.r) if shifted else None
         self.fused = self.hierarchy.open_cycle is not None and A.symmetric  # one CPU thread, no ghost cells to fill
         self._iterate_by(self._krylov_method(), self._weight)
 
@@ -171,7 +172,7 @@ class LineSystem(KrylovSystem):
         self.hierarchy = LineHierarchy(A.stencil, real, symmetric=A.symmetric, settings=settings)
         finest = self.hierarchy.finest
         self.r, self.z = finest.b, finest.x
-        self._weight = wp.zeros_like(self.r) if shifted else None
+        self._weight = zeros_like(self.r) if shifted else None
         method = ConjugateGradient if A.symmetric else GMRES
         self._iterate_by(method(finest.stencil.product, self, weight=self._weight), self._weight)
 
@@ -201,9 +202,9 @@ class CoupledGridSystem(KrylovSystem):
         self._grid, self._low, self._A = GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted), low, A
         self.r, self.z = self._grid.r, self._grid.z
         self._correction, self._begins = LowRankCorrection(low, self._grid.hierarchy), True
-        self._extra = wp.zeros_like(self.r)
+        self._extra = zeros_like(self.r)
         self._free: wp.array[Any] | None = None
-        self._weight = wp.zeros_like(self.r) if shifted else None
+        self._weight = zeros_like(self.r) if shifted else None
         self._iterate_by(ConjugateGradient(self._product, self, weight=self._weight), self._weight)
         self._take_diagonal()
 

@@ -17,6 +17,7 @@ from warp_lcp.multigrid.aggregates import suits_multigrid
 from warp_lcp.multigrid.algebraic import AlgebraicHierarchy
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch
 
 # symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
@@ -87,7 +88,7 @@ class IncompleteFactors:
 
     def __init__(self, A: SparseOperator, real: Any) -> None:
         self._A = A
-        self.r, self.z, self.weight = (wp.zeros(A.unknowns, dtype=real, device=A.device) for _ in range(3))
+        self.r, self.z, self.weight = (zeros(A.unknowns, real, A.device) for _ in range(3))
         self._solve: Any = None
         self._free = np.zeros(0, dtype=np.intp)
 
