@@ -69,6 +69,7 @@ def main():
     begun = time.perf_counter()
     nx, ny, levels = request["coarsest"][0], request["coarsest"][1], request["levels"]
     dm = PETSc.DMDA().create([nx, ny], dof=1, stencil_width=1)
+    snes: Any = None
     x: Any = None
     guess, steps = None, []
     for level in range(levels):
