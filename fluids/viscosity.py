@@ -135,6 +135,8 @@ class Viscosity:
             norm, lost, driven, _ = self._force(inner, given, changed=True)
             if not norm < 0.5 * before:  # what float32 can tell
                 break
+        for total, u, hold, slip, own in zip(self.change, velocity, self._fine.hold, self._slip, self._solids, strict=True):
+            inner.run(self._passes.cover, total=total, u=u, hold=hold, h=slip, own=own)
         energy = self._density * self.grid.cell_volume
         residual = norm / first if first > 0.0 else 0.0
         return ViscousResult(iterations, residual, norm <= least, energy * (lost + driven), energy * driven)
@@ -170,11 +172,23 @@ class Viscosity:
         fine.find_spans(inner)
         self.multigrid.set_up(box)
 
+    def _motion(self, axis: int) -> dict[str, Any]:
+        """Return how solids that cut cells move, and whose a component's faces are."""
+        moves = isinstance(self.boundary, CutBoundary) and self.boundary.moves
+        cut: Any = self.boundary.cut if isinstance(self.boundary, CutBoundary) and moves else None
+        numbers = {name: None if cut is None else _numbers(getattr(cut, name)) for name in ("turn", "shift")}
+        origin = dict(zip(("before_x", "before_y", "before_z"), self.grid.origin, strict=True))
+        return {"wall": None if cut is None else cut.wall[axis]} | numbers | origin
+
+    @property
+    def _solids(self) -> list[wp.array | None]:
+        """Velocities of solids on the faces of each component."""
+        return [*self.boundary.velocity] or [None] * self.grid.dimension
+
     def _force(self, inner: Window, given: dict[str, Any], *, changed: bool) -> list[float]:
         """Write the residual; return its norm, the energy that the velocity loses by the force, what walls give, and the diagonal's norm."""
-        fine, found = self._fine, np.zeros(4)
+        fine, found, solids = self._fine, np.zeros(4), self._solids
         residual, velocity, distance = self.multigrid.components(self.multigrid.r), given["u"], self._distance
-        solids = [*self.boundary.velocity] or [None] * 3
         for axis in range(self.grid.dimension):
             of = {"u": velocity[axis], "d": distance[axis], "h": self._slip[axis], "own": solids[axis]}
             for letter, other in zip("bc", fine.others(axis), strict=True):
@@ -183,7 +197,13 @@ class Viscosity:
                 of |= {f"solid_{letter}": solids[other] if there else None}
             of |= {"cell": fine.cell, "mixed": fine.mixed, "volume": fine.volume[axis], "diagonal": fine.diagonal[axis]}
             of |= {"change": self.change[axis] if changed else None, "r": residual[axis], "axis": axis, "planes": self.grid.planes}
-            where = {"kind": given["kind"], "contact": given["contact"]}
+            where = {"kind": given["kind"], "contact": given["contact"], "dx": self.grid.spacing} | self._motion(axis)
             self._sums[axis].take(inner, **of, **fine.across(axis), **where)
             found += self._sums[axis].read()
         return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]
+
+
+def _numbers(array: wp.array) -> wp.array:
+    """Return vectors or matrices as the numbers that they lie in memory as."""
+    size = array.size * array.strides[0] // 4
+    return wp.array(ptr=array.ptr, dtype=wp.float32, shape=(size,), device=array.device, capacity=4 * size)

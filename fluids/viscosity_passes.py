@@ -17,10 +17,9 @@ HEADERS = Path(__file__).parent / "headers"
 F32, I8, U8 = wp.float32, wp.int8, wp.uint8
 CLOSE = 1e-3  # cells: a face within it of a wall, or behind it, has the wall's velocity
 THETA = 0.02  # cells: the shortest link to a wall
-DEEP = 1.2  # cells below the surface from which on no edge of a cell reaches it
 ALONG = 0.95  # of a cell that the distance changes by from face to face: the wall lies across the axis
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
-LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "DEEP": DEEP, "ALONG": ALONG}
+LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG}
 
 
 def _fields(names: str, dtype: Any = F32) -> dict[str, Any]:
@@ -40,7 +39,7 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
     deep = dimension == 3
 
     def made(name: str, box: dict[str, Any], numbers: str = "axis", real: Any = F32, apart: str = "", **more: Any) -> RowPass:
-        types = {word: F32 if word == "scale" else int for word in numbers.split()}
+        types = {word: F32 if word in ("scale", "dx") else int for word in numbers.split()}
         module = f"fluids.viscosity_{dimension}d{apart}"
         return RowPass(f"{module}.{name}", HEADERS / f"viscous_{name}.h", real, box=box, numbers=types, **more)
 
@@ -64,9 +63,11 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
             "diagonal", _fields("diagonal drag held d h cell xb xc volume") | cells, "axis planes", optional=("xc",), **near
         ),
         force=made(
-            "force", _fields("r diagonal u ub uc d h db dc cell mixed xb xc volume change own solid_b solid_c") | cells, "axis planes",
-            optional=("uc", "dc", "xc", "change", "own", "solid_b", "solid_c"), **sums, **near,
+            "force", _fields("r diagonal u ub uc d h db dc cell mixed xb xc volume change own solid_b solid_c") | cells | {"wall": wp.int16},
+            "axis planes before_x before_y before_z dx", whole=_fields("turn shift"),
+            optional=("uc", "dc", "xc", "change", "own", "solid_b", "solid_c", "wall", "turn", "shift"), **sums, **near,
         ),
+        cover=made("cover", _fields("total u hold h own"), "", optional=("own",), **near),
         add=made("add", _fields("u total more"), ""),
         sum=made("sum", _fields("u kept more"), ""),
         span=made("span", _fields("dx dy dz"), "", whole={"span": wp.int32}, optional=("dz",)),

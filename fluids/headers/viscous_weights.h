@@ -22,13 +22,19 @@ for (int i = first; i < last; ++i) {
     const bool inside = i >= 1 && i <= nx && j >= 1 && j <= ny && (!deep || (k >= 1 && k <= nz));
     const long long here[1] = {i};
     float share = inside ? filled(here, 1) : 0.0f, walled = 0.0f;
-    bool full = GHOST ? phi[GHOST ? i : 0] <= -(float)DEEP : kind[i] == FLUID, solid = false, sticks = holds(i);
+    bool solid = false, sticks = share == 1.0f && holds(i);
     if (inside) for (int axis = 0; axis <= planes; ++axis) for (int side = 0; side < 2; ++side) {
         const long long f = i + side*step[axis];
-        if (!GHOST) { const int next = kind[i + (2*side - 1)*step[axis]]; full = full && next != AIR; }
         if (d[axis][f] <= (float)CLOSE) { solid = true; sticks = sticks && h[axis][f] < INFINITY; }
     }
-    if (share > 0.0f && full && solid && sticks) walled = share;
+    if (solid && sticks) {  // and no edge reaches the surface
+        walled = 1.0f;
+        for (int e = 0; e < 2*planes - 1; ++e) for (int corner = 0; corner < 4; ++corner) {
+            const long long A = step[e < 2 ? 0 : 1], B = step[e < 1 ? 1 : 2], o = i + (corner & 1)*A + (corner >> 1)*B;
+            const long long cells[4] = {o - A - B, o - A, o - B, o};
+            if (filled(cells, 4) < 1.0f) walled = 0.0f;
+        }
+    }
     cell[i] = scale*(2.0f*share - walled);
     mixed[i] = scale*walled;
     for (int axis = 0; axis <= planes; ++axis) {
