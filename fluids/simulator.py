@@ -101,7 +101,7 @@ def make_viscosity(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, 
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
     settings = {"viscosity": scene.viscosity.value, "density": scene.physics.density, "slip_lengths": scene.slip_lengths}
-    return Viscosity(grid, boundary, phi=surface.phi, tolerance=tolerance, **settings)
+    return Viscosity(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), **settings)
 
 
 if TYPE_CHECKING:

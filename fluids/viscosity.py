@@ -79,6 +79,7 @@ class Viscosity:
         phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None: it lies on the cells' faces.
         tolerance: relative residual at which a solve is done.
         max_iterations: of conjugate gradients in a step.
+        sources: whether cells may turn SOLID, as those of sources do.
 
     Attributes:
         change: what the last step changed of each component [m/s].
@@ -87,7 +88,7 @@ class Viscosity:
 
     def __init__(
         self, grid: StaggeredGrid, boundary: Boundary, *, viscosity: float, density: float, slip_lengths: Sequence[float],
-        phi: wp.array | None, tolerance: float, max_iterations: int = 200,
+        phi: wp.array | None, tolerance: float, max_iterations: int = 200, sources: bool = False,
     ) -> None:  # fmt: skip
         self.grid, self.boundary, self.tolerance, self.max_iterations = grid, boundary, tolerance, max_iterations
         self._viscosity, self._density, self._phi = viscosity, density, phi
@@ -95,6 +96,7 @@ class Viscosity:
         slips = np.asarray(slip_lengths, dtype=np.float32) / np.float32(grid.spacing)
         self._slips = wp.array(slips, dtype=wp.float32, device=grid.device)
         self._walls = ~open_sides_of(grid, boundary.open_sides) & (1 << 2 * grid.dimension) - 1
+        self._walls_change, self._placed = boundary.moves or sources, False
         self.multigrid = VectorMultigrid(grid)
         self._fine = self.multigrid.levels[0]
         size = grid.dimension * grid.size
@@ -135,8 +137,9 @@ class Viscosity:
             norm, lost, driven, _ = self._force(inner, given, changed=True)
             if not norm < 0.5 * before:  # what float32 can tell
                 break
-        for total, u, hold, slip, own in zip(self.change, velocity, self._fine.hold, self._slip, self._solids, strict=True):
-            inner.run(self._passes.cover, total=total, u=u, hold=hold, h=slip, own=own)
+        for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True)):
+            covered = {"hold": self._fine.hold[axis], "h": self._slip[axis], "own": own, "kind": kind, "base": self.boundary.base}
+            inner.run(self._passes.cover, total=total, u=u, axis=axis, **covered)
         energy = self._density * self.grid.cell_volume
         residual = norm / first if first > 0.0 else 0.0
         return ViscousResult(iterations, residual, norm <= least, energy * (lost + driven), energy * driven)
@@ -156,9 +159,11 @@ class Viscosity:
             nodes, walls = boundary.cut.distance, [*boundary.cut.wall]
         elif isinstance(boundary, WholeCells):
             index = boundary.solids.index
-        for axis in range(self.grid.dimension):
+        where_solids = self.grid.everywhere if not self._placed else box if self._walls_change else None
+        for axis in range(self.grid.dimension if where_solids is not None else 0):
             solids = {"nodes": nodes, "wall": walls[axis], "kind": kind, "index": index, "slip": self._slips, "walls": self._walls}
-            box.run(passes.distance, out=distance[axis], hold=slip[axis], axis=axis, planes=planes, **solids)
+            where_solids.run(passes.distance, out=distance[axis], hold=slip[axis], axis=axis, planes=planes, **solids)
+        self._placed = True
         edges = {"xy": fine.edges[0, 1], "xz": fine.edges.get((0, 2)), "yz": fine.edges.get((1, 2))}
         fields = zip("vdh", (fine.volume, distance, slip), strict=True)
         faces = {f"{letter}{axis}": field for letter, of in fields for axis, field in zip("xyz", [*of, None], strict=False)}
@@ -197,7 +202,7 @@ class Viscosity:
                 of |= {f"solid_{letter}": solids[other] if there else None}
             of |= {"cell": fine.cell, "mixed": fine.mixed, "volume": fine.volume[axis], "diagonal": fine.diagonal[axis]}
             of |= {"change": self.change[axis] if changed else None, "r": residual[axis], "axis": axis, "planes": self.grid.planes}
-            where = {"kind": given["kind"], "contact": given["contact"], "dx": self.grid.spacing} | self._motion(axis)
+            where = {"kind": given["kind"], "contact": given["contact"], "base": self.boundary.base, "dx": self.grid.spacing} | self._motion(axis)
             self._sums[axis].take(inner, **of, **fine.across(axis), **where)
             found += self._sums[axis].read()
         return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]

@@ -41,7 +41,7 @@ class VectorLevel:
         self.grid, self.dimension, self.passes = grid, grid.dimension, viscous_passes(grid.dimension)
         self.cell, self.mixed = grid.field(), grid.field()
         self.edges = {pair: grid.field() for pair in [(0, 1), (0, 2), (1, 2)][: 1 if grid.dimension == 2 else 3]}
-        self.volume, self.drag, self.diagonal, self.hold, self.norm, self.r = (grid.faces() for _ in range(6))
+        self.volume, self.drag, self.diagonal, self.hold, self.norm, self.r, self.there = (grid.faces() for _ in range(7))
         self.x, self.b = x, b
         self.span = wp.zeros(2 * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
@@ -68,7 +68,7 @@ class VectorLevel:
         """Relax all components, the last one first if not forth."""
         for axis in range(self.dimension) if forth else reversed(range(self.dimension)):
             for color in (0, 1) if forth else (1, 0):
-                given = self._row(axis, self.x) | {"b": self.b[axis], "color": color, "order": int(not forth)}
+                given = self._row(axis, self.x) | {"b": self.b[axis], "scratch": self.r[axis], "color": color, "order": int(not forth)}
                 if self.grid.device.is_cuda:
                     for parity in (0, 1) if forth else (1, 0):
                         self.grid.domain.run(self.passes.sweep, launch=launch, only=parity, **given)
@@ -78,12 +78,12 @@ class VectorLevel:
     def residual(self, launch: Launch) -> None:
         """Find r = b - A x."""
         for axis in range(self.dimension):
-            self.grid.domain.run(self.passes.residual, launch=launch, b=self.b[axis], out=self.r[axis], **self._row(axis, self.x))
+            self.grid.domain.run(self.passes.residual, launch=launch, right=self.b[axis], out=self.r[axis], **self._row(axis, self.x))
 
     def product(self, x: list[wp.array], out: list[wp.array], launch: Launch) -> None:
         """Find A x."""
         for axis in range(self.dimension):
-            self.grid.domain.run(self.passes.product, launch=launch, b=None, out=out[axis], **self._row(axis, x))
+            self.grid.domain.run(self.passes.product, launch=launch, right=None, out=out[axis], **self._row(axis, x))
 
     def clear(self, launch: Launch) -> None:
         """Set x to 0."""
@@ -109,14 +109,14 @@ class VectorLevel:
         if inner is None:
             return
         for axis in axes:
-            given = {"h": self.hold[axis], "volume": self.volume[axis], "drag": self.drag[axis], "cell": self.cell}
-            inner.run(self.passes.coarse_diagonal, diagonal=self.diagonal[axis], axis=axis, planes=planes, **given, **self.across(axis))
+            given = {"h": self.hold[axis], "volume": self.volume[axis], "drag": self.drag[axis], "cell": self.cell, "there": self.there[axis]}
+            window.run(self.passes.coarse_diagonal, diagonal=self.diagonal[axis], axis=axis, planes=planes, **given, **self.across(axis))
         self.find_spans(inner)
 
     def normalize(self, coarse: VectorLevel, window: Window) -> None:
         """Find the normalization of the interpolation from a coarser level."""
         for axis in range(self.dimension):
-            given = {"coarse": coarse.diagonal[axis], "h": coarse.hold[axis], "axis": axis, "planes": self.grid.planes}
+            given = {"coarse": coarse.there[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "x": None}
             window.run(self.passes.normalize, norm=self.norm[axis], diagonal=self.diagonal[axis], **given)
 
     def restrict(self, coarse: VectorLevel, launch: Launch) -> None:
@@ -128,7 +128,7 @@ class VectorLevel:
     def prolong(self, coarse: VectorLevel, launch: Launch) -> None:
         """Add the coarser level's solution."""
         for axis in range(self.dimension):
-            given = {"coarse": coarse.x[axis], "axis": axis, "planes": self.grid.planes, "span": self.span}
+            given = {"coarse": coarse.x[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "diagonal": None}
             self.grid.domain.run(self.passes.prolong, launch=launch, x=self.x[axis], norm=self.norm[axis], **given)
 
 

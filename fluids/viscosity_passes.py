@@ -46,8 +46,9 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
     walls = "_cut" * cut + "_ghost" * ghost + "_moving" * moving
     macros = KINDS | LIMITS | {"CUT": cut, "GHOST": ghost, "MOVING": moving}
     cells: dict[str, Any] = {"kind": I8, "contact": U8}
-    stencil, spans = _fields("x y z xb xc cell mixed diagonal"), {"whole": {"span": wp.int32}, "optional": ("z", "xc", "b")}
+    stencil, spans = _fields("x y z xb xc cell mixed diagonal"), {"whole": {"span": wp.int32}, "optional": ("z", "xc", "right")}
     levels: dict[str, Any] = {"constants": {}}
+    carried = {"whole": _fields("coarse") | {"span": wp.int32}, "optional": ("diagonal", "x")}
     sums = {"sums": ("residual", "taken", "given_by_walls", "stiff")}
     near = {"apart": walls, "constants": macros}
     return SimpleNamespace(
@@ -63,21 +64,24 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
             "diagonal", _fields("diagonal drag held d h cell xb xc volume") | cells, "axis planes", optional=("xc",), **near
         ),
         force=made(
-            "force", _fields("r diagonal u ub uc d h db dc cell mixed xb xc volume change own solid_b solid_c") | cells | {"wall": wp.int16},
+            "force", _fields("r diagonal u ub uc d h db dc cell mixed xb xc volume change own solid_b solid_c") | cells | {"wall": wp.int16, "base": I8},
             "axis planes before_x before_y before_z dx", whole=_fields("turn shift"),
             optional=("uc", "dc", "xc", "change", "own", "solid_b", "solid_c", "wall", "turn", "shift"), **sums, **near,
         ),
-        cover=made("cover", _fields("total u hold h own"), "", optional=("own",), **near),
+        cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
         add=made("add", _fields("u total more"), ""),
         sum=made("sum", _fields("u kept more"), ""),
         span=made("span", _fields("dx dy dz"), "", whole={"span": wp.int32}, optional=("dz",)),
-        sweep=made("sweep", stencil | _fields("b"), "axis color order only", constants={"DEPTH": deep}, **spans),
-        product=made("apply", stencil | _fields("b out"), constants={"DEPTH": deep, "RESIDUAL": False}, **spans),
-        residual=made("apply", stencil | _fields("b out"), apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans),
+        sweep=made(
+            "sweep", stencil | _fields("b scratch"), "axis color order only", constants={"DEPTH": deep}, whole={"span": wp.int32},
+            optional=("z", "xc"),
+        ),
+        product=made("apply", stencil | _fields("out right"), constants={"DEPTH": deep, "RESIDUAL": False}, **spans),
+        residual=made("apply", stencil | _fields("out right"), apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans),
         average=made("average", _fields("out"), "planes faces scale", whole={"fine": F32}, **levels),
         close=made("close", _fields("out"), "axis planes", whole={"fine": F32}, **levels),
-        coarse_diagonal=made("coarse_diagonal", _fields("diagonal h volume drag cell xb xc"), "axis planes", optional=("xc",)),
-        normalize=made("normalize", _fields("norm diagonal"), "axis planes", whole=_fields("coarse h")),
-        prolong=made("prolong", _fields("x norm"), "axis planes", whole=_fields("coarse") | {"span": wp.int32}),
+        coarse_diagonal=made("coarse_diagonal", _fields("diagonal there h volume drag cell xb xc"), "axis planes", optional=("xc",)),
+        normalize=made("prolong", _fields("norm diagonal x"), "axis planes", apart="_norm", constants={"NORM": True}, **carried),
+        prolong=made("prolong", _fields("norm diagonal x"), "axis planes", constants={"NORM": False}, **carried),
         restrict=made("restrict", _fields("out diagonal"), "axis planes", whole=_fields("fine norm") | {"span": wp.int32}),
     )  # fmt: skip

@@ -12,10 +12,12 @@ for (int i = first; i < last; ++i) {
         distance = 0.25f*(nodes[i] + nodes[i + up] + nodes[i + far] + nodes[i + up + far]);
         owner = wall[i];
     } else {
-        const bool here = kind[i] == SOLID, there = kind[below] == SOLID;
-        distance = here && there ? -0.5f : (here || there ? 0.0f : 0.5f);
+        distance = 0.5f;
         owner = index[i] > index[below] ? index[i] : index[below];
     }
+    const bool here = kind[i] == SOLID, there = kind[below] == SOLID;  // or a source
+    const float whole = here && there ? -0.5f : (here || there ? 0.0f : distance);
+    distance = whole < distance ? whole : distance;
     for (int other = 0; other <= planes; ++other) {
         const float x = (float)at[other] - (other == axis ? 1.0f : 0.5f), high = (float)(size[other] - 2) - x;
         if ((walls >> 2*other & 1) && x < distance) { distance = x; owner = x > 0.0f ? owner : 0; }

@@ -3,7 +3,11 @@
 const int first_other = axis == 0 ? 1 : 0, last_other = axis == 2 ? 1 : 2;
 double lost = 0, driven = 0, square = 0, large = 0;
 const auto wall_speed = [&](const float* of, long long i) { return MOVING ? (double)of[MOVING ? i : 0] : 0.0; };
+const auto source = [&](long long q) {
+    return ((kind[q] == SOLID) & (base[q] != SOLID)) | ((kind[q - sa] == SOLID) & (base[q - sa] != SOLID));
+};
 const auto met = [&](int i, long long q, int other, int side) {  // the velocity of the wall where the link from i to q along an axis meets it
+    if (source(q)) return (double)u[q];
     if (!MOVING || !turn) return wall_speed(own, q);
     double x[3] = {i + before_x - 0.5, j + before_y - 0.5, planes == 2 ? k + before_z - 0.5 : 0.0};
     x[axis] -= 0.5; x[other] += side*(double)(d[i]/(d[i] - d[q]));
