@@ -95,13 +95,15 @@ def make_pressure(
     return PressureProjection(grid, boundary, solver, coupling=coupling, **settings)
 
 
-def make_viscosity(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface) -> Viscosity | None:
+def make_viscosity(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, bodies: RigidBodies | None
+) -> Viscosity | None:
     """Return the viscosity that a scene asks for, if it does."""
     if scene.viscosity is None:
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
     settings = {"viscosity": scene.viscosity.value, "density": scene.physics.density, "slip_lengths": scene.slip_lengths}
-    return Viscosity(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), **settings)
+    return Viscosity(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies, **settings)
 
 
 if TYPE_CHECKING:
@@ -138,7 +140,7 @@ class LiquidSimulation(ParticleSimulation):
         super().lay(grid, parts)
         self.surface = self._surface()
         self.projection = self._pressure()
-        self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface)
+        self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
@@ -276,6 +278,7 @@ class LiquidSimulation(ParticleSimulation):
         viscosity.undo(self.velocity)
         for body, values in zip(self.bodies.bodies if self.bodies is not None else (), momenta, strict=True):
             body.restore_momenta(values)
+        viscosity.push_bodies()
         return dict(zip(VISCOUS_COLUMNS, found.row(), strict=True))
 
     def _project(self, window: Window, dt: float, speed: float) -> Projection:

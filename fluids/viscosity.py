@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.fluids.viscosity_bodies import BodyDrag
 from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
@@ -37,7 +38,9 @@ from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rows.fields import zeros
+from warp_lcp.rows.program import Launch
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a force, relative to the diagonal times the speed
 
@@ -79,6 +82,7 @@ class Viscosity:
         phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None: it lies on the cells' faces.
         tolerance: relative residual at which a solve is done.
         max_iterations: of conjugate gradients in a step.
+        bodies: those that the liquid moves, among the solids; None: there are none.
         sources: whether cells may turn SOLID, as those of sources do.
 
     Attributes:
@@ -88,7 +92,7 @@ class Viscosity:
 
     def __init__(
         self, grid: StaggeredGrid, boundary: Boundary, *, viscosity: float, density: float, slip_lengths: Sequence[float],
-        phi: wp.array | None, tolerance: float, max_iterations: int = 200, sources: bool = False,
+        phi: wp.array | None, tolerance: float, max_iterations: int = 200, sources: bool = False, bodies: RigidBodies | None = None,
     ) -> None:  # fmt: skip
         self.grid, self.boundary, self.tolerance, self.max_iterations = grid, boundary, tolerance, max_iterations
         self._viscosity, self._density, self._phi = viscosity, density, phi
@@ -103,7 +107,11 @@ class Viscosity:
         self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)
         self._distance, self._slip, self.before = grid.faces(), grid.faces(), grid.faces()
         self.change = self.multigrid.components(self._change)
-        self._solver = ConjugateGradient(self.multigrid.product, self.multigrid)
+        self._bodies: BodyDrag | None = None
+        if bodies is not None:
+            assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
+            self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes)
+        self._solver = ConjugateGradient(self._product, self.multigrid)
         self._trail, self._sums = Trail(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
 
     def solve(
@@ -126,6 +134,11 @@ class Viscosity:
             return ViscousResult(0, 0.0, True, 0.0, 0.0)
         self._set_up(box, inner, kind, contact, self._viscosity / self._density * dt / self.grid.spacing**2)
         given = {"u": velocity, "kind": kind, "contact": contact}
+        if self._bodies is not None:
+            tau, where = self._viscosity / self._density * dt / self.grid.spacing**2, {"kind": kind, "contact": contact}
+            self._bodies.take(self._fine, self._distance, self._slip, velocity, where, tau)
+            if self._bodies.moved:  # a recorded iteration knows where they lay
+                self._solver = ConjugateGradient(self._product, self.multigrid)
         first, lost, driven, stiff = self._force(inner, given, changed=False)
         norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
         while norm > least and iterations < self.max_iterations:
@@ -143,6 +156,17 @@ class Viscosity:
         energy = self._density * self.grid.cell_volume
         residual = norm / first if first > 0.0 else 0.0
         return ViscousResult(iterations, residual, norm <= least, energy * (lost + driven), energy * driven)
+
+    def push_bodies(self) -> None:
+        """Give the bodies the impulses of the last step, if there are bodies."""
+        if self._bodies is not None:
+            self._bodies.push(self._change)
+
+    def _product(self, p: wp.array, q: wp.array, *, launch: Launch = wp.launch) -> None:
+        """Write q = A p, the bodies' answer included."""
+        self.multigrid.product(p, q, launch=launch)
+        if self._bodies is not None:
+            self._bodies.subtract(p, q, launch)
 
     def undo(self, velocity: Sequence[wp.array]) -> None:
         """Make a velocity what `before` keeps, but for the last step's change."""
@@ -202,9 +226,17 @@ class Viscosity:
                 of |= {f"solid_{letter}": solids[other] if there else None}
             of |= {"cell": fine.cell, "mixed": fine.mixed, "volume": fine.volume[axis], "diagonal": fine.diagonal[axis]}
             of |= {"change": self.change[axis] if changed else None, "r": residual[axis], "axis": axis, "planes": self.grid.planes}
-            where = {"kind": given["kind"], "contact": given["contact"], "base": self.boundary.base, "dx": self.grid.spacing} | self._motion(axis)
+            where = {
+                "kind": given["kind"],
+                "contact": given["contact"],
+                "base": self.boundary.base,
+                "dx": self.grid.spacing,
+            } | self._motion(axis)
             self._sums[axis].take(inner, **of, **fine.across(axis), **where)
             found += self._sums[axis].read()
+        if self._bodies is not None:
+            self._bodies.answer(self.multigrid.r, self._change)
+            found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
         return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]
 
 

@@ -109,7 +109,13 @@ class VectorLevel:
         if inner is None:
             return
         for axis in axes:
-            given = {"h": self.hold[axis], "volume": self.volume[axis], "drag": self.drag[axis], "cell": self.cell, "there": self.there[axis]}
+            given = {
+                "h": self.hold[axis],
+                "volume": self.volume[axis],
+                "drag": self.drag[axis],
+                "cell": self.cell,
+                "there": self.there[axis],
+            }
             window.run(self.passes.coarse_diagonal, diagonal=self.diagonal[axis], axis=axis, planes=planes, **given, **self.across(axis))
         self.find_spans(inner)
 

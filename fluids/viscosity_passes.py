@@ -68,6 +68,13 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
             "axis planes before_x before_y before_z dx", whole=_fields("turn shift"),
             optional=("uc", "dc", "xc", "change", "own", "solid_b", "solid_c", "wall", "turn", "shift"), **sums, **near,
         ),
+        links=made(
+            "links", _fields("d h cell xb xc diagonal") | cells | {"wall": wp.int16},
+            "axis planes before_x before_y before_z dx width from_",
+            whole={"counts": wp.int32, "offsets": wp.int32, "entry_rows": wp.int32, "blocks": wp.int32, "ways": wp.int32, "body": wp.int32}
+            | dict.fromkeys(("values", "weights", "center"), wp.float64),
+            optional=("xc", "offsets", "entry_rows", "blocks", "ways", "values", "weights"), **near,
+        ),
         cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
         add=made("add", _fields("u total more"), ""),
         sum=made("sum", _fields("u kept more"), ""),

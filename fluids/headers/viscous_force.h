@@ -1,6 +1,5 @@
 // What viscosity does to a component in a step, less what it has done: r = -K u - V (u - u1), and sums over it.
 #include "viscous_walls.h"
-const int first_other = axis == 0 ? 1 : 0, last_other = axis == 2 ? 1 : 2;
 double lost = 0, driven = 0, square = 0, large = 0;
 const auto wall_speed = [&](const float* of, long long i) { return MOVING ? (double)of[MOVING ? i : 0] : 0.0; };
 const auto source = [&](long long q) {

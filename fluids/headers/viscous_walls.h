@@ -2,6 +2,7 @@
 // two other components; a link to a wall ends at it, or behind it by the slip length.
 const bool deep = planes == 2;
 const long long step[3] = {1, s2, s1}, sa = step[axis], sb = step[axis == 0 ? 1 : 0], sc = step[axis == 2 ? 1 : 2];
+const int first_other = axis == 0 ? 1 : 0, last_other = axis == 2 ? 1 : 2;
 const auto solid = [&](const float* distance, long long i) { return distance[i] <= (float)CLOSE; };
 const auto beyond = [&](long long i, long long q, float slip) {  // the reciprocal length of a link from i to the wall before q
     const float length = (d[i] + slip)/(d[i] - d[q]);
