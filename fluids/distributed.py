@@ -340,6 +340,7 @@ def refusals(scene: LiquidScene) -> list[str]:
     output, particles = scene.output, scene.particles
     asked = {
         **{f"solid[{n}].motion" if solid.motion else f"solid[{n}].mass": solid.moves for n, solid in enumerate(scene.solid)},
+        "viscosity": scene.viscosity,
         "source": scene.source,
         "drain": scene.drain,
         "domain.open": scene.domain.open,

@@ -46,6 +46,7 @@ class Viscosity(Table):
     slip_length: float = Field(
         default=0.0,
         ge=0,
+        allow_inf_nan=True,
         description="how far behind a wall that holds the liquid its velocity would be the wall's [m]: 0 is no slip; of walls that are "
         '"separating" or "sticky"',
     )

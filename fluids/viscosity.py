@@ -111,7 +111,7 @@ class Viscosity:
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
             self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes)
-        self._solver = ConjugateGradient(self._product, self.multigrid)
+        self._solver = ConjugateGradient(self._product, self.multigrid, by_error=True)
         self._trail, self._sums = Trail(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
 
     def solve(
@@ -135,15 +135,14 @@ class Viscosity:
         self._set_up(box, inner, kind, contact, self._viscosity / self._density * dt / self.grid.spacing**2)
         given = {"u": velocity, "kind": kind, "contact": contact}
         if self._bodies is not None:
-            tau, where = self._viscosity / self._density * dt / self.grid.spacing**2, {"kind": kind, "contact": contact}
-            self._bodies.take(self._fine, self._distance, self._slip, velocity, where, tau)
+            self._bodies.take(self._fine, self._distance, self._slip, velocity, {"kind": kind, "contact": contact})
             if self._bodies.moved:  # a recorded iteration knows where they lay
-                self._solver = ConjugateGradient(self._product, self.multigrid)
+                self._solver = ConjugateGradient(self._product, self.multigrid, by_error=True)
         first, lost, driven, stiff = self._force(inner, given, changed=False)
         norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
         while norm > least and iterations < self.max_iterations:
             before = norm
-            done, _ = self._solver.solve(0.7 * least, self.max_iterations - iterations)
+            done, _ = self._solver.solve(self.tolerance, self.max_iterations - iterations)
             iterations += done
             for u, total, more in zip(velocity, self.change, self.multigrid.components(self._solver.x), strict=True):
                 inner.run(self._passes.add, u=u, total=total, more=more)
@@ -233,7 +232,7 @@ class Viscosity:
                 "dx": self.grid.spacing,
             } | self._motion(axis)
             self._sums[axis].take(inner, **of, **fine.across(axis), **where)
-            found += self._sums[axis].read()
+            found += self._sums[axis].read(self.grid.domain)
         if self._bodies is not None:
             self._bodies.answer(self.multigrid.r, self._change)
             found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())

@@ -9,7 +9,8 @@ import numpy as np
 import scipy.linalg
 import warp as wp
 
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.fluids.viscosity_multigrid import VectorLevel
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns, weigh_kernel
 from warp_lcp.rigid.bodies import RigidBodies
@@ -21,14 +22,14 @@ SPARE = 1.5  # room for links, times those there are when there is none left
 class BodyDrag:
     """Solve for liquid and bodies together, see `fluids.viscosity`.
 
-    A link from a face to a wall weighs c and pulls the body by c (u - g'V), g the velocities of its unit motions where the link meets it.
-    With C = sum of c g over links, D of c g g', and m = rho dx^d M^-1 the body's velocity is V = V1 + m (C'u - D V), so that a change of the
-    liquid's velocity changes it by
+    What pulls a face towards a body's velocity V does so by c'V: of a link that meets its wall, the weight times the velocities g of the
+    body's unit motions there; of a product with a face in the body, those at that face. The body is pulled back by C'u - D V, C of rows c.
+    All this is an energy's, which rigid motions of liquid and body together leave 0, so D is what makes C'u = D V for those. With
+    m = rho dx^d M^-1 the body's velocity is V = V1 + m (C'u - D V), so that a change of the liquid's velocity changes it by
 
         dV = W C'du,   W = (1 + m D)^-1 m,
 
-    and the liquid's equations lose C W C', symmetric like the rest. Beside a wall links carry mu du/dn, not the traction of the stress, which
-    is -mu w x n more on a wall that turns with w, n into the liquid: all around a body a torque of -2 mu volume w. D has it link by link.
+    and the liquid's equations lose C W C', symmetric like the rest.
 
     Args:
         grid: the grid.
@@ -54,76 +55,80 @@ class BodyDrag:
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
 
     def take(
-        self, level: Any, distance: Sequence[wp.array], slip: Sequence[wp.array], velocity: Sequence[wp.array], where: Any, tau: float
+        self,
+        level: VectorLevel,
+        distance: Sequence[wp.array],
+        slip: Sequence[wp.array],
+        velocity: Sequence[wp.array],
+        where: dict[str, Any],
     ) -> None:
-        """Find the links of a step, and how the bodies answer to the liquid's velocity as it is."""
-        grid, width = self.grid, self._width
+        """Find what pulls the bodies in a step, and how they answer to the liquid's velocity as it is.
+
+        Args:
+            level: the equations of the step.
+            distance: of each component's faces from walls [cells].
+            slip: what their walls have for a slip length [cells].
+            velocity: of each component [m/s].
+            where: `kind` and `contact` of cells.
+        """
+        grid, wall = self.grid, self.boundary.cut.wall
         block = self.boundary.cut.moving_block()
-        found: list[tuple[np.ndarray, ...]] = []
+        window = None if block is None else grid.window(*block, grow=1).common(grid.domain)
         centers = np.array([body.position for body in self.bodies.bodies])
         given = where | {"body": self._body, "center": wp.array(centers.ravel(), dtype=wp.float64, device=grid.device)}
-        given |= {"cell": level.cell, "planes": grid.planes, "dx": grid.spacing, "width": width, "counts": self._counts}
-        given |= dict(zip(("before_x", "before_y", "before_z"), grid.origin, strict=True))
-        for axis in range(grid.dimension if block is not None else 0):
-            assert block is not None
-            window = grid.window(*block, grow=1).common(grid.domain)
-            if window is None:
-                continue
+        given |= {"cell": level.cell, "mixed": level.mixed, "planes": grid.planes, "dx": grid.spacing, "width": self._width}
+        given |= dict(zip(("before_x", "before_y", "before_z"), grid.origin, strict=True)) | {"counts": self._counts}
+        found = [(np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, self._width)))]
+        for axis in range(grid.dimension if window is not None else 0):
+            assert window is not None
             of = given | level.across(axis) | {"axis": axis, "d": distance[axis], "h": slip[axis], "diagonal": level.diagonal[axis]}
-            of |= {"wall": self.boundary.cut.wall[axis], "from_": axis * grid.size}
-            nothing = dict.fromkeys(("offsets", "entry_rows", "blocks", "ways", "values", "weights"))
-            self._counts.zero_()
-            window.run(self._passes.links, whole=True, **of, **nothing)
-            counts = self._counts.numpy()
-            total = int(counts.sum())
-            if not total:
-                continue
-            offsets = wp.array(np.cumsum(counts) - counts, dtype=wp.int32, device=grid.device)
-            rows, blocks, ways = (wp.zeros(total, dtype=wp.int32, device=grid.device) for _ in range(3))
-            values, weights = (wp.zeros(n, dtype=wp.float64, device=grid.device) for n in (total * width, total))
-            lists = {"offsets": offsets, "entry_rows": rows, "blocks": blocks, "ways": ways, "values": values, "weights": weights}
-            window.run(self._passes.links, whole=True, **of, **lists)
-            found.append((rows.numpy(), blocks.numpy(), values.numpy().reshape(-1, width), weights.numpy(), ways.numpy()))
-        rows, blocks, values, weights, ways = (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else _nothing(width)
-        self._find_response(rows, blocks, values, weights, ways, velocity, tau)
+            of |= {"wall": wall[axis], "from_": axis * grid.size}
+            for letter, other in zip("bc", level.others(axis), strict=True):
+                there = other is not None
+                of |= {f"d{letter}": distance[other] if there else None, f"wall_{letter}": wall[other] if there else None}
+            found.append(self._entries(window, of))
+        self._find_response(*(np.concatenate(parts) for parts in zip(*found, strict=True)), velocity)
 
-    def _find_response(
-        self,
-        rows: np.ndarray,
-        blocks: np.ndarray,
-        values: np.ndarray,
-        weights: np.ndarray,
-        ways: np.ndarray,
-        velocity: Sequence[wp.array],
-        tau: float,
-    ) -> None:
-        bodies, dimension = self.bodies.bodies, self.grid.dimension
+    def _entries(self, window: Window, given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return rows, bodies and values of a component's entries."""
+        device = self.grid.device
+        self._counts.zero_()
+        window.run(self._passes.links, whole=True, **given, **dict.fromkeys(("offsets", "entry_rows", "blocks", "values")))
+        counts = self._counts.numpy().copy()
+        total = int(counts.sum())
+        rows, blocks = (wp.zeros(total, dtype=wp.int32, device=device) for _ in range(2))
+        values = wp.zeros(total * self._width, dtype=wp.float64, device=device)
+        if total:
+            offsets = wp.array(np.cumsum(counts) - counts, dtype=wp.int32, device=device)
+            lists = {"offsets": offsets, "entry_rows": rows, "blocks": blocks, "values": values}
+            window.run(self._passes.links, whole=True, **given, **lists)
+        return rows.numpy(), blocks.numpy(), values.numpy().reshape(-1, self._width)
+
+    def _find_response(self, rows: np.ndarray, blocks: np.ndarray, values: np.ndarray, velocity: Sequence[wp.array]) -> None:
+        bodies, grid, dimension, width = self.bodies.bodies, self.grid, self.grid.dimension, self._width
         self.moved = len(rows) > self.columns.capacity
         if self.moved:
             self.columns.reserve(round(SPARE * len(rows)))
         self.columns.assign(rows, blocks, values)
-        pulled = np.zeros((len(bodies), self._width))
+        axes, cells = np.divmod(rows, grid.size)
+        k, j, i = np.unravel_index(cells, grid.shape)
+        places = (np.stack((i, j, k), axis=-1) + np.array(grid.origin) - 0.5 - 0.5 * np.eye(3)[axes]) * grid.spacing
         at = [field.numpy().ravel() for field in velocity]
-        speeds = np.array([at[row // self.grid.size][row % self.grid.size] for row in rows])
-        np.add.at(pulled, blocks, values * speeds[:, None])
-        drags, responses = [], []
-        motions, turns = values / weights[:, None], np.zeros_like(values)
-        axes, normals = rows // self.grid.size, np.zeros((len(rows), 3))
-        normals[np.arange(len(rows)), ways >> 1] = 1 - 2 * (ways & 1)
-        for n, rotation in zip(
-            range(2, 3) if dimension == 2 else range(3, 6), np.eye(3)[-1:] if dimension == 2 else np.eye(3), strict=True
-        ):
-            turns[:, n] = np.cross(rotation, normals)[np.arange(len(rows)), axes]
+        speeds = np.array([at[axis][cell] for axis, cell in zip(axes, cells, strict=True)])
+        self._drag, responses = np.zeros((len(bodies), width, width)), []
+        pulled = np.zeros((len(bodies), width))
         for n, body in enumerate(bodies):
             own = blocks == n
-            more = tau * self.grid.spacing * motions[own].T @ turns[own]
-            drag = motions[own].T @ values[own] + 0.5 * (more + more.T)
+            arms = places[own] - body.position
+            arms[:, dimension:] = 0.0
+            turns = np.cross(np.eye(3)[None], arms[:, None])[np.arange(len(arms)), :, axes[own]]  # by the axis of the turn
+            motions = np.concatenate((np.eye(3)[axes[own]][:, :dimension], turns[:, 2:] if dimension == 2 else turns), axis=1)
+            drag = values[own].T @ motions
+            self._drag[n], pulled[n] = 0.5 * (drag + drag.T), speeds[own] @ values[own]
             m = self._scale * body.inverse_mass(dimension)
-            drags.append(drag)
-            responses.append(np.linalg.solve(np.eye(self._width) + m @ drag, m))
-        self._drag = np.array(drags)
-        before = np.array([body.velocities(dimension) for body in bodies])
-        self._before, self._pulled = before, pulled - np.einsum("bij,bj->bi", self._drag, before)
+            responses.append(np.linalg.solve(np.eye(width) + m @ self._drag[n], m))
+        self._before = np.array([body.velocities(dimension) for body in bodies])
+        self._pulled = pulled - np.einsum("bij,bj->bi", self._drag, self._before)
         W = scipy.linalg.block_diag(*responses)
         self._weights = 0.5 * (W + W.T)
         self._response.assign(self._weights)
@@ -146,7 +151,3 @@ class BodyDrag:
         pulled = self._pulled + self.columns.gather(change).numpy().reshape(moved.shape) - np.einsum("bij,bj->bi", self._drag, moved)
         for body, impulse in zip(self.bodies.bodies, self._scale * pulled, strict=True):
             body.apply_impulse(impulse)
-
-
-def _nothing(width: int) -> tuple[np.ndarray, ...]:
-    return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, width)), np.zeros(0), np.zeros(0, dtype=np.int32)

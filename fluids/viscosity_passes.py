@@ -69,11 +69,11 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
             optional=("uc", "dc", "xc", "change", "own", "solid_b", "solid_c", "wall", "turn", "shift"), **sums, **near,
         ),
         links=made(
-            "links", _fields("d h cell xb xc diagonal") | cells | {"wall": wp.int16},
+            "links",
+            _fields("d h db dc cell mixed xb xc diagonal") | cells | dict.fromkeys(("wall", "wall_b", "wall_c"), wp.int16),
             "axis planes before_x before_y before_z dx width from_",
-            whole={"counts": wp.int32, "offsets": wp.int32, "entry_rows": wp.int32, "blocks": wp.int32, "ways": wp.int32, "body": wp.int32}
-            | dict.fromkeys(("values", "weights", "center"), wp.float64),
-            optional=("xc", "offsets", "entry_rows", "blocks", "ways", "values", "weights"), **near,
+            whole=_fields("counts offsets entry_rows blocks body", wp.int32) | _fields("values center", wp.float64),
+            optional=("dc", "wall_c", "xc", "offsets", "entry_rows", "blocks", "values"), **near,
         ),
         cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
         add=made("add", _fields("u total more"), ""),

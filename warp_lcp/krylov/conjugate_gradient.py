@@ -62,6 +62,17 @@ def end_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)):
     going[0] = next_iteration(scalars, RR)
 
 
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")
+def end_by_error_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)):
+    """The same where r.z decides, of the residual before the iteration; the tolerance is relative to the first."""
+    if scalars[ITERATIONS] == wp.float64(0.0):
+        scalars[TOLERANCE] = scalars[TOLERANCE] * wp.sqrt(scalars[RZ])
+    scalars[RR] = scalars[RZ]
+    scalars[RZ_OLD] = scalars[RZ]
+    going[0] = next_iteration(scalars, RR)
+
+
 HEADERS, PLACES = Path(__file__).parent / "headers", {"RZ": int(RZ), "RZ_OLD": int(RZ_OLD), "PQ": int(PQ)}
 DIRECTION = RowPass(
     "conjugate_gradient.direction", HEADERS / "direction.h", "S", reads={"z": "S"}, writes={"direction": "S"},
@@ -101,9 +112,14 @@ class ConjugateGradient:
         preconditioner: M. If it is recorded (has a `program`), so must A be, and an iteration is one program.
         weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1. Rows that a large shift makes stiff would
             else decide when to stop.
+        by_error: whether (r'M r)^(1/2) decides, the error's energy norm as M sees it, a step late; `solve` then takes a tolerance relative
+            to that of the start. Where a system is stiff a small residual may leave much of the error in what A hardly sees.
     """
 
-    def __init__(self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None) -> None:
+    def __init__(
+        self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None, by_error: bool = False
+    ) -> None:
+        self._end = end_by_error_kernel if by_error else end_kernel
         self._product, self._preconditioner, r = product, preconditioner, preconditioner.r
         self.device, self.x, self._p, self._q = r.device, zeros_like(r), zeros_like(r), zeros_like(r)
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=r.device)
@@ -150,4 +166,4 @@ class ConjugateGradient:
         self._reduction.dot(self._p, self._q, int(PQ), launch=launch)
         self._update.launch(launch)
         self._reduction.add_up(int(RR), launch=launch)
-        launch(end_kernel, 1, [self._scalars, self._going], device=self.device)
+        launch(self._end, 1, [self._scalars, self._going], device=self.device)

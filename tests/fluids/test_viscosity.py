@@ -1,0 +1,258 @@
+"""Viscosity: its equations against their energy, what they keep, walls that hold, let go or slip, and bodies."""
+
+import math
+
+import numpy as np
+import pytest
+import warp as wp
+from pydantic import ValidationError
+
+from small_liquids import GRAVITY, advance, box, create, scene
+from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.simulation import StepFailed
+
+WEIGHTLESS = {"physics": {"gravity": [0.0, 0.0]}}
+
+
+def blob(dimension: int, viscosity: float = 100.0, resolution: int = 24, **tables):
+    """A box of liquid in free flight."""
+    low, high = [0.3, 0.35, 0.4][:dimension], [0.7, 0.62, 0.65][:dimension]
+    physics = {"physics": {"gravity": [0.0] * dimension}}
+    given = {"viscosity": {"value": viscosity}, **physics, **tables}
+    return create(scene(size=[1.0] * dimension, resolution=resolution, liquid=[box(low, high)], **given))
+
+
+def prepared(simulation, velocity, dt: float = 0.01):
+    """Take a viscous step of a velocity as the simulation's liquid is."""
+    for field, values in zip(simulation.velocity, velocity, strict=True):
+        field.assign(values.astype(np.float32))
+    projection = simulation.projection
+    projection.contact.fill_(1)
+    everywhere = simulation.grid.everywhere
+    return simulation.viscosity.solve(simulation.velocity, everywhere, projection.kind, projection.contact, dt, 1.0)
+
+
+def force_of_energy(simulation, u, tau: float):
+    """V u + tau K u from the energy's definition, for liquid that touches no wall; V of each component."""
+    phi, d = simulation.surface.phi.numpy().astype(float), simulation.grid.dimension
+    axis_of = {a: 2 - a for a in range(d)}
+
+    def below(field, a):
+        return np.roll(field, 1, axis=axis_of[a])
+
+    def above(field, a):
+        return np.roll(field, -1, axis=axis_of[a])
+
+    def filled(field):
+        return np.clip(0.5 - field, 0.0, 1.0)
+
+    volume = [filled(0.5 * (phi + below(phi, a))) for a in range(d)]
+    result = [volume[a] * u[a] for a in range(d)]
+    for a in range(d):
+        stress = 2.0 * filled(phi) * (above(u[a], a) - u[a])
+        result[a] = result[a] + tau * (below(stress, a) - stress)
+        for b in range(a + 1, d):
+            mean = 0.25 * (phi + below(phi, a) + below(phi, b) + below(below(phi, a), b))
+            shear = filled(mean) * (u[a] - below(u[a], b) + u[b] - below(u[b], a))
+            result[a] = result[a] + tau * (shear - above(shear, b))
+            result[b] = result[b] + tau * (shear - above(shear, a))
+    return result, volume
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_equations_are_the_energys(dimension: int) -> None:
+    simulation, rng = blob(dimension), np.random.default_rng(3)
+    grid, viscosity = simulation.grid, simulation.viscosity
+    prepared(simulation, [np.zeros(grid.shape)] * dimension)
+    there = [field.numpy() > 0.0 for field in viscosity.multigrid.levels[0].diagonal]
+    u = [np.where(mask, rng.standard_normal(grid.shape), 0.0) for mask in there]
+    expected, _ = force_of_energy(simulation, u, 100.0 / 1000.0 * 0.01 / grid.spacing**2)
+    p, q = (wp.zeros(dimension * grid.size, dtype=wp.float32, device="cpu") for _ in range(2))
+    p.assign(np.concatenate([field.ravel() for field in u]).astype(np.float32))
+    viscosity.multigrid.product(p, q)
+    for axis, found in enumerate(viscosity.multigrid.components(q)):
+        assert np.abs(np.where(there[axis], expected[axis], 0.0) - found.numpy()).max() < 1e-4
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_rigid_motions_stay_and_momenta_are_kept(dimension: int) -> None:
+    simulation, rng = blob(dimension, viscosity=1e3), np.random.default_rng(4)
+    grid = simulation.grid
+    index = np.indices(grid.shape)[::-1].astype(float)
+    at = [[index[b] - (0.0 if a == b else -0.5) for b in range(3)] for a in range(dimension)]
+    turning = [-at[0][1], at[1][0], np.zeros(grid.shape)][:dimension]
+    prepared(simulation, [0.3 * field for field in turning])
+    there = [field.numpy() > 0.0 for field in simulation.viscosity.multigrid.levels[0].diagonal]
+    for field, mask, expected in zip(simulation.velocity, there, turning, strict=True):
+        assert np.abs(field.numpy() - 0.3 * expected)[mask].max() < 1e-4
+    before = [np.where(mask, rng.standard_normal(grid.shape), 0.0) for mask in there]
+    result = prepared(simulation, before)
+    _, volume = force_of_energy(simulation, before, 1.0)
+    assert result.converged and result.dissipated > 0.0
+    after = [field.numpy() for field in simulation.velocity]
+    kept = [sum((volume[a] * x[a]).sum() for a in (0,)) for x in (before, after)]
+    spin = [(volume[1] * at[1][0] * x[1]).sum() - (volume[0] * at[0][1] * x[0]).sum() for x in (before, after)]
+    size = sum(np.abs(volume[a] * before[a]).sum() for a in range(dimension))
+    assert abs(kept[1] - kept[0]) < 1e-4 * size
+    assert abs(spin[1] - spin[0]) < 1e-4 * size * grid.counts[0]
+    energy = [sum((volume[a] * np.square(x[a])).sum() for a in range(dimension)) for x in (before, after)]
+    assert energy[1] < 0.1 * energy[0]
+
+
+@pytest.mark.parametrize("viscosity", [1e-3, 1.0, 1e3, 1e5])
+def test_iterations_do_not_grow_with_the_grid(viscosity: int) -> None:
+    counts = []
+    for resolution in (32, 128):
+        simulation = create(
+            scene(size=[1.0, 1.0], resolution=resolution, liquid=[box([0.0, 0.0], [1.0, 0.6])], viscosity={"value": viscosity})
+        )
+        index = np.indices(simulation.grid.shape)[::-1] / resolution * 2.0 * np.pi
+        result = prepared(simulation, [np.sin(index[1]) * np.cos(2.0 * index[0]), np.sin(index[0]) * np.cos(2.0 * index[1])])
+        assert result.converged and result.relative_residual <= 1e-4
+        counts.append(result.iterations)
+    assert counts[1] <= counts[0] + 3 and counts[1] <= 12
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("viscosity", [1.0, 100.0, 1e4])
+def test_a_block_leaves_a_ceiling_that_separates(dimension: int, viscosity: float) -> None:
+    """Every particle falls freely; held by suction it hangs, stretching by its weight, and so it does where it sticks."""
+    low, size = [0.25, 1.6, 0.25][:dimension], [1.0, 2.0, 1.0][:dimension]
+    high = [0.75, 2.0, 0.75][:dimension]
+    fallen = {}
+    for wall in ("separating", "free-slip", "sticky"):
+        tables = {"wall": wall, "viscosity": {"value": viscosity}, "cfl": 1.0}
+        simulation = create(scene(size=size, resolution={2: 32, 3: 16}[dimension], liquid=[box(low, high)], **tables))
+        start = np.sort(simulation.particles.position.numpy()[:, 1])
+        advance(simulation, 0.15)
+        fallen[wall] = (start - np.sort(simulation.particles.position.numpy()[:, 1])) / simulation.grid.spacing
+    expected = 0.5 * GRAVITY * 0.15**2 / simulation.grid.spacing
+    assert np.abs(fallen["separating"] - expected).max() < 0.01
+    for wall in ("free-slip", "sticky"):
+        assert fallen[wall].min() < 0.2
+        if viscosity == 1e4:
+            assert fallen[wall].max() < 0.25
+
+
+def test_couette_flow_between_cut_walls() -> None:
+    """The velocity between a disc that turns and a round wall, 16 cells apart: A r + B / r."""
+    inner, outer, rate = 0.2, 0.45, 1.0
+    errors = []
+    for resolution in (32, 64):
+        solids = [
+            {"shape": "sphere", "invert": True, "center": [0.5, 0.51], "radius": outer},
+            {
+                "shape": "sphere",
+                "center": [0.5, 0.51],
+                "radius": inner,
+                "motion": {"kind": "rotation", "center": [0.5, 0.51], "rate": 57.29578},
+            },
+        ]
+        full = box([0.0, 0.0], [1.0, 1.0])
+        tables = {"wall": "sticky", "viscosity": {"value": 1.0}, "physics": {"gravity": [0.0, 0.0], "density": 1.0}}
+        simulation = create(scene(size=[1.0, 1.0], resolution=resolution, liquid=[full], solid=solids, **tables))
+        simulation.boundary.begin_step(0.0, 1e-5)
+        prepared(simulation, [np.zeros(simulation.grid.shape)] * 2, dt=1e3)
+        B = rate * inner**2 * outer**2 / (outer**2 - inner**2)
+        wrong, size = 0.0, 0.0
+        for axis, (field, diagonal) in enumerate(zip(simulation.velocity, simulation.viscosity.multigrid.levels[0].diagonal, strict=True)):
+            index = np.indices(simulation.grid.shape)[::-1]
+            x, y = ((index[a] - (1.0 if a == axis else 0.5)) / resolution - center for a, center in ((0, 0.5), (1, 0.51)))
+            r = np.maximum(np.hypot(x, y), 1e-9)
+            exact = (-B / outer**2 * r + B / r) * (-y if axis == 0 else x) / r
+            mask = diagonal.numpy() > 0.0
+            wrong, size = wrong + np.square(field.numpy() - exact)[mask].sum(), size + np.square(exact)[mask].sum()
+        errors.append(math.sqrt(wrong / size))
+    assert errors[1] < 0.004
+    assert errors[0] / errors[1] > 2.8
+
+
+def test_a_slip_length_moves_the_wall_away() -> None:
+    """A layer over a floor that drags it: u - nu dt u'' = 1 with u(0) = slip u'(0), u'(H) = 0."""
+    depth, length = 0.125, math.sqrt(0.02)
+    for slip in (0.0, 0.05, math.inf):
+        tables = {"viscosity": {"value": 1.0, "slip_length": slip}, "physics": {"gravity": [0.0, 0.0], "density": 1.0}, "wall": "sticky"}
+        simulation = create(scene(size=[2.0, 0.25], resolution=128, liquid=[box([0.0, 0.0], [2.0, depth])], **tables))
+        prepared(simulation, [np.ones(simulation.grid.shape), np.zeros(simulation.grid.shape)], dt=0.02)
+        y = (np.arange(8) + 0.5) / 64
+        part = 0.0 if slip == math.inf else 1.0 / (math.cosh(depth / length) + slip / length * math.sinh(depth / length))
+        expected = 1.0 - part * np.cosh((depth - y) / length)
+        assert np.abs(simulation.velocity[0].numpy()[1, 1:9, 65] - expected).max() < 0.015  # the tank's ends reach here
+
+
+def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
+    """Stokes's law with the walls' factor of .6 or so; momenta of liquid and body together are kept."""
+    ball = {"shape": "sphere", "center": [0.2, 0.2, 0.2], "radius": 0.05}
+    speeds = {}
+    for density in (2000.0, 50.0):
+        tables = {"viscosity": {"value": 200.0}, "solid": [{**ball, "density": density}], "wall": "sticky"}
+        simulation = create(scene(size=[0.4] * 3, resolution=20, liquid=[box([0.0] * 3, [0.4, 0.38, 0.4])], **tables))
+        advance(simulation, 0.06, dt_max=0.01)
+        speeds[density] = simulation.bodies.bodies[0].velocity[1]
+        stokes = 2.0 / 9.0 * (1000.0 - density) * GRAVITY * 0.05**2 / 200.0
+        assert 0.5 < speeds[density] / stokes < 0.9
+    tables = {"viscosity": {"value": 50.0}, **WEIGHTLESS}
+    disc = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.1, "density": 500.0, "velocity": [1.0, 0.0], "angular_velocity": 90.0}
+    simulation = create(scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.3, 0.3], [0.7, 0.7])], solid=[disc], **tables))
+    body = simulation.bodies.bodies[0]
+
+    def momentum() -> float:
+        return float(body.momentum[0] + simulation.particle_mass * simulation.particles.velocity.numpy()[:, 0].sum())
+
+    before = momentum()
+    advance(simulation, 0.1)
+    assert momentum() == pytest.approx(before, rel=0.03)  # without viscosity the same: transfers
+    assert 0.0 < body.velocity[0] < 1.0
+    slower = abs(body.angular_velocity[2]) / math.radians(90.0)
+    assert slower < 1.0
+
+
+def test_a_resumed_run_goes_on_with_the_same_bits() -> None:
+    def fresh():
+        return blob(2, physics={"gravity": [0.0, -9.81]})
+
+    first, second = fresh(), fresh()
+    advance(first, 0.1)
+    second.restore(first.state())
+    for _ in range(3):
+        dt = first.stable_dt()
+        assert first.step(dt) == second.step(dt)
+    assert np.array_equal(first.particles.position.numpy(), second.particles.position.numpy())
+
+
+def test_the_log_tells_heat_and_rows_are_finite() -> None:
+    simulation = create(scene(size=[1.0, 0.5], resolution=32, liquid=[box([0.0, 0.0], [0.4, 0.4])], viscosity={"value": 5.0}))
+    rows = advance(simulation, 0.2)
+    assert {"viscous_iterations", "viscous_residual", "dissipated", "wall_work"} <= set(rows[0])
+    assert all(row["dissipated"] >= -1e-9 and row["wall_work"] == 0.0 for row in rows)
+
+
+def test_a_step_that_cannot_be_solved_may_be_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = blob(2, physics={"gravity": [0.0, -9.81]})
+    advance(simulation, 0.05)
+    simulation.particles.velocity.assign(np.random.default_rng(0).standard_normal((simulation.particles.count, 3)).astype(np.float32))
+    monkeypatch.setattr(simulation.viscosity, "max_iterations", 1)
+    with pytest.raises(StepFailed, match="viscous solve ended"):
+        simulation.step(0.01)
+
+
+def test_without_the_table_there_is_nothing() -> None:
+    simulation = create(scene(size=[1.0, 0.5], resolution=16, liquid=[box([0.0, 0.0], [0.4, 0.4])]))
+    assert simulation.viscosity is None
+    assert "dissipated" not in simulation.columns()
+    assert (simulation.projection.kind.numpy() == FLUID).any()
+
+
+@pytest.mark.parametrize(
+    ("tables", "complaint"),
+    [
+        ({"wall": "sticky"}, "needs the table"),
+        ({"solid": [box([0.1, 0.1], [0.2, 0.2], slip_length=0.1)]}, "needs the table"),
+        ({"viscosity": {"value": -1.0}}, "greater than 0"),
+        ({"viscosity": {"value": 1.0, "slip_length": -0.1}}, "greater than or equal to 0"),
+        ({"viscosity": {"value": 1.0}, "domain": {"size": [1.0, 1.0], "resolution": 8, "periodic": ["x"]}}, "periodic"),
+    ],
+)
+def test_what_is_wrong_is_said(tables, complaint: str) -> None:
+    with pytest.raises(ValidationError, match=complaint):
+        scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])], **tables)
