@@ -102,7 +102,7 @@ def make_viscosity(
     if scene.viscosity is None:
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
-    settings = {"viscosity": scene.viscosity.value, "density": scene.physics.density, "slip_lengths": scene.slip_lengths}
+    settings: dict[str, Any] = {"viscosity": scene.viscosity.value, "density": scene.physics.density, "slip_lengths": scene.slip_lengths}
     return Viscosity(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies, **settings)
 
 

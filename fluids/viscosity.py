@@ -8,8 +8,8 @@ least: u on faces, e_aa at cells, e_ab on edges, differences in units of 1/dx, V
 
     V u + tau K u = V u1,   K symmetric and positive semi-definite,
 
-with K u = 0 for all rigid motions of what floats freely: linear and angular momentum stay. Faces in air that touch a filled cell or edge are
-unknowns too, so that the surface bears no traction.
+with K u = 0 for all rigid motions of what floats freely: linear and angular momentum stay. Faces in air that touch a filled cell or edge
+are unknowns too, so that the surface bears no traction.
 
 In terms of gradients, with the determinants of pairs of axes apart,
 
@@ -176,20 +176,20 @@ class Viscosity:
         """Find the equations of a step."""
         fine, boundary, passes, planes = self._fine, self.boundary, self._passes, self.grid.planes
         slip, distance, where = self._slip, self._distance, {"kind": kind, "contact": contact}
+        edges: dict[str, Any] = {"xy": fine.edges[0, 1], "xz": fine.edges.get((0, 2)), "yz": fine.edges.get((1, 2))}
         walls: list[wp.array | None] = [None] * 3
         nodes = index = None
         if isinstance(boundary, CutBoundary):
             nodes, walls = boundary.cut.distance, [*boundary.cut.wall]
         elif isinstance(boundary, WholeCells):
             index = boundary.solids.index
-        where_solids = self.grid.everywhere if not self._placed else box if self._walls_change else None
-        for axis in range(self.grid.dimension if where_solids is not None else 0):
+        near = box if self._placed else self.grid.everywhere
+        for axis in range(self.grid.dimension if self._walls_change or not self._placed else 0):
             solids = {"nodes": nodes, "wall": walls[axis], "kind": kind, "index": index, "slip": self._slips, "walls": self._walls}
-            where_solids.run(passes.distance, out=distance[axis], hold=slip[axis], axis=axis, planes=planes, **solids)
+            near.run(passes.distance, out=distance[axis], hold=slip[axis], axis=axis, planes=planes, **solids)
         self._placed = True
-        edges = {"xy": fine.edges[0, 1], "xz": fine.edges.get((0, 2)), "yz": fine.edges.get((1, 2))}
         fields = zip("vdh", (fine.volume, distance, slip), strict=True)
-        faces = {f"{letter}{axis}": field for letter, of in fields for axis, field in zip("xyz", [*of, None], strict=False)}
+        faces: dict[str, Any] = {f"{letter}{axis}": field for letter, of in fields for axis, field in zip("xyz", [*of, None], strict=False)}
         # edges and faces on the upper ends of the domain, too; below the first cell there is nothing
         above = Window.of([max(low, 1) for low in box.low], box.high, box.device)
         above.run(passes.weights, cell=fine.cell, mixed=fine.mixed, phi=self._phi, planes=planes, scale=tau, **edges, **faces, **where)
@@ -214,15 +214,13 @@ class Viscosity:
         return [*self.boundary.velocity] or [None] * self.grid.dimension
 
     def _force(self, inner: Window, given: dict[str, Any], *, changed: bool) -> list[float]:
-        """Write the residual; return its norm, the energy that the velocity loses by the force, what walls give, and the diagonal's norm."""
+        """Write the residual; return its norm, the energy lost by the force, what walls give, and the diagonal's norm."""
         fine, found, solids = self._fine, np.zeros(4), self._solids
         residual, velocity, distance = self.multigrid.components(self.multigrid.r), given["u"], self._distance
         for axis in range(self.grid.dimension):
             of = {"u": velocity[axis], "d": distance[axis], "h": self._slip[axis], "own": solids[axis]}
-            for letter, other in zip("bc", fine.others(axis), strict=True):
-                there = other is not None
-                of |= {f"u{letter}": velocity[other] if there else None, f"d{letter}": distance[other] if there else None}
-                of |= {f"solid_{letter}": solids[other] if there else None}
+            for name, fields in (("u", velocity), ("d", distance), ("solid_", solids)):
+                of |= dict(zip((f"{name}b", f"{name}c"), fine.of_others(axis, fields), strict=True))
             of |= {"cell": fine.cell, "mixed": fine.mixed, "volume": fine.volume[axis], "diagonal": fine.diagonal[axis]}
             of |= {"change": self.change[axis] if changed else None, "r": residual[axis], "axis": axis, "planes": self.grid.planes}
             where = {

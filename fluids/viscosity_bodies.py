@@ -83,11 +83,11 @@ class BodyDrag:
             assert window is not None
             of = given | level.across(axis) | {"axis": axis, "d": distance[axis], "h": slip[axis], "diagonal": level.diagonal[axis]}
             of |= {"wall": wall[axis], "from_": axis * grid.size}
-            for letter, other in zip("bc", level.others(axis), strict=True):
-                there = other is not None
-                of |= {f"d{letter}": distance[other] if there else None, f"wall_{letter}": wall[other] if there else None}
+            of |= dict(zip(("db", "dc"), level.of_others(axis, distance), strict=True))
+            of |= dict(zip(("wall_b", "wall_c"), level.of_others(axis, wall), strict=True))
             found.append(self._entries(window, of))
-        self._find_response(*(np.concatenate(parts) for parts in zip(*found, strict=True)), velocity)
+        rows, blocks, values = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        self._find_response(rows, blocks, values, velocity)
 
     def _entries(self, window: Window, given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return rows, bodies and values of a component's entries."""

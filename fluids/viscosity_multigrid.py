@@ -1,11 +1,12 @@
 """Multigrid for the viscous equations: one symmetric cycle, the preconditioner of conjugate gradients.
 
-Coarse levels have the equations of the same form with the means of what the finer one weighs; unknowns are carried linearly, those beside air
-by the neighbors there are. Gauss-Seidel takes one component after the other, two colors of rows each, and back.
+Coarse levels have equations of the same form with the means of what the finer one weighs; unknowns are carried linearly, beside air by
+those there are. Gauss-Seidel takes one component after the other, two colors of rows each, and back.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
@@ -25,15 +26,16 @@ class VectorLevel:
 
     Args:
         grid: the level's.
-        finest: whether right-hand side and solution are given from outside.
+        x: its solution.
+        b: its right-hand side.
 
     Attributes:
         cell: weights of links along a component's own axis.
         mixed: of those, what is left out of the products of different components where walls are, see `fluids.viscosity`.
         edges: weights of links across, by pairs of axes.
-        volume, drag, diagonal, hold, norm: of the faces of each component: what weighs, what walls add, the sum; whether a wall holds it; the
-            interpolation's normalization.
-        x, b: solution and right-hand side, and `r`, the residual.
+        volume, drag, diagonal, hold, norm, there: of the faces of each component: what weighs, what walls add, the sum; whether a wall
+            holds it; the interpolation's normalization; and what that is to find.
+        r: the residual, and what a sweep keeps.
         span: where a row's unknowns begin and end.
     """
 
@@ -49,13 +51,17 @@ class VectorLevel:
         """Return the two other axes; None: there is none."""
         return [*(a for a in range(self.dimension) if a != axis), None][:2]
 
-    def across(self, axis: int) -> dict[str, wp.array | None]:
+    def of_others(self, axis: int, fields: Sequence[Any]) -> list[Any]:
+        """Return what other components have of fields, a field a component."""
+        return [None if other is None else fields[other] for other in self.others(axis)]
+
+    def across(self, axis: int) -> dict[str, Any]:
         """Return the weights of links across for a component."""
         of = [None if other is None else self.edges[min(axis, other), max(axis, other)] for other in self.others(axis)]
         return {"xb": of[0], "xc": of[1]}
 
     def _row(self, axis: int, x: list[wp.array]) -> dict[str, Any]:
-        y, z = (None if other is None else x[other] for other in self.others(axis))
+        y, z = self.of_others(axis, x)
         given = {"x": x[axis], "y": y, "z": z, "cell": self.cell, "mixed": self.mixed, "diagonal": self.diagonal[axis]}
         return given | self.across(axis) | {"axis": axis, "span": self.span}
 
@@ -109,13 +115,8 @@ class VectorLevel:
         if inner is None:
             return
         for axis in axes:
-            given = {
-                "h": self.hold[axis],
-                "volume": self.volume[axis],
-                "drag": self.drag[axis],
-                "cell": self.cell,
-                "there": self.there[axis],
-            }
+            given = {"h": self.hold[axis], "volume": self.volume[axis], "drag": self.drag[axis], "cell": self.cell}
+            given["there"] = self.there[axis]
             window.run(self.passes.coarse_diagonal, diagonal=self.diagonal[axis], axis=axis, planes=planes, **given, **self.across(axis))
         self.find_spans(inner)
 

@@ -38,19 +38,19 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
     """
     deep = dimension == 3
 
-    def made(name: str, box: dict[str, Any], numbers: str = "axis", real: Any = F32, apart: str = "", **more: Any) -> RowPass:
+    def made(name: str, box: dict[str, Any], numbers: str, *, apart: str = "", **more: Any) -> RowPass:
         types = {word: F32 if word in ("scale", "dx") else int for word in numbers.split()}
         module = f"fluids.viscosity_{dimension}d{apart}"
-        return RowPass(f"{module}.{name}", HEADERS / f"viscous_{name}.h", real, box=box, numbers=types, **more)
+        return RowPass(f"{module}.{name}", HEADERS / f"viscous_{name}.h", F32, box=box, numbers=types, **more)
 
     walls = "_cut" * cut + "_ghost" * ghost + "_moving" * moving
     macros = KINDS | LIMITS | {"CUT": cut, "GHOST": ghost, "MOVING": moving}
     cells: dict[str, Any] = {"kind": I8, "contact": U8}
-    stencil, spans = _fields("x y z xb xc cell mixed diagonal"), {"whole": {"span": wp.int32}, "optional": ("z", "xc", "right")}
-    levels: dict[str, Any] = {"constants": {}}
-    carried = {"whole": _fields("coarse") | {"span": wp.int32}, "optional": ("diagonal", "x")}
-    sums = {"sums": ("residual", "taken", "given_by_walls", "stiff")}
-    near = {"apart": walls, "constants": macros}
+    stencil, row = _fields("x y z xb xc cell mixed diagonal"), {"span": wp.int32}
+    spans: dict[str, Any] = {"whole": row, "optional": ("z", "xc", "right")}
+    carried: dict[str, Any] = {"whole": _fields("coarse") | row, "optional": ("diagonal", "x")}
+    sums: dict[str, Any] = {"sums": ("residual", "taken", "given_by_walls", "stiff")}
+    near: dict[str, Any] = {"apart": walls, "constants": macros}
     return SimpleNamespace(
         distance=made(
             "distance", _fields("out hold nodes") | {"kind": I8, "wall": wp.int16, "index": wp.int32}, "axis planes walls",
@@ -64,7 +64,9 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
             "diagonal", _fields("diagonal drag held d h cell xb xc volume") | cells, "axis planes", optional=("xc",), **near
         ),
         force=made(
-            "force", _fields("r diagonal u ub uc d h db dc cell mixed xb xc volume change own solid_b solid_c") | cells | {"wall": wp.int16, "base": I8},
+            "force",
+            _fields("r diagonal u ub uc d h db dc cell mixed xb xc volume change own solid_b solid_c")
+            | cells | {"wall": wp.int16, "base": I8},
             "axis planes before_x before_y before_z dx", whole=_fields("turn shift"),
             optional=("uc", "dc", "xc", "change", "own", "solid_b", "solid_c", "wall", "turn", "shift"), **sums, **near,
         ),
@@ -78,17 +80,17 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
         cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
         add=made("add", _fields("u total more"), ""),
         sum=made("sum", _fields("u kept more"), ""),
-        span=made("span", _fields("dx dy dz"), "", whole={"span": wp.int32}, optional=("dz",)),
+        span=made("span", _fields("dx dy dz"), "", whole=row, optional=("dz",)),
         sweep=made(
-            "sweep", stencil | _fields("b scratch"), "axis color order only", constants={"DEPTH": deep}, whole={"span": wp.int32},
+            "sweep", stencil | _fields("b scratch"), "axis color order only", constants={"DEPTH": deep}, whole=row,
             optional=("z", "xc"),
         ),
-        product=made("apply", stencil | _fields("out right"), constants={"DEPTH": deep, "RESIDUAL": False}, **spans),
-        residual=made("apply", stencil | _fields("out right"), apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans),
-        average=made("average", _fields("out"), "planes faces scale", whole={"fine": F32}, **levels),
-        close=made("close", _fields("out"), "axis planes", whole={"fine": F32}, **levels),
+        product=made("apply", stencil | _fields("out right"), "axis", constants={"DEPTH": deep, "RESIDUAL": False}, **spans),
+        residual=made("apply", stencil | _fields("out right"), "axis", apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans),
+        average=made("average", _fields("out"), "planes faces scale", whole={"fine": F32}),
+        close=made("close", _fields("out"), "axis planes", whole={"fine": F32}),
         coarse_diagonal=made("coarse_diagonal", _fields("diagonal there h volume drag cell xb xc"), "axis planes", optional=("xc",)),
         normalize=made("prolong", _fields("norm diagonal x"), "axis planes", apart="_norm", constants={"NORM": True}, **carried),
         prolong=made("prolong", _fields("norm diagonal x"), "axis planes", constants={"NORM": False}, **carried),
-        restrict=made("restrict", _fields("out diagonal"), "axis planes", whole=_fields("fine norm") | {"span": wp.int32}),
+        restrict=made("restrict", _fields("out diagonal"), "axis planes", whole=_fields("fine norm") | row),
     )  # fmt: skip

@@ -230,7 +230,10 @@ class SolidProperties(Shape):
     rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
     wall: Wall | None = Field(default=None, description="whether material may let go of it; domain.wall unless given")
     slip_length: float | None = Field(
-        default=None, ge=0, allow_inf_nan=True, description="of a thick liquid on it [m], 0: none, inf: free slip; viscosity.slip_length unless given"
+        default=None,
+        ge=0,
+        allow_inf_nan=True,
+        description="of a thick liquid on it [m], 0: none, inf: free slip; viscosity.slip_length unless given",
     )
     motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
     mass: float | None = Field(default=None, ge=1e-18, description="makes it a rigid body that the material moves [kg; kg/m in 2-D]")
