@@ -86,7 +86,9 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
             optional=("z", "xc"),
         ),
         product=made("apply", stencil | _fields("out right"), "axis", constants={"DEPTH": deep, "RESIDUAL": False}, **spans),
-        residual=made("apply", stencil | _fields("out right"), "axis", apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans),
+        residual=made(
+            "apply", stencil | _fields("out right"), "axis", apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans
+        ),
         average=made("average", _fields("out"), "planes faces scale", whole={"fine": F32}),
         close=made("close", _fields("out"), "axis planes", whole={"fine": F32}),
         coarse_diagonal=made("coarse_diagonal", _fields("diagonal there h volume drag cell xb xc"), "axis planes", optional=("xc",)),
