@@ -12,6 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.fluids.unilateral import UnilateralPressure
@@ -119,6 +120,8 @@ class LiquidSimulation(ParticleSimulation):
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.reach = max(self.layers, 2 * scene.pressure.smoothing)
+        self.probes = Probes(scene.probe, self.gravity, grid.dimension) if scene.probe else None
+        self.measured: dict[str, Row] = {}
         self.mark()
 
     def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
@@ -158,6 +161,7 @@ class LiquidSimulation(ParticleSimulation):
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
+        self._measure(dt)
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
         row = self.move(dt, window) | self.solve_row(projected.result)
@@ -167,6 +171,20 @@ class LiquidSimulation(ParticleSimulation):
         if automatic is not None and projected.result is not None:
             row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
         return self.logged(row | {"active": projected.released})
+
+    def tables(self) -> dict[str, tuple[str, ...]]:
+        """Return the columns of the tables beside the log; `measured` has the last step's row of each.
+
+        `time` is that of pressures, levels and forces: the step's beginning; velocities are those of its middle.
+        """
+        return {} if self.probes is None else {"probes": ("step", "time", *self.probes.columns())}
+
+    def _measure(self, dt: float) -> None:
+        """Fill the rows of the tables, if there are any."""
+        clock = {"step": self.step_count + 1, "time": self.time}
+        if self.probes is not None:
+            with self.watch.stage("probes", *self.velocity, self.projection.pressure):
+                self.measured["probes"] = clock | self.probes.row(self, self.kick_dt)
 
     def known_density(self) -> wp.array | None:
         """Return the density that the surface lies in, if it is made of one."""
@@ -330,6 +348,8 @@ class FluidsSimulator:
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
         """Build a rank's part of a simulation of `scene`, see `fluids.distributed.create`."""
+        if isinstance(scene, LiquidScene) and scene.probe:
+            raise ValueError("probe: --engine petsc has no probes")
         from warp_lcp.fluids.distributed import create  # what it needs is an extra
 
         return create(scene, ranks, device=device, folder=folder)

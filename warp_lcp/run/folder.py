@@ -41,7 +41,7 @@ SCENE = "scene.toml"
 ROUNDING = 1e-9
 BEFORE = "before its first step had ended"
 LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
-OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|log\.csv|[a-z][a-z_]*\.pvd")
+OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd")
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
 CHECKPOINTS = "checkpoints"
 STORED_STATE = re.compile(f"{CHECKPOINT_FILE.pattern}|{REFUSED_FILE.pattern}")
@@ -295,9 +295,9 @@ class RunFolder:
                 file.unlink()
         self.checkpoints.set_aside(step)
 
-    def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None) -> Log:
-        """Begin the log or continue it, see `Log`."""
-        return Log(self.log, columns, after_step=after_step, collective=self.collective)
+    def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None, table: str = "log") -> Log:
+        """Begin the log or continue it, see `Log`; or another table."""
+        return Log(self.log.with_stem(table), columns, after_step=after_step, collective=self.collective)
 
     def frame_writer(self, watch: Stopwatch) -> FrameWriter | RankFrameWriter:
         """Return what writes the frames while the simulation goes on."""
