@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_lcp.fluids.scene import Probe
+from warp_lcp.fluids.tables import Probe
 from warp_lcp.grid.cell_kernel import F32, F64, I8, interpolated
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.material.particle_log import Row
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 if typing.TYPE_CHECKING:
@@ -57,18 +57,16 @@ def depth_of(x: wp.vec3, planes: int, shape: wp.vec3i, kind: I8, phi: F32):
 @wp.kernel(**options)
 @typing.no_type_check
 def probe_kernel(
-    points: wp.array(dtype=wp.vec3), low: wp.vec3, counts: wp.vec3i, planes: int, kind: I8, x: F64, phi: F32, u: F32, v: F32, w: F32,
+    points: wp.array(dtype=wp.vec3), counts: wp.vec3i, planes: int, kind: I8, x: F64, phi: F32, u: F32, v: F32, w: F32,
     kick: wp.vec3, up: wp.vec3, values: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
-    """Find x [m/s], velocity [m/s] and level [cells] at points in grid coordinates, of a grid that begins at `low`.
+    """Find x [m/s], velocity [m/s] and level [cells] at points in array coordinates, in which cell i reaches from i to i + 1.
 
-    Args:
-        kick: what gravity adds to x from a cell to the next along each axis [m/s].
-        up: against gravity, of length 1.
+    `kick` [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points against it and has length 1.
     """
     t = wp.tid()
     shape = counts + wp.vec3i(2, 2, 2)
-    p = points[t] - low
+    p = points[t]
     inside = bool(True)
     cell = wp.vec3i(1, 1, 1)
     for axis in range(planes + 1):
@@ -89,10 +87,10 @@ def probe_kernel(
         for n in range(4 * planes):
             at, share = corner(c, n, planes, shape)
             if kind[at[2], at[1], at[0]] == _FLUID:
-                way = c - wp.vec3(float(at[0]), float(at[1]), float(at[2]))
+                off = c - wp.vec3(float(at[0]), float(at[1]), float(at[2]))
                 rise = float(0.0)
                 for axis in range(planes + 1):
-                    rise += kick[axis] * way[axis]
+                    rise += kick[axis] * off[axis]
                 found += wp.float64(share) * (x[at[2], at[1], at[0]] + wp.float64(rise))
                 total += share
         if total > 0.0:
@@ -102,22 +100,25 @@ def probe_kernel(
         if planes == 2:
             values[t, 3] = wp.float64(interpolated(w, planes, c[0], c[1], p[2]))
     if inside:
+        room = float(1.0e9)  # to the grid's end
+        for axis in range(planes + 1):
+            if up[axis] != 0.0:
+                end = wp.where(up[axis] > 0.0, float(counts[axis]) + 1.0, 1.0)
+                room = wp.min(room, (end - p[axis]) / up[axis])
         deep, total = depth_of(c, planes, shape, kind, phi)
         level = float(0.0)
         looking = bool(deep > 0.0)
         while looking:
-            q = c + (level + STEP) * up
-            for axis in range(planes + 1):
-                looking = looking and q[axis] >= 0.5 and q[axis] <= float(counts[axis]) + 0.5
+            way = wp.min(STEP, room - level)
             last = deep
-            deep, total = depth_of(q, planes, shape, kind, phi)
-            looking = looking and total > 0.0
+            deep, total = depth_of(c + (level + way) * up, planes, shape, kind, phi)
+            looking = total > 0.0 and way > 0.0
             if looking:
                 if deep <= 0.0:
-                    level += STEP * last / (last - deep)
+                    level += way * last / (last - deep)
                     looking = False
                 else:
-                    level += STEP
+                    level += way
         values[t, 4] = wp.float64(level)
 
 
@@ -127,7 +128,7 @@ class Probes:
     Pressure is interpolated trilinearly from the liquid's cells; air and solids among the eight around a point are left out, and what the
     others have is continued to the point by the pressure at rest's gradient rho g. Velocity is trilinear on each component's faces. Where
     the point's cell holds no liquid pressure is 0 and velocity has no value. The level is the way from the point against gravity to the
-    first surface above it, through walls' and the domain's ends at the most; 0 if the point is not in liquid.
+    first surface above it, or to the solid or the domain's end that comes before; 0 if the point is not in liquid.
 
     Args:
         probes: of the scene.
@@ -145,22 +146,22 @@ class Probes:
         """Return the names of the columns: NAME_pressure [Pa], NAME_level [m], NAME_vx, NAME_vy and in 3-D NAME_vz [m/s]."""
         return tuple(column for probe in self.probes for column in probe.columns(self.dimension))
 
-    def row(self, simulation: "LiquidSimulation", kick_dt: float) -> dict[str, float]:
-        """Return what a step has found, before anything moves; `kick_dt` is how long forces acted in it [s]."""
-        found = self._measure(simulation, simulation.grid, kick_dt)
-        density, dx, row = simulation.scene.physics.density, simulation.grid.spacing, {}
+    def row(self, simulation: "LiquidSimulation") -> Row:
+        """Return what a step has found, before anything moves."""
+        found, scale = self._measure(simulation), simulation.scene.physics.density * simulation.grid.spacing / simulation.kick_dt
+        row: Row = {}
         for probe, values in zip(self.probes, found, strict=True):
-            shown = {"pressure": values[:1] * density * dx / kick_dt, "velocity": values[1:4], "level": values[4:] * dx}
+            shown = {"pressure": values[:1] * scale, "velocity": values[1:4], "level": values[4:] * simulation.grid.spacing}
             row |= dict(zip(probe.columns(self.dimension), shown[probe.quantity].tolist(), strict=False))
         return row
 
-    def _measure(self, simulation: "LiquidSimulation", grid: StaggeredGrid, kick_dt: float) -> np.ndarray:
+    def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
         """Return x [m/s], velocity [m/s] and level [cells] of each probe."""
-        projection, velocity = simulation.projection, [*simulation.velocity, None][:3]
-        points = wp.array(grid.to_grid(self._points).astype(np.float32), dtype=wp.vec3, device=grid.device)
+        grid, projection, velocity = simulation.grid, simulation.projection, [*simulation.velocity, None][:3]
+        points = wp.array((grid.to_grid(self._points) - grid.origin).astype(np.float32), dtype=wp.vec3, device=grid.device)
         values = wp.zeros((len(self.probes), VALUES), dtype=wp.float64, device=grid.device)
-        at = [points, wp.vec3(*map(float, grid.origin)), wp.vec3i(*grid.counts), grid.planes]
         fields = [projection.kind, projection.pressure, simulation.surface.phi, *velocity]
-        inputs = [*at, *fields, wp.vec3(*(self.gravity * kick_dt)), wp.vec3(*self._up), values]
+        kick = wp.vec3(*(self.gravity * simulation.kick_dt))
+        inputs = [points, wp.vec3i(*grid.counts), grid.planes, *fields, kick, wp.vec3(*self._up), values]
         wp.launch(probe_kernel, len(self.probes), inputs, device=grid.device)
-        return values.numpy()
+        return np.asarray(values.numpy())

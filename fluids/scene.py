@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from pydantic import AfterValidator, Field
-from pydantic_core import PydanticCustomError
+from pydantic import Field
 
+from warp_lcp.fluids.tables import LiquidOutput, Probe, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
-from warp_lcp.scene.scene import Complaint, Liquid, Output, Table, Vector
+from warp_lcp.scene.scene import Complaint, Liquid, Table
 from warp_lcp.scene.shapes import MaterialProperties
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
@@ -38,26 +38,6 @@ class Pressure(Table):
     smoothing: int = Field(default=0, ge=0, le=8, description="binomial passes over the level set of a ghost-fluid surface")
 
 
-def _column_name(text: str) -> str:
-    """Return a name that columns may begin with."""
-    if not (text.isascii() and text.isidentifier()):
-        raise PydanticCustomError("name", 'must be a name of letters, digits and "_" that begins with no digit')
-    return text
-
-
-class Probe(Table):
-    """[[probe]]: a point at which every step is measured, for probes.csv."""
-
-    name: Annotated[str, AfterValidator(_column_name)] = Field(description="of its columns, such as NAME_pressure")
-    position: Vector = Field(description="the point [m], in the domain")
-    quantity: Literal["pressure", "velocity", "level"] = Field(description="level: height of the surface above it, against gravity [m]")
-
-    def columns(self, dimension: int) -> tuple[str, ...]:
-        """Return the names of its columns."""
-        parts = ("vx", "vy", "vz")[:dimension] if self.quantity == "velocity" else (self.quantity,)
-        return tuple(f"{self.name}_{part}" for part in parts)
-
-
 class LiquidScene(ParticleScene):
     """A scene of liquid: the tables of all materials, `pressure` and `liquid`."""
 
@@ -67,6 +47,7 @@ class LiquidScene(ParticleScene):
     pressure: Pressure = Field(default_factory=Pressure)
     liquid: list[Liquid] = Field(default_factory=list)
     probe: list[Probe] = Field(default_factory=list)
+    output: LiquidOutput = Field(default_factory=LiquidOutput)
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return `liquid` and its shapes."""
@@ -92,24 +73,7 @@ class LiquidScene(ParticleScene):
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which tells how full cells are'
             found.append(Complaint(("particles", "narrow_band"), None, message))
-        return [*found, *self._probe_complaints()]
-
-    def _probe_complaints(self) -> list[Complaint]:
-        """Return what is wrong with the probes."""
-        found = []
-        for index, probe in enumerate(self.probe):
-            place, size = ("probe", index, "position"), self.domain.size
-            if len(probe.position) != self.dimension:
-                found.append(Complaint(place, probe.position, f"must have {self.dimension} entries, as domain.size has"))
-            elif not all(0.0 <= x <= side for x, side in zip(probe.position, size, strict=True)):
-                found.append(Complaint(place, probe.position, f"lies outside the domain, which reaches from the origin to {size} m"))
-            if any((probe.name, probe.quantity) == (other.name, other.quantity) for other in self.probe[:index]):
-                message = f"is the name of another probe of the {probe.quantity}: their columns would be the same"
-                found.append(Complaint(("probe", index, "name"), probe.name, message))
-            if probe.quantity == "level" and not any(self.physics.gravity):
-                message = "needs gravity, along which it is measured"
-                found.append(Complaint(("probe", index, "quantity"), "level", message))
-        return found
+        return [*found, *probe_complaints(self.probe, self.domain.size, self.physics.gravity)]
 
     def models(self) -> list[Model]:
         """Return the models that the scene turns on, and those that it asks for but cannot need."""
@@ -130,6 +94,10 @@ class LiquidScene(ParticleScene):
             found.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
             found.append(Model("automatic tolerance", 'solver.tolerance = "auto"'))
+        if self.probe:
+            found.append(Model("probes", "[[probe]]"))
+        if self.output.forces:
+            found.append(Model("forces on solids", "output.forces"))
         return [*found, *super().models()]
 
     @property

@@ -161,7 +161,7 @@ class LiquidSimulation(ParticleSimulation):
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
-        self._measure(dt)
+        self._measure()
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
         row = self.move(dt, window) | self.solve_row(projected.result)
@@ -179,12 +179,12 @@ class LiquidSimulation(ParticleSimulation):
         """
         return {} if self.probes is None else {"probes": ("step", "time", *self.probes.columns())}
 
-    def _measure(self, dt: float) -> None:
+    def _measure(self) -> None:
         """Fill the rows of the tables, if there are any."""
-        clock = {"step": self.step_count + 1, "time": self.time}
+        clock: Row = {"step": self.step_count + 1, "time": self.time}
         if self.probes is not None:
             with self.watch.stage("probes", *self.velocity, self.projection.pressure):
-                self.measured["probes"] = clock | self.probes.row(self, self.kick_dt)
+                self.measured["probes"] = clock | self.probes.row(self)
 
     def known_density(self) -> wp.array | None:
         """Return the density that the surface lies in, if it is made of one."""
@@ -348,8 +348,6 @@ class FluidsSimulator:
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
         """Build a rank's part of a simulation of `scene`, see `fluids.distributed.create`."""
-        if isinstance(scene, LiquidScene) and scene.probe:
-            raise ValueError("probe: --engine petsc has no probes")
         from warp_lcp.fluids.distributed import create  # what it needs is an extra
 
         return create(scene, ranks, device=device, folder=folder)

@@ -262,19 +262,20 @@ class RunFolder:
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
 
-    def gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
-        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.run.gaps`.
+    def gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
+        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.run.gaps`; tables as of `open_log`.
 
         Raises:
             OSError: a file cannot be read.
             OutputError: the log has other columns.
         """
-        return self._gaps(columns, step, times, frame) or []
+        return self._gaps(tables, step, times, frame) or []
 
     @on_root
-    def _gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
+    def _gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
         whole = self.frames.whole if isinstance(self.frames, RankFrames) else self.frames
-        return gaps(self.log, columns, whole, self.checkpoints, step=step, times=times, frame=frame)
+        logs = {self.log.with_stem(name): columns for name, columns in tables.items()}
+        return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
 
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -284,7 +284,7 @@ class Run:
         self._first_step = self.simulation.step_count
         self._count()
         times = [self.time.frame_time(index) for index in range(self.record.frames + 1)]
-        for gap in self.folder.gaps(self._columns(), self._first_step, times, frame):
+        for gap in self.folder.gaps({"log": self._columns(), **self._table_columns()}, self._first_step, times, frame):
             self._warn(gap)
         self.folder.go_on(self.record, self._first_step)
         self.folder.frames.resume(times)
@@ -292,8 +292,11 @@ class Run:
 
     def _open_tables(self, stack: ExitStack, after_step: int | None) -> None:
         """Begin or continue the tables beside the log, to be closed by a stack."""
-        for name, columns in self.simulation.tables().items() if isinstance(self.simulation, Measured) else ():
+        for name, columns in self._table_columns().items():
             self._tables[name] = stack.enter_context(closing(self.folder.open_log(columns, after_step=after_step, table=name)))
+
+    def _table_columns(self) -> Mapping[str, tuple[str, ...]]:
+        return self.simulation.tables() if isinstance(self.simulation, Measured) else {}
 
     def _columns(self) -> tuple[str, ...]:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")
