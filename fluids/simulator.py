@@ -11,6 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
+from warp_lcp.fluids.forces import SolidForces, WallSums
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
@@ -19,6 +20,7 @@ from warp_lcp.fluids.unilateral import UnilateralPressure
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.material.boundary import Boundary, CutBoundary
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.coverage import start_of
@@ -106,17 +108,29 @@ class LiquidSimulation(ParticleSimulation):
         grid: the one that it starts on.
         parts: what of it belongs to that grid.
         particles: the liquid at the start.
+        solids: of the scene, where something asks for the forces on them.
         more: as of `ParticleSimulation`.
 
     Attributes:
         surface: the free surface.
+        forces: what the step has done to each solid; None: nobody asks.
         projection: the pressure's fields.
         record: takes the problem of each step before it is solved, if it is set.
     """
 
     scene: LiquidScene
 
-    def __init__(self, scene: LiquidScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any) -> None:
+    def __init__(
+        self,
+        scene: LiquidScene,
+        grid: StaggeredGrid,
+        parts: Parts,
+        particles: Particles,
+        *,
+        solids: Sequence[PlacedSolid] = (),
+        **more: Any,
+    ) -> None:
+        self.forces = SolidForces(solids, grid.dimension) if scene.output.forces else None
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.reach = max(self.layers, 2 * scene.pressure.smoothing)
@@ -129,6 +143,7 @@ class LiquidSimulation(ParticleSimulation):
         super().lay(grid, parts)
         self.surface = self._surface()
         self.projection = self._pressure()
+        self.wall_sums = WallSums(grid, self.boundary, len(self.forces.references)) if self.forces is not None else None
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
@@ -158,6 +173,7 @@ class LiquidSimulation(ParticleSimulation):
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
+        self._push_solids(window)
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
@@ -177,7 +193,8 @@ class LiquidSimulation(ParticleSimulation):
 
         `time` is that of pressures, levels and forces: the step's beginning; velocities are those of its middle.
         """
-        return {} if self.probes is None else {"probes": ("step", "time", *self.probes.columns())}
+        measured = {"probes": self.probes, "forces": self.forces}
+        return {name: ("step", "time", *found.columns()) for name, found in measured.items() if found is not None}
 
     def _measure(self) -> None:
         """Fill the rows of the tables, if there are any."""
@@ -185,6 +202,15 @@ class LiquidSimulation(ParticleSimulation):
         if self.probes is not None:
             with self.watch.stage("probes", *self.velocity, self.projection.pressure):
                 self.measured["probes"] = clock | self.probes.row(self)
+        if self.forces is not None:
+            self.measured["forces"] = clock | self.forces.row(self.kick_dt)
+
+    def _push_solids(self, window: Window) -> None:
+        """Collect what the projection has done to solids, before closed faces take other velocities."""
+        if self.forces is not None and self.wall_sums is not None:
+            with self.watch.stage("forces on solids", self.projection.pressure, self.boundary.touch):
+                self.forces.begin(self.time)
+                self.forces.add_pressure(self.wall_sums, window, self)
 
     def known_density(self) -> wp.array | None:
         """Return the density that the surface lies in, if it is made of one."""
@@ -343,7 +369,8 @@ class FluidsSimulator:
         particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
         outlets, spray = make_outlets(scene, grid, folder), make_spray(scene, coverage, solids)
         return LiquidSimulation(
-            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray, notes=[*warnings, *notes]
+            scene, grid, parts, particles, solids=solids, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray,
+            notes=[*warnings, *notes],
         )  # fmt: skip
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:

@@ -181,6 +181,10 @@ CASES = {
         {"solver": {"tolerance": "auto"}}, modules=("warp_lcp.tolerance",), files=("fluids/tolerance.py",),
         columns=("tolerance", "time_error"),
     ),
+    "probes": Case(
+        {"probe": [{"name": "a", "position": [0.1, 0.1], "quantity": "pressure"}]}, modules=("fluids.probes",), files=("fluids/probes.py",)
+    ),
+    "forces on solids": Case({"output": QUIET | {"forces": True}}, modules=("fluids.forces",), files=("fluids/forces.py",)),
     "rigid bodies in sand": Case(
         {"solid": [BALL | {"density": 500.0}]}, {"solid": [SWAYING]}, modules=("granular.bodies",), files=("granular/bodies.py",),
         columns=("body0_x", "contacts"), sand=True,
