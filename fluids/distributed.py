@@ -351,6 +351,7 @@ def refusals(scene: LiquidScene) -> list[str]:
         "output.volume": output.volume,
         "output.forces": output.forces,
         "probe": scene.probe,
+        "wall_drag": scene.drags,
     }
     return [key for key, wanted in asked.items() if wanted]
 

@@ -15,7 +15,8 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.particle_log import Row
-from warp_lcp.rigid.body import BodyMotion
+from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rigid.body import PLANAR, BodyMotion
 
 if TYPE_CHECKING:
     from warp_lcp.fluids.simulator import LiquidSimulation
@@ -80,6 +81,10 @@ class WallSums:
         owners, values = self._owners.numpy()[:total], self._values.numpy()[:total]
         return np.stack([np.bincount(owners, weights=column, minlength=self.solids) for column in values.T], axis=-1)
 
+    def launch(self, kernel: wp.Kernel, window: Window, given: Sequence[Any]) -> None:
+        """Launch a kernel for what else it does; its entries are counted only."""
+        window.launch_rows(kernel, [self.walls, None, self._counts, None, None, None, *given])
+
     def _reserve(self, count: int) -> None:
         self._owners = wp.zeros(count, dtype=wp.int32, device=self.grid.device)
         self._values = wp.zeros((count, 6), dtype=wp.float64, device=self.grid.device)
@@ -140,9 +145,15 @@ class SolidForces:
         kick = wp.vec3(*(simulation.gravity * simulation.kick_dt))
         self.add(sums.take(kernels.pressure_kernel, window, self.references, [*given, kick, scale]))
 
+    @staticmethod
+    def push(bodies: RigidBodies, impulses: np.ndarray) -> None:
+        """Give rigid bodies impulses that they have not got otherwise, of the shape of `impulses`."""
+        for number, body in zip(bodies.numbers, bodies.bodies, strict=True):
+            body.apply_impulse(impulses[number] if bodies.dimension == 3 else impulses[number][PLANAR])
+
     def row(self, kick_dt: float) -> Row:
         """Return forces and torques of the step, in which forces acted for `kick_dt` [s]."""
-        shown = self.impulses if self._dimension == 3 else self.impulses[:, [0, 1, 5]]
+        shown = self.impulses if self._dimension == 3 else self.impulses[:, PLANAR]
         return dict(zip(self.columns(), (shown / kick_dt).ravel().tolist(), strict=True))
 
 

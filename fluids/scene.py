@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from warp_lcp.fluids.tables import LiquidOutput, Probe, probe_complaints
+from warp_lcp.fluids.tables import LiquidOutput, Probe, WallDragSettings, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
@@ -47,6 +47,7 @@ class LiquidScene(ParticleScene):
     pressure: Pressure = Field(default_factory=Pressure)
     liquid: list[Liquid] = Field(default_factory=list)
     probe: list[Probe] = Field(default_factory=list)
+    wall_drag: WallDragSettings | None = None
     output: LiquidOutput = Field(default_factory=LiquidOutput)
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
@@ -98,7 +99,17 @@ class LiquidScene(ParticleScene):
             found.append(Model("probes", "[[probe]]"))
         if self.output.forces:
             found.append(Model("forces on solids", "output.forces"))
+        if self.drags is not None:
+            found.append(Model("drag along walls", "[wall_drag]" if self.wall_drag is not None else "drag of a solid"))
         return [*found, *super().models()]
+
+    @property
+    def drags(self) -> list[float] | None:
+        """Return c_f of the domain's walls and of each solid, see `fluids.wall_drag`; None: no wall drags."""
+        table = self.wall_drag or WallDragSettings()
+        walls = [table.domain, *(solid.drag for solid in self.solid)]
+        found = [table.coefficient if given is None else given for given in walls]
+        return found if any(found) else None
 
     @property
     def keeps_volume(self) -> bool:

@@ -17,6 +17,7 @@ from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.fluids.unilateral import UnilateralPressure
+from warp_lcp.fluids.wall_drag import WallDrag
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -130,7 +131,8 @@ class LiquidSimulation(ParticleSimulation):
         solids: Sequence[PlacedSolid] = (),
         **more: Any,
     ) -> None:
-        self.forces = SolidForces(solids, grid.dimension) if scene.output.forces else None
+        tell = scene.output.forces or (scene.drags is not None and more.get("bodies") is not None)
+        self.forces = SolidForces(solids, grid.dimension) if tell else None
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.reach = max(self.layers, 2 * scene.pressure.smoothing)
@@ -143,7 +145,10 @@ class LiquidSimulation(ParticleSimulation):
         super().lay(grid, parts)
         self.surface = self._surface()
         self.projection = self._pressure()
-        self.wall_sums = WallSums(grid, self.boundary, len(self.forces.references)) if self.forces is not None else None
+        drags, physics = self.scene.drags, self.scene.physics
+        asked = self.forces is not None or drags is not None
+        self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
+        self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
@@ -173,14 +178,14 @@ class LiquidSimulation(ParticleSimulation):
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
-        self._push_solids(window)
+        walls = self._meet_walls(window, dt)
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self._measure()
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
-        row = self.move(dt, window) | self.solve_row(projected.result)
+        row = self.move(dt, window) | self.solve_row(projected.result) | walls
         if self.scene.output.diagnostics:
             row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
         automatic = self.projection.automatic
@@ -193,7 +198,7 @@ class LiquidSimulation(ParticleSimulation):
 
         `time` is that of pressures, levels and forces: the step's beginning; velocities are those of its middle.
         """
-        measured = {"probes": self.probes, "forces": self.forces}
+        measured = {"probes": self.probes, "forces": self.forces if self.scene.output.forces else None}
         return {name: ("step", "time", *found.columns()) for name, found in measured.items() if found is not None}
 
     def _measure(self) -> None:
@@ -202,15 +207,34 @@ class LiquidSimulation(ParticleSimulation):
         if self.probes is not None:
             with self.watch.stage("probes", *self.velocity, self.projection.pressure):
                 self.measured["probes"] = clock | self.probes.row(self)
-        if self.forces is not None:
+        if self.forces is not None and self.scene.output.forces:
             self.measured["forces"] = clock | self.forces.row(self.kick_dt)
 
-    def _push_solids(self, window: Window) -> None:
-        """Collect what the projection has done to solids, before closed faces take other velocities."""
-        if self.forces is not None and self.wall_sums is not None:
-            with self.watch.stage("forces on solids", self.projection.pressure, self.boundary.touch):
-                self.forces.begin(self.time)
-                self.forces.add_pressure(self.wall_sums, window, self)
+    def _meet_walls(self, window: Window, dt: float) -> Row:
+        """Collect what the projection has done to solids, before closed faces take other velocities, and let walls drag.
+
+        Returns:
+            What the log says of it.
+        """
+        sums, forces = self.wall_sums, self.forces
+        row: Row = {}
+        if sums is None:
+            return row
+        with self.watch.stage("walls", *self.velocity, self.projection.pressure, self.boundary.touch):
+            if forces is not None:
+                forces.begin(self.time)
+                if self.scene.output.forces:
+                    forces.add_pressure(sums, window, self)
+            if self.wall_drag is not None:
+                fields = self.velocity, self.projection, self.surface.phi
+                points = forces.references if forces is not None else None
+                row["wall_work"], dragged = self.wall_drag.act(sums, window, *fields, self.kick_dt, points)
+                if forces is not None and dragged is not None:
+                    forces.add(dragged)
+                if self.bodies is not None and dragged is not None:
+                    SolidForces.push(self.bodies, dragged)
+                    self.boundary.begin_step(self.time, dt)  # their velocities are others now
+        return row
 
     def known_density(self) -> wp.array | None:
         """Return the density that the surface lies in, if it is made of one."""
@@ -224,10 +248,12 @@ class LiquidSimulation(ParticleSimulation):
         """Return the names of the pressure's columns and the volume's.
 
         active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the projection; volume [m^3; m^2 in 2-D]:
-        counts FLUID cells, or lies inside the surface where that is finer than cells. With an automatic tolerance: tolerance, the relative
+        counts FLUID cells, or lies inside the surface where that is finer than cells. With drag along walls: wall_work [J; J/m in 2-D], the
+        energy that it takes from the liquid in the step. With an automatic tolerance: tolerance, the relative
         residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes.
         """
-        columns = ("active", "max_divergence", "volume") if self.scene.output.diagnostics else ("active",)
+        drags = ("wall_work",) if self.scene.drags is not None else ()
+        columns = ("active", "max_divergence", "volume", *drags) if self.scene.output.diagnostics else ("active", *drags)
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
     def frame(self) -> list[Part]:

@@ -1,4 +1,4 @@
-"""Tables of a liquid's scene for what is measured in it."""
+"""Tables of a liquid's scene: what is measured in it, and how walls slow it down."""
 
 from __future__ import annotations
 
@@ -9,12 +9,20 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from warp_lcp.scene.scene import Complaint, Output, Table, Vector
+from warp_lcp.settings import NonNegative
 
 
 class LiquidOutput(Output):
     """[output]: what the run's folder gets."""
 
     forces: bool = Field(default=False, description="write forces.csv: force and torque of the liquid on each solid, a row a step")
+
+
+class WallDragSettings(Table):
+    """[wall_drag]: friction along walls whose boundary layer the grid does not resolve; without the table, and `drag` of a solid, none."""
+
+    coefficient: NonNegative = Field(default=0.0, description="c_f of walls and solids: the shear stress is c_f / 2 rho u^2; about 0.005")
+    domain: NonNegative | None = Field(default=None, description="of the domain's walls; coefficient unless given")
 
 
 def _column_name(text: str) -> str:
