@@ -23,7 +23,8 @@ class WallDrag:
         du/dt = -k |u| u,   k = (sum of c_f / 2 times its shares of A) / V,
 
     solved at once, u / (1 + dt k |u|): exact for one wall, and never faster than before, however long the step. What faces lose walls get.
-    Where solids cut a cell all of them are one plane, with the vector area of what they close and the normal along it.
+    Where solids cut a cell all of them are one plane, with the vector area of what they close and the normal along it: beside corners too,
+    and not in gaps of one cell, where it cancels.
 
     V is that of the liquid in the face's cells as the surface lies, so that a sheet of thickness h slows down as u0 / (1 + c_f/2 u0 t / h)
     whether it fills its cells or not, if h is at most a cell. Of a deeper flow the cells beside the wall alone slow down, and u is theirs.

@@ -94,14 +94,13 @@ def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
 def piece_of(S: Walls, n: int, k: int, j: int, i: int):
     """Return the area of a piece of wall in a cell [faces], its normal, and whose it is.
 
-    The first 2 d pieces are what whole cells, or the domain, close of each face; those after them are what solids that cut the cell close:
-    one plane with the vector area of all their parts, and for each axis two planes if both faces are closed wholly, as in a narrow gap.
+    The first 2 d pieces are what whole cells, or the domain, close of each face; the last one is what solids that cut the cell close: a
+    plane with the vector area of all their parts, which cancel in a gap of one cell.
     """
     faces = 2 * (S.planes + 1)
     area = float(0.0)
     normal = wp.vec3()
     solid = int(0)
-    most = float(0.0)
     if n < faces:
         axis = n >> 1
         high = n & 1
@@ -113,7 +112,7 @@ def piece_of(S: Walls, n: int, k: int, j: int, i: int):
             solid = wp.max(owner, 0)
             normal[axis] = 1.0
     elif not S.index:
-        narrow = n - faces - 1  # the axis of a gap, -1: the plane
+        most = float(0.0)
         for m in range(faces):
             axis = m >> 1
             high = m & 1
@@ -122,27 +121,18 @@ def piece_of(S: Walls, n: int, k: int, j: int, i: int):
             )
             if owner == 0:
                 own = float(0.0)
-            share = own + covered + moved
-            if narrow < 0:
-                normal[axis] = normal[axis] + wp.where(high == 1, share, -share)
-            elif narrow == axis and share > 0.999:
-                area += 1.0
-            if narrow < 0 or narrow == axis:
-                if own > most:
-                    most = own
-                    solid = owner
-                if covered > most:
-                    most = covered
-                    solid = standing_of(S, k, j, i)
-                if moved > most:
-                    most = moved
-                    solid = mover
-        if narrow < 0:
-            area = wp.length(normal)
-            normal = wp.normalize(normal)
-        else:
-            area = wp.where(area > 1.5, area, 0.0)
-            normal[narrow] = 1.0
+            normal[axis] = normal[axis] + float(2 * high - 1) * (own + covered + moved)
+            if own > most:
+                most = own
+                solid = owner
+            if covered > most:
+                most = covered
+                solid = standing_of(S, k, j, i)
+            if moved > most:
+                most = moved
+                solid = mover
+        area = wp.length(normal)
+        normal = wp.normalize(normal)
     return area, normal, solid
 
 
@@ -172,7 +162,7 @@ def drag_kernel(
     if values:
         begin = offsets[row]
     e = int(begin)
-    pieces = 3 * (S.planes + 1) + 1
+    pieces = 2 * (S.planes + 1) + 1
     for i in range(first, end):
         c = k - wp.where(axis == 2, 1, 0)
         b = j - wp.where(axis == 1, 1, 0)
@@ -203,8 +193,8 @@ def drag_kernel(
                             if area > 0.0 and D.coefficient[solid] > 0.0:
                                 rate, target = pull(D, axis, q, x, weight * area, normal, solid)
                                 rates += rate
-                                pulls += rate * target
-                now = (q[axis] + pulls) / (1.0 + rates)
+                                pulls += rate * (q[axis] - target)
+                now = q[axis] - pulls / (1.0 + rates)
                 for side in range(2):
                     z = wp.where(side == 0, k, c)
                     y = wp.where(side == 0, j, b)
