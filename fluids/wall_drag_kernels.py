@@ -91,8 +91,8 @@ def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-def piece_of(S: Walls, n: int, k: int, j: int, i: int):
-    """Return the area of a piece of wall in a cell [faces], its normal, and whose it is.
+def piece_of(S: Walls, n: int, along: int, k: int, j: int, i: int):
+    """Return the area of a piece of wall in a cell [faces] that drags along an axis, its normal, and whose it is.
 
     The first 2 d pieces are what whole cells, or the domain, close of each face; the last one is what solids that cut the cell close: a
     plane with the vector area of all their parts, which cancel in a gap of one cell.
@@ -104,13 +104,14 @@ def piece_of(S: Walls, n: int, k: int, j: int, i: int):
     if n < faces:
         axis = n >> 1
         high = n & 1
-        owner, own, _covered, _mover, _moved = closed_on(
-            S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
-        )
-        if S.index or owner == 0:
-            area = own
-            solid = wp.max(owner, 0)
-            normal[axis] = 1.0
+        if axis != along:
+            owner, own, _covered, _mover, _moved = closed_on(
+                S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
+            )
+            if S.index or owner == 0:
+                area = own
+                solid = wp.max(owner, 0)
+                normal[axis] = 1.0
     elif not S.index:
         most = float(0.0)
         for m in range(faces):
@@ -138,13 +139,12 @@ def piece_of(S: Walls, n: int, k: int, j: int, i: int):
 
 @wp.func
 def pull(D: Drag, axis: int, q: wp.vec3, x: wp.vec3, area: float, normal: wp.vec3, solid: int):
-    """Return how fast a piece of wall pulls the velocity on a face, area x coefficient x speed [m/s], and towards which one [m/s]."""
+    """Return how fast a piece of wall pulls a face's velocity, area x coefficient x speed, and what that loses until it rests [m/s]."""
     relative = q - (D.turn[solid] * x + D.shift[solid])
     along = relative - wp.dot(relative, normal) * normal
     own = relative[axis]
-    # what it loses where the liquid rests along the wall: no more than all of it, nor a gain
-    lost = wp.clamp(along[axis], wp.min(own, 0.0), wp.max(own, 0.0))
-    return area * D.coefficient[solid] * wp.length(along), q[axis] - lost
+    lost = wp.clamp(along[axis], wp.min(own, 0.0), wp.max(own, 0.0))  # no more than all of it, nor a gain
+    return wp.where(lost == 0.0, 0.0, area * D.coefficient[solid] * wp.length(along)), lost
 
 
 @cell_kernel("fluids.wall_drag")
@@ -162,22 +162,26 @@ def drag_kernel(
     if values:
         begin = offsets[row]
     e = int(begin)
-    pieces = 2 * (S.planes + 1) + 1
     for i in range(first, end):
         c = k - wp.where(axis == 2, 1, 0)
         b = j - wp.where(axis == 1, 1, 0)
         a = i - wp.where(axis == 0, 1, 0)
+        here = bool(False)
+        below = bool(False)
         if known[k, j, i] == wp.int8(1):
             here = D.kind[k, j, i] == _FLUID and D.contact[k, j, i] == _HELD
             below = D.kind[c, b, a] == _FLUID and D.contact[c, b, a] == _HELD
-            if here or below:
-                free = open_share(S, axis, k, j, i)
-                part = free * HALF * (fill(D, k, j, i) + fill(D, c, b, a))
-                q = velocity_on(D, axis, k, j, i)
-                center = face_center(S, axis, k, j, i)
-                x = wp.vec3(float(center[0]), float(center[1]), float(center[2]))
-                rates = float(0.0)
-                pulls = float(0.0)
+        if here or below:
+            free = open_share(S, axis, k, j, i)
+            part = free * HALF * (fill(D, k, j, i) + fill(D, c, b, a))
+            center = face_center(S, axis, k, j, i)
+            x = wp.vec3(float(center[0]), float(center[1]), float(center[2]))
+            q = velocity_on(D, axis, k, j, i)
+            rates = float(0.0)
+            pulls = float(0.0)
+            now = float(0.0)
+            last = int(e)
+            for turn in range(wp.where(values, 2, 1)):  # what all pieces do, and then what of it is each one's
                 for side in range(2):
                     z = wp.where(side == 0, k, c)
                     y = wp.where(side == 0, j, b)
@@ -188,33 +192,24 @@ def drag_kernel(
                             S, axis, z + wp.where(axis == 2, o, 0), y + wp.where(axis == 1, o, 0), s + wp.where(axis == 0, o, 0)
                         )
                         weight = dt / float(S.spacing) / wp.max(part, 1.0e-6) * free / (free + other)
-                        for n in range(pieces):
-                            area, normal, solid = piece_of(S, n, z, y, s)
+                        for n in range(2 * (S.planes + 1) + 1):
+                            area, normal, solid = piece_of(S, n, axis, z, y, s)
                             if area > 0.0 and D.coefficient[solid] > 0.0:
-                                rate, target = pull(D, axis, q, x, weight * area, normal, solid)
-                                rates += rate
-                                pulls += rate * (q[axis] - target)
-                now = q[axis] - pulls / (1.0 + rates)
-                for side in range(2):
-                    z = wp.where(side == 0, k, c)
-                    y = wp.where(side == 0, j, b)
-                    s = wp.where(side == 0, i, a)
-                    if (side == 0 and here) or (side == 1 and below):
-                        o = wp.where(side == 0, 1, 0)
-                        other = open_share(
-                            S, axis, z + wp.where(axis == 2, o, 0), y + wp.where(axis == 1, o, 0), s + wp.where(axis == 0, o, 0)
-                        )
-                        weight = dt / float(S.spacing) / wp.max(part, 1.0e-6) * free / (free + other)
-                        for n in range(pieces):
-                            area, normal, solid = piece_of(S, n, z, y, s)
-                            if area > 0.0 and D.coefficient[solid] > 0.0:
-                                if values:
-                                    rate, target = pull(D, axis, q, x, weight * area, normal, solid)
+                                rate, lost = pull(D, axis, q, x, weight * area, normal, solid)
+                                if turn == 0:
+                                    rates += rate
+                                    pulls += rate * lost
+                                    e += 1
+                                else:
+                                    e -= 1  # from the last one
                                     force = wp.vec3d()
-                                    force[axis] = mass * wp.float64(part * rate * (now - target))
+                                    force[axis] = mass * wp.float64(part * rate * (now - q[axis] + lost))
                                     put(e, solid, force, center - references[solid], owners, values)
-                                e += 1
-                if apply == 1 or values:
-                    losses[row] = losses[row] + wp.float64(0.5) * mass * wp.float64(part) * wp.float64((q[axis] - now) * (q[axis] + now))
-                    field[k, j, i] = now
+                if turn == 0:
+                    last = e
+                now = q[axis] - pulls / (1.0 + rates)
+            e = last
+            if apply == 1 or values:
+                losses[row] = losses[row] + wp.float64(0.5) * mass * wp.float64(part) * wp.float64((q[axis] - now) * (q[axis] + now))
+                field[k, j, i] = now
     counts[row] = e - begin
