@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from warp_lcp.fluids.tables import LiquidOutput, Probe, WallDragSettings, probe_complaints
+from warp_lcp.fluids.tables import Probe, WallDragSettings, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
@@ -48,7 +48,6 @@ class LiquidScene(ParticleScene):
     liquid: list[Liquid] = Field(default_factory=list)
     probe: list[Probe] = Field(default_factory=list)
     wall_drag: WallDragSettings | None = None
-    output: LiquidOutput = Field(default_factory=LiquidOutput)
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return `liquid` and its shapes."""

@@ -8,14 +8,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from warp_lcp.scene.scene import Complaint, Output, Table, Vector
+from warp_lcp.scene.scene import Complaint, Table, Vector
 from warp_lcp.settings import NonNegative
-
-
-class LiquidOutput(Output):
-    """[output]: what the run's folder gets."""
-
-    forces: bool = Field(default=False, description="write forces.csv: force and torque of the liquid on each solid, a row a step")
 
 
 class WallDragSettings(Table):

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from pydantic import ValidationError
 
+import small_sands
 from small_liquids import GRAVITY, advance, box, create, scene
 from small_runs import run_into
 from warp_lcp.fluids import LiquidSimulation
@@ -209,3 +211,9 @@ def test_an_interrupted_run_writes_the_same_table(tmp_path: Path) -> None:
         rows = list(csv.DictReader(table))
     assert list(rows[0]) == ["step", "time", "domain_fx", "domain_fy", "domain_torque"]
     assert all(float(row["domain_fy"]) < 0.0 for row in rows), "the floor bears"
+
+
+def test_sand_has_none() -> None:
+    sand = {"size": [1.0, 0.5], "resolution": 16, "sand": [small_sands.box([0.0, 0.0], [0.3, 0.3])]}
+    with pytest.raises(ValidationError, match="is for liquids only"):
+        small_sands.scene(**sand, output=FORCES)
