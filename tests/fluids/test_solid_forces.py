@@ -11,7 +11,7 @@ import warp as wp
 from pydantic import ValidationError
 
 import small_sands
-from small_liquids import GRAVITY, advance, box, create, scene
+from small_liquids import GRAVITY, advance, box, create, random_tank, scene
 from small_runs import run_into
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.fluids.forces_kernels import pressure_kernel
@@ -174,6 +174,17 @@ def test_an_impact_takes_the_momentum(solids: str) -> None:
     change = momentum() - start - mass * elapsed * np.array([0.0, -GRAVITY])
     assert np.abs(given).max() > mass * 1.0
     assert np.abs(change + given).max() < 0.05 * np.abs(given).max()
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13, 14])
+def test_all_solids_together_bear_the_liquid(seed: int) -> None:
+    """Whatever stands in a pool at rest: the forces on it and on the walls add up to the weight of the particles."""
+    simulation = create(scene(**random_tank(seed), output=FORCES))
+    found = forces(simulation, 0.6)
+    weight = simulation.particle_mass * simulation.particles.count * GRAVITY
+    total = sum(force[: simulation.grid.dimension] for force in found.values())
+    assert total[1] / weight == pytest.approx(-1.0, abs=0.03)
+    assert np.abs(np.delete(total, 1)).max() < 0.01 * weight
 
 
 def test_forces_change_nothing() -> None:

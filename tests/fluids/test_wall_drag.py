@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 import small_sands
-from small_liquids import GRAVITY, advance, box, create, scene
+from small_liquids import GRAVITY, advance, box, create, random_tank, scene
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.fluids.distributed import refusals
 
@@ -121,6 +121,39 @@ def test_what_liquid_loses_walls_get() -> None:
     assert given > 0.03 * start
     assert start - momentum() == pytest.approx(given, rel=0.05)
     assert work == pytest.approx(power, rel=0.15), "force times speed, that of the cells beside the floor is less than the mean"
+
+
+@pytest.mark.parametrize("seed", [21, 22, 23, 24])
+def test_momentum_and_energy_of_any_flow(seed: int) -> None:
+    """In random flows around random solids: faces never gain speed, and what they lose is what walls get, and `wall_work`."""
+    rng = np.random.default_rng(seed)
+    tables = random_tank(seed)
+    dimension = len(tables["size"])
+    tables["liquid"][0]["velocity"] = rng.uniform(-2.0, 2.0, dimension).tolist()
+    drag = {"coefficient": float(10.0 ** rng.uniform(-3, 1)), "domain": float(10.0 ** rng.uniform(-3, 1))}
+    simulation = create(scene(**tables, wall_drag=drag, pressure={"surface": "voxel"}, output=FORCES))
+    projection, boundary, mass = simulation.projection, simulation.boundary, 1000.0 * simulation.grid.cell_volume
+    act, checked = simulation.wall_drag.act, []
+
+    def watched(sums: Any, window: Any, velocity: Any, *rest: Any) -> Any:
+        before = [field.numpy().astype(np.float64) for field in velocity]
+        work, impulses = act(sums, window, velocity, *rest)
+        fluid, lost, energy, sizes = (projection.kind.numpy() == 1).astype(float), np.zeros(3), 0.0, np.zeros(2)
+        for axis, (u, field) in enumerate(zip(before, velocity, strict=True)):
+            now = field.numpy().astype(np.float64)
+            assert (np.abs(now) <= np.abs(u)).all()
+            free = boundary.open[axis].numpy() if boundary.open else 1.0
+            m = mass * free * 0.5 * (fluid + np.roll(fluid, 1, 2 - axis))
+            lost[axis], energy = (m * (u - now)).sum(), energy + 0.5 * (m * (u**2 - now**2)).sum()
+            sizes += (m * np.abs(u)).sum(), (m * u**2).sum()
+        assert np.abs(impulses[:, :3].sum(axis=0) - lost).max() <= 1e-5 * np.abs(impulses).max() + 1e-7 * sizes[0]  # float32 faces
+        assert work == pytest.approx(energy, rel=1e-5, abs=1e-7 * sizes[1])
+        checked.append(np.abs(impulses).max())
+        return work, impulses
+
+    simulation.wall_drag.act = watched
+    advance(simulation, 0.05)
+    assert max(checked) > 0.0
 
 
 def test_walls_that_move_pull() -> None:
