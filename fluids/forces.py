@@ -125,7 +125,7 @@ class SolidForces:
         return tuple(f"{name}_{part}" for name in ("domain", *(f"solid{n}" for n in range(len(self._solids)))) for part in parts)
 
     def begin(self, time: float) -> None:
-        """Begin a step at a time [s], before solids move."""
+        """Begin a step at a time [s], before models add to it and solids move."""
         self.impulses, self.references = np.zeros_like(self.impulses), self._centers.copy()
         for number, solid in enumerate(self._solids, start=1):
             if isinstance(solid.motion, BodyMotion):

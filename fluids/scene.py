@@ -158,6 +158,7 @@ class LiquidScene(ParticleScene):
         return {
             "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
+            "drag along walls": cells * 4 * self.dimension * (self.drags is not None),
             "surface": cells
             * (not self.stays_full)
             * (LEVEL_SET_BYTES * (level_set or self.cuts_cells) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)),

@@ -172,6 +172,8 @@ class LiquidSimulation(ParticleSimulation):
             ValueError: dt is not positive.
         """
         before = self.begin_step(dt)
+        if self.forces is not None:
+            self.forces.begin(self.time)
         window = self.window(before)
         self.bring_to_faces(window)
         projected = self._project(window, dt, self.top_speed(before))
@@ -221,10 +223,8 @@ class LiquidSimulation(ParticleSimulation):
         if sums is None:
             return row
         with self.watch.stage("walls", *self.velocity, self.projection.pressure, self.boundary.touch):
-            if forces is not None:
-                forces.begin(self.time)
-                if self.scene.output.forces:
-                    forces.add_pressure(sums, window, self)
+            if forces is not None and self.scene.output.forces:
+                forces.add_pressure(sums, window, self)
             if self.wall_drag is not None:
                 fields = self.velocity, self.projection, self.surface.phi
                 points = forces.references if forces is not None else None
