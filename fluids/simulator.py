@@ -228,7 +228,7 @@ class LiquidSimulation(ParticleSimulation):
             if self.wall_drag is not None:
                 fields = self.velocity, self.projection, self.surface.phi
                 points = forces.references if forces is not None else None
-                row["wall_work"], dragged = self.wall_drag.act(sums, window, *fields, self.kick_dt, points)
+                row["drag_work"], dragged = self.wall_drag.act(sums, window, *fields, self.kick_dt, points)
                 if forces is not None and dragged is not None:
                     forces.add(dragged)
                 if self.bodies is not None and dragged is not None:
@@ -248,11 +248,11 @@ class LiquidSimulation(ParticleSimulation):
         """Return the names of the pressure's columns and the volume's.
 
         active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the projection; volume [m^3; m^2 in 2-D]:
-        counts FLUID cells, or lies inside the surface where that is finer than cells. With drag along walls: wall_work [J; J/m in 2-D], the
+        counts FLUID cells, or lies inside the surface where that is finer than cells. With drag along walls: drag_work [J; J/m in 2-D], the
         energy that it takes from the liquid in the step. With an automatic tolerance: tolerance, the relative
         residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes.
         """
-        drags = ("wall_work",) if self.scene.drags is not None else ()
+        drags = ("drag_work",) if self.scene.drags is not None else ()
         columns = ("active", "max_divergence", "volume", *drags) if self.scene.output.diagnostics else ("active", *drags)
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 

@@ -67,7 +67,7 @@ def test_the_length_of_steps_does_not_matter(cfl: float) -> None:
 def test_of_a_deep_flow_the_cells_beside_the_wall_slow_down() -> None:
     """The law holds at first; later the stress is that of the slower cells, and the rest goes on."""
     simulation = sheet(4.0, 0.1, physics={"gravity": [0.0, -1.0]})
-    assert simulation.step(0.01)["wall_work"] == pytest.approx(0.05 * 1000.0 * 2.0 * simulation.kick_dt, rel=0.05)
+    assert simulation.step(0.01)["drag_work"] == pytest.approx(0.05 * 1000.0 * 2.0 * simulation.kick_dt, rel=0.05)
     advance(simulation, 0.3)
     x, v = simulation.particles.position.numpy(), simulation.particles.velocity.numpy()[:, 0]
     lowest = v[(x[:, 1] < 0.5 * DX) & (x[:, 0] > 1.2) & (x[:, 0] < 1.8)].mean()
@@ -115,9 +115,9 @@ def test_what_liquid_loses_walls_get() -> None:
         row = simulation.step(min(simulation.stable_dt(), 0.01))
         force = simulation.measured["forces"]["domain_fx"]
         given += force * simulation.kick_dt
-        work += row["wall_work"]
+        work += row["drag_work"]
         power += force * simulation.kick_dt * middle(simulation)
-        assert row["wall_work"] > 0.0
+        assert row["drag_work"] > 0.0
     assert given > 0.03 * start
     assert start - momentum() == pytest.approx(given, rel=0.05)
     assert work == pytest.approx(power, rel=0.15), "force times speed, that of the cells beside the floor is less than the mean"
@@ -125,7 +125,7 @@ def test_what_liquid_loses_walls_get() -> None:
 
 @pytest.mark.parametrize("seed", [21, 22, 23, 24])
 def test_momentum_and_energy_of_any_flow(seed: int) -> None:
-    """In random flows around random solids: faces never gain speed, and what they lose is what walls get, and `wall_work`."""
+    """In random flows around random solids: faces never gain speed, and what they lose is what walls get, and `drag_work`."""
     rng = np.random.default_rng(seed)
     tables = random_tank(seed)
     dimension = len(tables["size"])
@@ -166,7 +166,7 @@ def test_walls_that_move_pull() -> None:
         force = simulation.measured["forces"]["solid0_fx"]
         if expected is None:
             assert force == pytest.approx(-0.1 * 1000.0 * 2.0, rel=0.1)
-            assert row["wall_work"] < 0.0, "it gives energy"
+            assert row["drag_work"] < 0.0, "it gives energy"
         else:
             assert abs(force) < 1e-3 * 200.0
         advance(simulation, 0.3)
@@ -192,7 +192,7 @@ def test_the_strongest_drag_stops_and_does_not_turn(dimension: int) -> None:
 
         simulation.wall_drag.act = watched
         rows = advance(simulation, 0.3)
-        assert all(row["wall_work"] >= 0.0 for row in rows)
+        assert all(row["drag_work"] >= 0.0 for row in rows)
         assert all((np.abs(now) <= np.abs(u)).all() and (now * u >= -1e-6).all() for u, now in taken)
         assert max(np.abs(now).max() for _, now in taken) < 10.0
         solids = [solids[0] | {"radius": 0.07}, box([0.8, -1.0, -1.0][:dimension], [0.83, 9.0, 9.0][:dimension])]
@@ -204,9 +204,9 @@ def test_liquid_that_leaves_its_wall_is_not_held() -> None:
     simulation = create(scene(size=[2.0, 1.0], resolution=40, liquid=liquid, wall_drag={"coefficient": 0.5}, output=FORCES))
     row = simulation.step(0.01)
     assert row["active"] > 0
-    assert row["wall_work"] == simulation.measured["forces"]["domain_fx"] == 0.0
+    assert row["drag_work"] == simulation.measured["forces"]["domain_fx"] == 0.0
     held = create(scene(size=[2.0, 1.0], resolution=40, liquid=liquid, wall_drag={"coefficient": 0.5}, wall="free-slip"))
-    assert held.step(0.01)["wall_work"] > 0.0
+    assert held.step(0.01)["drag_work"] > 0.0
 
 
 def test_bodies_are_dragged_along() -> None:
@@ -228,7 +228,7 @@ def test_no_coefficient_no_change(tables: dict[str, Any]) -> None:
     states = []
     for more in ({}, {"wall_drag": {}}, {"wall_drag": {"coefficient": 0.01, "domain": 0.0}}):
         simulation = sheet(4.0, 0.0, **tables, **more)
-        assert ("wall_work" in simulation.columns()) == (simulation.wall_drag is not None) == False  # noqa: E712
+        assert ("drag_work" in simulation.columns()) == (simulation.wall_drag is not None) == False  # noqa: E712
         advance(simulation, 0.05)
         states.append(simulation.state())
     assert all(np.array_equal(states[0][name], state[name]) for state in states for name in state)

@@ -187,7 +187,7 @@ CASES = {
     "forces on solids": Case({"output": QUIET | {"forces": True}}, modules=("fluids.forces",), files=("fluids/forces.py",)),
     "drag along walls": Case(
         {"wall_drag": {"coefficient": 0.01}}, modules=("fluids.wall_drag",), files=("fluids/wall_drag.py", "fluids/forces.py"),
-        columns=("wall_work",),
+        columns=("drag_work",),
     ),
     "rigid bodies in sand": Case(
         {"solid": [BALL | {"density": 500.0}]}, {"solid": [SWAYING]}, modules=("granular.bodies",), files=("granular/bodies.py",),
