@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
@@ -19,6 +20,7 @@ BOUND_BYTES = 9  # of them, those of walls that separate
 LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 UNILATERAL_BYTES = 1
+VISCOUS_BYTES = {2: 140, 3: 220}  # its fields, those of coarse levels, and the velocity before the pressure
 SHORT_STEPS = 0.5  # Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at 1/8 on 20
 BODY_BYTES, POTENTIAL_BYTES = 8, 4  # of a right-hand side that bodies change, and a motion of a body, if it is light
 COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")  # for A + U W U', see `fluids.coupling`
@@ -38,13 +40,26 @@ class Pressure(Table):
     smoothing: int = Field(default=0, ge=0, le=8, description="binomial passes over the level set of a ghost-fluid surface")
 
 
+class Viscosity(Table):
+    """[viscosity]: a liquid that is thick."""
+
+    value: float = Field(gt=0, le=1e9, allow_inf_nan=False, description="of the liquid [Pa s]: water 0.001, honey 10, tar 10000")
+    slip_length: float = Field(
+        default=0.0,
+        ge=0,
+        description="how far behind a wall that holds the liquid its velocity would be the wall's [m]: 0 is no slip; of walls that are "
+        '"separating" or "sticky"',
+    )
+
+
 class LiquidScene(ParticleScene):
-    """A scene of liquid: the tables of all materials, `pressure` and `liquid`."""
+    """A scene of liquid: the tables of all materials, `pressure`, `viscosity` and `liquid`."""
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
 
     pressure: Pressure = Field(default_factory=Pressure)
+    viscosity: Viscosity | None = Field(default=None)
     liquid: list[Liquid] = Field(default_factory=list)
     probe: list[Probe] = Field(default_factory=list)
     wall_drag: WallDragSettings | None = None
@@ -73,7 +88,26 @@ class LiquidScene(ParticleScene):
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which tells how full cells are'
             found.append(Complaint(("particles", "narrow_band"), None, message))
-        return [*found, *probe_complaints(self.probe, self.domain.size, self.physics.gravity)]
+        return [*found, *self._viscosity_complaints(), *probe_complaints(self.probe, self.domain.size, self.physics.gravity)]
+
+    def _viscosity_complaints(self) -> list[Complaint]:
+        """Return what needs viscosity, and what viscosity does not go with."""
+        if self.viscosity is not None and self.endless:
+            return [Complaint(("viscosity",), None, "not on a domain with periodic axes")]
+        if self.viscosity is not None:
+            return []
+        message = 'needs the table [viscosity]: without it nothing sticks, use "free-slip"'
+        walls = [(("domain", "wall"), self.domain.wall), *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid))]
+        found = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
+        slips = [(n, solid.slip_length) for n, solid in enumerate(self.solid) if solid.slip_length is not None]
+        return found + [Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]") for n, slip in slips]
+
+    @property
+    def slip_lengths(self) -> list[float]:
+        """Return those of the domain's wall and of each solid [m]."""
+        assert self.viscosity is not None
+        own = [(self.domain.wall, None), *((solid.wall or self.domain.wall, solid.slip_length) for solid in self.solid)]
+        return [math.inf if wall == "free-slip" else (self.viscosity.slip_length if slip is None else slip) for wall, slip in own]
 
     def models(self) -> list[Model]:
         """Return the models that the scene turns on, and those that it asks for but cannot need."""
@@ -90,6 +124,8 @@ class LiquidScene(ParticleScene):
             found.append(Model("ghost-fluid surface", closed if full else 'pressure.surface = "ghost-fluid"', built=not full))
         if self.pressure.smoothing and ghost:
             found.append(Model("smoothing", closed if full else "pressure.smoothing", built=not full))
+        if self.viscosity is not None:
+            found.append(Model("viscosity", "viscosity.value"))
         if self.short_steps:
             found.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
@@ -157,6 +193,7 @@ class LiquidScene(ParticleScene):
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
             "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
+            "viscosity": cells * (self.viscosity is not None) * VISCOUS_BYTES[self.dimension],
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "drag along walls": cells * 4 * self.dimension * (self.drags is not None),
             "surface": cells

@@ -17,6 +17,7 @@ from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.fluids.unilateral import UnilateralPressure
+from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
 from warp_lcp.fluids.wall_drag import WallDrag
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
@@ -42,6 +43,8 @@ from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
+
+VISCOUS_TOLERANCE = 1e-4  # where the pressure's comes from the time step
 
 
 def make_surface(
@@ -94,6 +97,17 @@ def make_pressure(
         settings = {name: settings[name] for name in ("tolerance", "max_iterations", "gravity")} | {"level_set": surface.level_set}
         return UnilateralPressure(grid, boundary, solver, weights=weights, coupling=coupling, **settings)
     return PressureProjection(grid, boundary, solver, coupling=coupling, **settings)
+
+
+def make_viscosity(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, bodies: RigidBodies | None
+) -> Viscosity | None:
+    """Return the viscosity that a scene asks for, if it does."""
+    if scene.viscosity is None:
+        return None
+    tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
+    settings = {"viscosity": scene.viscosity.value, "density": scene.physics.density, "slip_lengths": scene.slip_lengths}
+    return Viscosity(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies, **settings)
 
 
 if TYPE_CHECKING:
@@ -149,6 +163,7 @@ class LiquidSimulation(ParticleSimulation):
         asked = self.forces is not None or drags is not None
         self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
         self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
+        self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
@@ -176,7 +191,12 @@ class LiquidSimulation(ParticleSimulation):
             self.forces.begin(self.time)
         window = self.window(before)
         self.bring_to_faces(window)
-        projected = self._project(window, dt, self.top_speed(before))
+        speed = self.top_speed(before)
+        self._find_surface(window)
+        viscous: Row = {}
+        if self.viscosity is not None:
+            viscous = self._rub(self.viscosity, window, dt, speed)
+        projected = self._project(window, dt, speed)
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
@@ -187,7 +207,7 @@ class LiquidSimulation(ParticleSimulation):
         self._measure()
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
-        row = self.move(dt, window) | self.solve_row(projected.result) | walls
+        row = self.move(dt, window) | self.solve_row(projected.result) | viscous | walls
         if self.scene.output.diagnostics:
             row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
         automatic = self.projection.automatic
@@ -248,12 +268,14 @@ class LiquidSimulation(ParticleSimulation):
         """Return the names of the pressure's columns and the volume's.
 
         active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the projection; volume [m^3; m^2 in 2-D]:
-        counts FLUID cells, or lies inside the surface where that is finer than cells. With drag along walls: drag_work [J; J/m in 2-D], the
-        energy that it takes from the liquid in the step. With an automatic tolerance: tolerance, the relative
-        residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes.
+        counts FLUID cells, or lies inside the surface where that is finer than cells. With an automatic tolerance: tolerance, the relative
+        residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes. With viscosity what its
+        solve took and reached, the energy that became heat in the step, and the work of moving walls on it [J; J/m in 2-D]. With drag along
+        walls: drag_work [J; J/m in 2-D], the energy that it takes from the liquid in the step.
         """
         drags = ("drag_work",) if self.scene.drags is not None else ()
         columns = ("active", "max_divergence", "volume", *drags) if self.scene.output.diagnostics else ("active", *drags)
+        columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
     def frame(self) -> list[Part]:
@@ -297,12 +319,41 @@ class LiquidSimulation(ParticleSimulation):
             self.cover(self._coverage.domain)
         self.restore(state_of(pieces, self.state()))
 
+    def _find_surface(self, window: Window) -> None:
+        """Mark the liquid's cells, and give velocity to their faces."""
+        projection = self.projection
+        with self.watch.stage("surface", self.particles.key, projection.kind):
+            self.surface.mark(self.particles, window, projection.kind)
+            self.surface.complete(window, self.velocity, self.weights, projection.known)
+
+    def _rub(self, viscosity: Viscosity, window: Window, dt: float, speed: float) -> Row:
+        """Change the velocity before the pressure by what viscosity does to that after it; return what the log says of it.
+
+        The pressure first finds which walls hold: viscosity acts on the velocity that it leaves. Then all of it acts anew, together with
+        what viscosity has changed, so that it balances viscous stresses too and the walls that let go do so by the sum of both.
+        """
+        projection, before = self.projection, viscosity.before
+        for saved, field in zip(before, self.velocity, strict=True):
+            wp.copy(saved, field)
+        momenta = [] if self.bodies is None else [body.momenta() for body in self.bodies.bodies]
+        if self._project(window, dt, speed).result is None:
+            return {}
+        self.extend(window, projection.known, projection.kind, projection.contact)
+        with self.watch.stage("viscosity", *self.velocity, projection.kind, projection.contact):
+            found = viscosity.solve(self.velocity, window, projection.kind, projection.contact, dt, speed)
+        if not found.converged:
+            self.restore_bodies()
+            residual = f"relative residual of {found.relative_residual:.2e} (tolerance {viscosity.tolerance})"
+            raise missed_by_far("viscous", wl.SolveStatus.MAX_ITERATIONS, found.iterations, residual, "a shorter step is less stiff")
+        viscosity.undo(self.velocity)
+        for body, values in zip(self.bodies.bodies if self.bodies is not None else (), momenta, strict=True):
+            body.restore_momenta(values)
+        viscosity.push_bodies()
+        return dict(zip(VISCOUS_COLUMNS, found.row(), strict=True))
+
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
         """Solve for the pressure and project the velocity."""
         projection, watch = self.projection, self.watch
-        with watch.stage("surface", self.particles.key, projection.kind):
-            self.surface.mark(self.particles, window, projection.kind)
-            self.surface.complete(window, self.velocity, self.weights, projection.known)
         with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
             self.boundary.begin_step(self.time, dt)
             if self.sources is not None:

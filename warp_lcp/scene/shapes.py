@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 BUILTIN = "builtin:"  # how the name of a mesh that the project generates begins
 
-Wall = Literal["separating", "free-slip"]
+Wall = Literal["separating", "free-slip", "sticky"]
 
 
 def _wall_friction(value: Any, handler: ValidatorFunctionWrapHandler) -> float | str:
@@ -229,6 +229,9 @@ class SolidProperties(Shape):
 
     rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
     wall: Wall | None = Field(default=None, description="whether material may let go of it; domain.wall unless given")
+    slip_length: float | None = Field(
+        default=None, ge=0, description="of a thick liquid on it [m], 0: none, inf: free slip; viscosity.slip_length unless given"
+    )
     motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
     mass: float | None = Field(default=None, ge=1e-18, description="makes it a rigid body that the material moves [kg; kg/m in 2-D]")
     density: float | None = Field(default=None, ge=1e-18, description="in place of mass: of the solid, filled evenly [kg/m^3]")

@@ -1,0 +1,246 @@
+"""Viscosity: an implicit step in a variational form, with free surfaces that bear no traction and walls that hold or let go.
+
+With the rate of strain e of a velocity u, the step from u1 makes [Batty & Bridson 2008]
+
+    1/2 sum_f V_f |u_f - u1_f|^2 + tau sum_s V_s e_s : e_s,   tau = nu dt / dx^2,
+
+least: u on faces, e_aa at cells, e_ab on edges, differences in units of 1/dx, V the shares of their cubes that liquid fills. So faces have
+
+    V u + tau K u = V u1,   K symmetric and positive semi-definite,
+
+with K u = 0 for all rigid motions of what floats freely: linear and angular momentum stay. Faces in air that touch a filled cell or edge are
+unknowns too, so that the surface bears no traction.
+
+In terms of gradients, with the determinants of pairs of axes apart,
+
+    e : e = |grad u|^2 / 2 + (div u)^2 / 2 + sum_{a<b} (d_b u_a d_a u_b - d_a u_a d_b u_b),
+
+and in the discrete sums too the last term adds up to nothing in the middle of the liquid. Beside a wall where the liquid sticks it is left
+out with div u, which the pressure has made 0: what remains is |grad u|^2 / 2, whose links that cross the wall end at it, at theta of their
+length, with the wall's velocity there [Gibou et al. 2002], second order on walls that cut cells. A slip length puts the end that far behind
+the wall (Navier). Links to walls that the pressure's complementarity has let go of are cut: there is no traction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.fluids.viscosity_bodies import BodyDrag
+from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
+from warp_lcp.fluids.viscosity_passes import viscous_passes
+from warp_lcp.grid.sides import open_sides_of
+from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
+from warp_lcp.grid.tally import WindowTally
+from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
+from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rows.fields import zeros
+from warp_lcp.rows.program import Launch
+
+ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a force, relative to the diagonal times the speed
+
+VISCOUS_COLUMNS = ("viscous_iterations", "viscous_residual", "dissipated", "wall_work")
+
+
+@dataclass(frozen=True)
+class ViscousResult:
+    """What a viscous step has done.
+
+    Attributes:
+        iterations: of conjugate gradients.
+        relative_residual: ||r|| over that of the start, recomputed from the velocities in float64.
+        converged: whether it is at most the tolerance, or at the rounding of the velocities.
+        dissipated: energy that became heat [J; J/m in 2-D].
+        given_by_walls: work that moving walls did [J; J/m in 2-D].
+    """
+
+    iterations: int
+    relative_residual: float
+    converged: bool
+    dissipated: float
+    given_by_walls: float
+
+    def row(self) -> tuple[int, float, float, float]:
+        """Return the entries of `VISCOUS_COLUMNS`."""
+        return self.iterations, self.relative_residual, self.dissipated, self.given_by_walls
+
+
+class Viscosity:
+    """Take implicit steps of viscosity.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        viscosity: mu [Pa s].
+        density: [kg/m^3].
+        slip_lengths: of the domain's wall and each solid [m], shape (1 + solids,); inf: free slip.
+        phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None: it lies on the cells' faces.
+        tolerance: relative residual at which a solve is done.
+        max_iterations: of conjugate gradients in a step.
+        bodies: those that the liquid moves, among the solids; None: there are none.
+        sources: whether cells may turn SOLID, as those of sources do.
+
+    Attributes:
+        change: what the last step changed of each component [m/s].
+        before: of a velocity that a caller keeps, see `undo`.
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, *, viscosity: float, density: float, slip_lengths: Sequence[float],
+        phi: wp.array | None, tolerance: float, max_iterations: int = 200, sources: bool = False, bodies: RigidBodies | None = None,
+    ) -> None:  # fmt: skip
+        self.grid, self.boundary, self.tolerance, self.max_iterations = grid, boundary, tolerance, max_iterations
+        self._viscosity, self._density, self._phi = viscosity, density, phi
+        self._passes = viscous_passes(grid.dimension, bool(boundary.open), phi is not None, bool(boundary.velocity))
+        slips = np.asarray(slip_lengths, dtype=np.float32) / np.float32(grid.spacing)
+        self._slips = wp.array(slips, dtype=wp.float32, device=grid.device)
+        self._walls = ~open_sides_of(grid, boundary.open_sides) & (1 << 2 * grid.dimension) - 1
+        self._walls_change, self._placed = boundary.moves or sources, False
+        self.multigrid = VectorMultigrid(grid)
+        self._fine = self.multigrid.levels[0]
+        size = grid.dimension * grid.size
+        self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)
+        self._distance, self._slip, self.before = grid.faces(), grid.faces(), grid.faces()
+        self.change = self.multigrid.components(self._change)
+        self._bodies: BodyDrag | None = None
+        if bodies is not None:
+            assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
+            self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes)
+        self._solver = ConjugateGradient(self._product, self.multigrid)
+        self._trail, self._sums = Trail(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
+
+    def solve(
+        self, velocity: Sequence[wp.array], window: Window, kind: wp.array, contact: wp.array, dt: float, speed: float
+    ) -> ViscousResult:
+        """Find the change of a velocity in a step; the velocity itself becomes what it was changed to.
+
+        Args:
+            velocity: u1 of each component [m/s] (updated), continued into the air by a face.
+            window: cells that hold all liquid, with two to spare.
+            kind: int8 of AIR, FLUID, SOLID.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
+            dt: time step [s].
+            speed: scale of the velocities [m/s].
+        """
+        box = replace(self._trail.through(window), near=None)
+        inner = box.common(self.grid.domain)
+        self._change.zero_()
+        if inner is None:
+            return ViscousResult(0, 0.0, True, 0.0, 0.0)
+        self._set_up(box, inner, kind, contact, self._viscosity / self._density * dt / self.grid.spacing**2)
+        given = {"u": velocity, "kind": kind, "contact": contact}
+        if self._bodies is not None:
+            tau, where = self._viscosity / self._density * dt / self.grid.spacing**2, {"kind": kind, "contact": contact}
+            self._bodies.take(self._fine, self._distance, self._slip, velocity, where, tau)
+            if self._bodies.moved:  # a recorded iteration knows where they lay
+                self._solver = ConjugateGradient(self._product, self.multigrid)
+        first, lost, driven, stiff = self._force(inner, given, changed=False)
+        norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
+        while norm > least and iterations < self.max_iterations:
+            before = norm
+            done, _ = self._solver.solve(0.7 * least, self.max_iterations - iterations)
+            iterations += done
+            for u, total, more in zip(velocity, self.change, self.multigrid.components(self._solver.x), strict=True):
+                inner.run(self._passes.add, u=u, total=total, more=more)
+            norm, lost, driven, _ = self._force(inner, given, changed=True)
+            if not norm < 0.5 * before:  # what float32 can tell
+                break
+        for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True)):
+            covered = {"hold": self._fine.hold[axis], "h": self._slip[axis], "own": own, "kind": kind, "base": self.boundary.base}
+            inner.run(self._passes.cover, total=total, u=u, axis=axis, **covered)
+        energy = self._density * self.grid.cell_volume
+        residual = norm / first if first > 0.0 else 0.0
+        return ViscousResult(iterations, residual, norm <= least, energy * (lost + driven), energy * driven)
+
+    def push_bodies(self) -> None:
+        """Give the bodies the impulses of the last step, if there are bodies."""
+        if self._bodies is not None:
+            self._bodies.push(self._change)
+
+    def _product(self, p: wp.array, q: wp.array, *, launch: Launch = wp.launch) -> None:
+        """Write q = A p, the bodies' answer included."""
+        self.multigrid.product(p, q, launch=launch)
+        if self._bodies is not None:
+            self._bodies.subtract(p, q, launch)
+
+    def undo(self, velocity: Sequence[wp.array]) -> None:
+        """Make a velocity what `before` keeps, but for the last step's change."""
+        for u, kept, more in zip(velocity, self.before, self.change, strict=True):
+            self.grid.everywhere.run(self._passes.sum, u=u, kept=kept, more=more)
+
+    def _set_up(self, box: Window, inner: Window, kind: wp.array, contact: wp.array, tau: float) -> None:
+        """Find the equations of a step."""
+        fine, boundary, passes, planes = self._fine, self.boundary, self._passes, self.grid.planes
+        slip, distance, where = self._slip, self._distance, {"kind": kind, "contact": contact}
+        walls: list[wp.array | None] = [None] * 3
+        nodes = index = None
+        if isinstance(boundary, CutBoundary):
+            nodes, walls = boundary.cut.distance, [*boundary.cut.wall]
+        elif isinstance(boundary, WholeCells):
+            index = boundary.solids.index
+        where_solids = self.grid.everywhere if not self._placed else box if self._walls_change else None
+        for axis in range(self.grid.dimension if where_solids is not None else 0):
+            solids = {"nodes": nodes, "wall": walls[axis], "kind": kind, "index": index, "slip": self._slips, "walls": self._walls}
+            where_solids.run(passes.distance, out=distance[axis], hold=slip[axis], axis=axis, planes=planes, **solids)
+        self._placed = True
+        edges = {"xy": fine.edges[0, 1], "xz": fine.edges.get((0, 2)), "yz": fine.edges.get((1, 2))}
+        fields = zip("vdh", (fine.volume, distance, slip), strict=True)
+        faces = {f"{letter}{axis}": field for letter, of in fields for axis, field in zip("xyz", [*of, None], strict=False)}
+        # edges and faces on the upper ends of the domain, too; below the first cell there is nothing
+        above = Window.of([max(low, 1) for low in box.low], box.high, box.device)
+        above.run(passes.weights, cell=fine.cell, mixed=fine.mixed, phi=self._phi, planes=planes, scale=tau, **edges, **faces, **where)
+        for axis in range(self.grid.dimension):
+            given = {"diagonal": fine.diagonal[axis], "drag": fine.drag[axis], "held": fine.hold[axis], "volume": fine.volume[axis]}
+            given |= {"d": distance[axis], "h": slip[axis], "cell": fine.cell, "axis": axis, "planes": planes}
+            above.run(passes.diagonal, **given, **fine.across(axis), **where)
+        fine.find_spans(inner)
+        self.multigrid.set_up(box)
+
+    def _motion(self, axis: int) -> dict[str, Any]:
+        """Return how solids that cut cells move, and whose a component's faces are."""
+        moves = isinstance(self.boundary, CutBoundary) and self.boundary.moves
+        cut: Any = self.boundary.cut if isinstance(self.boundary, CutBoundary) and moves else None
+        numbers = {name: None if cut is None else _numbers(getattr(cut, name)) for name in ("turn", "shift")}
+        origin = dict(zip(("before_x", "before_y", "before_z"), self.grid.origin, strict=True))
+        return {"wall": None if cut is None else cut.wall[axis]} | numbers | origin
+
+    @property
+    def _solids(self) -> list[wp.array | None]:
+        """Velocities of solids on the faces of each component."""
+        return [*self.boundary.velocity] or [None] * self.grid.dimension
+
+    def _force(self, inner: Window, given: dict[str, Any], *, changed: bool) -> list[float]:
+        """Write the residual; return its norm, the energy that the velocity loses by the force, what walls give, and the diagonal's norm."""
+        fine, found, solids = self._fine, np.zeros(4), self._solids
+        residual, velocity, distance = self.multigrid.components(self.multigrid.r), given["u"], self._distance
+        for axis in range(self.grid.dimension):
+            of = {"u": velocity[axis], "d": distance[axis], "h": self._slip[axis], "own": solids[axis]}
+            for letter, other in zip("bc", fine.others(axis), strict=True):
+                there = other is not None
+                of |= {f"u{letter}": velocity[other] if there else None, f"d{letter}": distance[other] if there else None}
+                of |= {f"solid_{letter}": solids[other] if there else None}
+            of |= {"cell": fine.cell, "mixed": fine.mixed, "volume": fine.volume[axis], "diagonal": fine.diagonal[axis]}
+            of |= {"change": self.change[axis] if changed else None, "r": residual[axis], "axis": axis, "planes": self.grid.planes}
+            where = {
+                "kind": given["kind"],
+                "contact": given["contact"],
+                "base": self.boundary.base,
+                "dx": self.grid.spacing,
+            } | self._motion(axis)
+            self._sums[axis].take(inner, **of, **fine.across(axis), **where)
+            found += self._sums[axis].read()
+        if self._bodies is not None:
+            self._bodies.answer(self.multigrid.r, self._change)
+            found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
+        return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]
+
+
+def _numbers(array: wp.array) -> wp.array:
+    """Return vectors or matrices as the numbers that they lie in memory as."""
+    size = array.size * array.strides[0] // 4
+    return wp.array(ptr=array.ptr, dtype=wp.float32, shape=(size,), device=array.device, capacity=4 * size)

@@ -1,0 +1,204 @@
+"""Multigrid for the viscous equations: one symmetric cycle, the preconditioner of conjugate gradients.
+
+Coarse levels have the equations of the same form with the means of what the finer one weighs; unknowns are carried linearly, those beside air
+by the neighbors there are. Gauss-Seidel takes one component after the other, two colors of rows each, and back.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.fluids.viscosity_passes import viscous_passes
+from warp_lcp.grid.staggered import CLEAR, StaggeredGrid, Window
+from warp_lcp.rows.fields import zeros
+from warp_lcp.rows.program import Launch, Program
+
+LEAST = 8  # cells of the longest side at which there is no coarser level
+SWEEPS = 4  # of the coarsest level, each forth and back
+WALL = 0.5  # of the finer level's drag by walls, in units of its own links: half of what is near one lies in its row
+
+
+class VectorLevel:
+    """Fields and passes of a grid.
+
+    Args:
+        grid: the level's.
+        finest: whether right-hand side and solution are given from outside.
+
+    Attributes:
+        cell: weights of links along a component's own axis.
+        mixed: of those, what is left out of the products of different components where walls are, see `fluids.viscosity`.
+        edges: weights of links across, by pairs of axes.
+        volume, drag, diagonal, hold, norm: of the faces of each component: what weighs, what walls add, the sum; whether a wall holds it; the
+            interpolation's normalization.
+        x, b: solution and right-hand side, and `r`, the residual.
+        span: where a row's unknowns begin and end.
+    """
+
+    def __init__(self, grid: StaggeredGrid, x: list[wp.array], b: list[wp.array]) -> None:
+        self.grid, self.dimension, self.passes = grid, grid.dimension, viscous_passes(grid.dimension)
+        self.cell, self.mixed = grid.field(), grid.field()
+        self.edges = {pair: grid.field() for pair in [(0, 1), (0, 2), (1, 2)][: 1 if grid.dimension == 2 else 3]}
+        self.volume, self.drag, self.diagonal, self.hold, self.norm, self.r, self.there = (grid.faces() for _ in range(7))
+        self.x, self.b = x, b
+        self.span = wp.zeros(2 * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
+
+    def others(self, axis: int) -> list[int | None]:
+        """Return the two other axes; None: there is none."""
+        return [*(a for a in range(self.dimension) if a != axis), None][:2]
+
+    def across(self, axis: int) -> dict[str, wp.array | None]:
+        """Return the weights of links across for a component."""
+        of = [None if other is None else self.edges[min(axis, other), max(axis, other)] for other in self.others(axis)]
+        return {"xb": of[0], "xc": of[1]}
+
+    def _row(self, axis: int, x: list[wp.array]) -> dict[str, Any]:
+        y, z = (None if other is None else x[other] for other in self.others(axis))
+        given = {"x": x[axis], "y": y, "z": z, "cell": self.cell, "mixed": self.mixed, "diagonal": self.diagonal[axis]}
+        return given | self.across(axis) | {"axis": axis, "span": self.span}
+
+    def find_spans(self, window: Window) -> None:
+        """Find where the rows' unknowns lie."""
+        dx, dy, dz = [*self.diagonal, None][:3]
+        window.run(self.passes.span, whole=True, dx=dx, dy=dy, dz=dz, span=self.span)
+
+    def sweep(self, forth: bool, launch: Launch) -> None:
+        """Relax all components, the last one first if not forth."""
+        for axis in range(self.dimension) if forth else reversed(range(self.dimension)):
+            for color in (0, 1) if forth else (1, 0):
+                given = self._row(axis, self.x) | {"b": self.b[axis], "scratch": self.r[axis], "color": color, "order": int(not forth)}
+                if self.grid.device.is_cuda:
+                    for parity in (0, 1) if forth else (1, 0):
+                        self.grid.domain.run(self.passes.sweep, launch=launch, only=parity, **given)
+                else:
+                    self.grid.domain.run(self.passes.sweep, whole=True, launch=launch, only=-1, **given)
+
+    def residual(self, launch: Launch) -> None:
+        """Find r = b - A x."""
+        for axis in range(self.dimension):
+            self.grid.domain.run(self.passes.residual, launch=launch, right=self.b[axis], out=self.r[axis], **self._row(axis, self.x))
+
+    def product(self, x: list[wp.array], out: list[wp.array], launch: Launch) -> None:
+        """Find A x."""
+        for axis in range(self.dimension):
+            self.grid.domain.run(self.passes.product, launch=launch, right=None, out=out[axis], **self._row(axis, x))
+
+    def clear(self, launch: Launch) -> None:
+        """Set x to 0."""
+        for field in self.x:
+            self.grid.domain.run(CLEAR[wp.float32], launch=launch, field=field)
+
+    def average(self, fine: VectorLevel, window: Window) -> None:
+        """Take the means of a finer level, of which there is something in a window of this one."""
+        planes, axes = self.grid.planes, range(self.dimension)
+
+        def mean(out: wp.array, of: wp.array, faces: int, scale: float) -> None:
+            window.run(self.passes.average, out=out, fine=of, planes=planes, faces=faces, scale=scale)
+
+        mean(self.cell, fine.cell, 0, 0.25)
+        mean(self.mixed, fine.mixed, 0, 0.25)
+        for (a, b), edge in self.edges.items():
+            mean(edge, fine.edges[a, b], 1 << a | 1 << b, 0.25)
+        for axis in axes:
+            mean(self.volume[axis], fine.volume[axis], 1 << axis, 1.0)
+            mean(self.drag[axis], fine.drag[axis], 1 << axis, WALL)
+            window.run(self.passes.close, out=self.hold[axis], fine=fine.hold[axis], axis=axis, planes=planes)
+        inner = window.common(self.grid.domain)
+        if inner is None:
+            return
+        for axis in axes:
+            given = {
+                "h": self.hold[axis],
+                "volume": self.volume[axis],
+                "drag": self.drag[axis],
+                "cell": self.cell,
+                "there": self.there[axis],
+            }
+            window.run(self.passes.coarse_diagonal, diagonal=self.diagonal[axis], axis=axis, planes=planes, **given, **self.across(axis))
+        self.find_spans(inner)
+
+    def normalize(self, coarse: VectorLevel, window: Window) -> None:
+        """Find the normalization of the interpolation from a coarser level."""
+        for axis in range(self.dimension):
+            given = {"coarse": coarse.there[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "x": None}
+            window.run(self.passes.normalize, norm=self.norm[axis], diagonal=self.diagonal[axis], **given)
+
+    def restrict(self, coarse: VectorLevel, launch: Launch) -> None:
+        """Make the residual the coarser level's right-hand side."""
+        for axis in range(self.dimension):
+            given = {"fine": self.r[axis], "norm": self.norm[axis], "axis": axis, "planes": self.grid.planes, "span": coarse.span}
+            coarse.grid.domain.run(self.passes.restrict, launch=launch, out=coarse.b[axis], diagonal=coarse.diagonal[axis], **given)
+
+    def prolong(self, coarse: VectorLevel, launch: Launch) -> None:
+        """Add the coarser level's solution."""
+        for axis in range(self.dimension):
+            given = {"coarse": coarse.x[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "diagonal": None}
+            self.grid.domain.run(self.passes.prolong, launch=launch, x=self.x[axis], norm=self.norm[axis], **given)
+
+
+class VectorMultigrid:
+    """Approximate the inverse of the viscous equations on faces: z = M r, symmetric and positive definite.
+
+    Args:
+        grid: the finest grid.
+
+    Attributes:
+        r, z: flat float32 fields, one component after the other.
+        levels: from the finest on.
+        program: one cycle.
+    """
+
+    def __init__(self, grid: StaggeredGrid) -> None:
+        self.grid, size = grid, grid.dimension * grid.size
+        self.r, self.z = (zeros(size, wp.float32, grid.device, small_pages=grid.sparse) for _ in range(2))
+        self.levels = [VectorLevel(grid, self.components(self.z), self.components(self.r))]
+        while max(grid.counts) > LEAST:
+            nx, ny, nz = (-(-n // 2) for n in grid.counts)
+            grid = StaggeredGrid((nx, ny, nz), 2.0 * grid.spacing, grid.dimension, grid.device)
+            self.levels.append(VectorLevel(grid, grid.faces(), grid.faces()))
+        self.program = Program(grid.device)
+        self._cycle(0, self.program.launch)
+
+    def components(self, field: wp.array) -> list[wp.array]:
+        """Return a flat field as one field a component."""
+        n = self.grid.size
+        return [field[axis * n : (axis + 1) * n].reshape(self.grid.shape) for axis in range(self.grid.dimension)]
+
+    def apply(self) -> None:
+        """Write z = M r."""
+        self.program.run()
+
+    def product(self, p: wp.array, q: wp.array, *, launch: Launch = wp.launch) -> None:
+        """Write q = A p."""
+        self.levels[0].product(self.components(p), self.components(q), launch)
+
+    def set_up(self, window: Window) -> None:
+        """Make the coarse levels from the finest, of which something may differ from what it was in a window."""
+        boxes = [window]
+        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
+            box = boxes[-1]
+            low = [n // 2 for n in box.low]
+            high = [min(n // 2 + 2, size) for n, size in zip(box.high, coarse.grid.shape, strict=True)]
+            if self.grid.dimension == 2:
+                low[0], high[0] = 1, 2
+            boxes.append(Window.of(low, high, self.grid.device))
+            coarse.average(fine, boxes[-1])
+            inner = box.common(fine.grid.domain)
+            if inner is not None:
+                fine.normalize(coarse, inner)
+
+    def _cycle(self, number: int, launch: Launch) -> None:
+        level = self.levels[number]
+        level.clear(launch)
+        if number == len(self.levels) - 1:
+            for forth in (True,) * SWEEPS + (False,) * SWEEPS:
+                level.sweep(forth, launch)
+            return
+        level.sweep(True, launch)
+        level.residual(launch)
+        level.restrict(self.levels[number + 1], launch)
+        self._cycle(number + 1, launch)
+        level.prolong(self.levels[number + 1], launch)
+        level.sweep(False, launch)

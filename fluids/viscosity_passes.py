@@ -1,0 +1,94 @@
+"""Passes of the viscous solve, see `fluids.viscosity`."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.material.boundary_kernels import RELEASED
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.rows import RowPass
+
+HEADERS = Path(__file__).parent / "headers"
+F32, I8, U8 = wp.float32, wp.int8, wp.uint8
+CLOSE = 1e-3  # cells: a face within it of a wall, or behind it, has the wall's velocity
+THETA = 0.02  # cells: the shortest link to a wall
+ALONG = 0.95  # of a cell that the distance changes by from face to face: the wall lies across the axis
+KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
+LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG}
+
+
+def _fields(names: str, dtype: Any = F32) -> dict[str, Any]:
+    return dict.fromkeys(names.split(), dtype)
+
+
+@functools.cache
+def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, moving: bool = False) -> SimpleNamespace:
+    """Return the passes of a dimension; those that look at walls differ by these.
+
+    Args:
+        dimension: 2 or 3.
+        cut: whether solids cut cells.
+        ghost: whether the free surface lies between cells.
+        moving: whether solids have velocities.
+    """
+    deep = dimension == 3
+
+    def made(name: str, box: dict[str, Any], numbers: str = "axis", real: Any = F32, apart: str = "", **more: Any) -> RowPass:
+        types = {word: F32 if word in ("scale", "dx") else int for word in numbers.split()}
+        module = f"fluids.viscosity_{dimension}d{apart}"
+        return RowPass(f"{module}.{name}", HEADERS / f"viscous_{name}.h", real, box=box, numbers=types, **more)
+
+    walls = "_cut" * cut + "_ghost" * ghost + "_moving" * moving
+    macros = KINDS | LIMITS | {"CUT": cut, "GHOST": ghost, "MOVING": moving}
+    cells: dict[str, Any] = {"kind": I8, "contact": U8}
+    stencil, spans = _fields("x y z xb xc cell mixed diagonal"), {"whole": {"span": wp.int32}, "optional": ("z", "xc", "right")}
+    levels: dict[str, Any] = {"constants": {}}
+    carried = {"whole": _fields("coarse") | {"span": wp.int32}, "optional": ("diagonal", "x")}
+    sums = {"sums": ("residual", "taken", "given_by_walls", "stiff")}
+    near = {"apart": walls, "constants": macros}
+    return SimpleNamespace(
+        distance=made(
+            "distance", _fields("out hold nodes") | {"kind": I8, "wall": wp.int16, "index": wp.int32}, "axis planes walls",
+            whole={"slip": F32}, optional=("nodes", "kind", "wall", "index"), **near,
+        ),
+        weights=made(
+            "weights", _fields("cell mixed xy xz yz vx vy vz dx dy dz hx hy hz phi") | cells, "planes scale",
+            optional=("xz", "yz", "vz", "dz", "hz", "phi"), **near,
+        ),
+        diagonal=made(
+            "diagonal", _fields("diagonal drag held d h cell xb xc volume") | cells, "axis planes", optional=("xc",), **near
+        ),
+        force=made(
+            "force", _fields("r diagonal u ub uc d h db dc cell mixed xb xc volume change own solid_b solid_c") | cells | {"wall": wp.int16, "base": I8},
+            "axis planes before_x before_y before_z dx", whole=_fields("turn shift"),
+            optional=("uc", "dc", "xc", "change", "own", "solid_b", "solid_c", "wall", "turn", "shift"), **sums, **near,
+        ),
+        links=made(
+            "links", _fields("d h cell xb xc diagonal") | cells | {"wall": wp.int16},
+            "axis planes before_x before_y before_z dx width from_",
+            whole={"counts": wp.int32, "offsets": wp.int32, "entry_rows": wp.int32, "blocks": wp.int32, "ways": wp.int32, "body": wp.int32}
+            | dict.fromkeys(("values", "weights", "center"), wp.float64),
+            optional=("xc", "offsets", "entry_rows", "blocks", "ways", "values", "weights"), **near,
+        ),
+        cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
+        add=made("add", _fields("u total more"), ""),
+        sum=made("sum", _fields("u kept more"), ""),
+        span=made("span", _fields("dx dy dz"), "", whole={"span": wp.int32}, optional=("dz",)),
+        sweep=made(
+            "sweep", stencil | _fields("b scratch"), "axis color order only", constants={"DEPTH": deep}, whole={"span": wp.int32},
+            optional=("z", "xc"),
+        ),
+        product=made("apply", stencil | _fields("out right"), constants={"DEPTH": deep, "RESIDUAL": False}, **spans),
+        residual=made("apply", stencil | _fields("out right"), apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans),
+        average=made("average", _fields("out"), "planes faces scale", whole={"fine": F32}, **levels),
+        close=made("close", _fields("out"), "axis planes", whole={"fine": F32}, **levels),
+        coarse_diagonal=made("coarse_diagonal", _fields("diagonal there h volume drag cell xb xc"), "axis planes", optional=("xc",)),
+        normalize=made("prolong", _fields("norm diagonal x"), "axis planes", apart="_norm", constants={"NORM": True}, **carried),
+        prolong=made("prolong", _fields("norm diagonal x"), "axis planes", constants={"NORM": False}, **carried),
+        restrict=made("restrict", _fields("out diagonal"), "axis planes", whole=_fields("fine norm") | {"span": wp.int32}),
+    )  # fmt: skip
