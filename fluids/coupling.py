@@ -10,6 +10,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids import coupling_kernels as kernels
+from warp_lcp.fluids.forces import walls_of
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns
@@ -45,11 +46,8 @@ class BodyCoupling:
         self.columns = BlockColumns(grid.size, len(bodies.bodies), self.width, wp.float64, grid.device)
         body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
         body[bodies.numbers] = np.arange(len(bodies.bodies))
-        cut, S = boundary.cut, kernels.Solids()
-        S.planes, S.bodies, S.spacing, S.origin = grid.planes, len(bodies.bodies), grid.spacing, wp.vec3i(*grid.origin)
-        S.moving = cut.moving
-        S.open_x, S.open_y, S.open_z = (*cut.open, *cut.open[:1])[:3]
-        S.wall_x, S.wall_y, S.wall_z = (*cut.wall, *cut.wall[:1])[:3]
+        S = kernels.Solids()
+        S.walls, S.bodies = walls_of(grid, boundary), len(bodies.bodies)
         S.body = wp.array(body, dtype=wp.int32, device=grid.device)
         S.center = wp.zeros(len(bodies.bodies), dtype=wp.vec3d, device=grid.device)
         self._solids = S

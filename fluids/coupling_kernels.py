@@ -3,8 +3,8 @@
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
-from warp_lcp.grid.cut_cells_kernels import Moving, moving_part
+from warp_lcp.fluids.wall_kernels import Walls, face_center, moving_on
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.operators.grid_poisson import FLUID
 
 _FLUID = wp.constant(wp.int8(FLUID))
@@ -14,19 +14,10 @@ _F64 = wp.array(dtype=wp.float64)
 
 @wp.struct
 class Solids:
-    """What solids leave open, see `warp_lcp.grid.cut_cells`."""
+    """The bodies among the solids."""
 
-    planes: int
+    walls: Walls
     bodies: int
-    spacing: wp.float64
-    origin: wp.vec3i  # cells of a larger grid before the first one of this
-    moving: Moving
-    open_x: F32
-    open_y: F32
-    open_z: F32
-    wall_x: I16
-    wall_y: I16
-    wall_z: I16
     body: _I32  # of a wall's number; -1: it is none
     center: wp.array(dtype=wp.vec3d)  # of mass of each body [m]
 
@@ -34,18 +25,7 @@ class Solids:
 @wp.func
 def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
     """Return the body that covers a face, -1 if none does, and the share of the face that it covers."""
-    solid = int(0)
-    part = float(0.0)
-    free = float(1.0)
-    if axis == 0:
-        free = S.open_x[k, j, i]
-        solid, part = moving_part(S.moving, 0, S.planes, k, j, i, S.open_x, S.wall_x)
-    elif axis == 1:
-        free = S.open_y[k, j, i]
-        solid, part = moving_part(S.moving, 1, S.planes, k, j, i, S.open_y, S.wall_y)
-    else:
-        free = S.open_z[k, j, i]
-        solid, part = moving_part(S.moving, 2, S.planes, k, j, i, S.open_z, S.wall_z)
+    free, solid, part = moving_on(S.walls, axis, k, j, i)
     share = (wp.float64(1.0) - wp.float64(free)) * wp.float64(part)
     body = S.body[solid]
     if share == wp.float64(0.0):
@@ -56,9 +36,9 @@ def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
 @wp.func
 def beside_a_wall(S: Solids, k: int, j: int, i: int):
     """Return whether a face of a cell is not open."""
-    a = wp.min(wp.min(S.open_x[k, j, i], S.open_x[k, j, i + 1]), wp.min(S.open_y[k, j, i], S.open_y[k, j + 1, i]))
-    if S.planes == 2:
-        a = wp.min(a, wp.min(S.open_z[k, j, i], S.open_z[k + 1, j, i]))
+    a = wp.min(wp.min(S.walls.open_x[k, j, i], S.walls.open_x[k, j, i + 1]), wp.min(S.walls.open_y[k, j, i], S.walls.open_y[k, j + 1, i]))
+    if S.walls.planes == 2:
+        a = wp.min(a, wp.min(S.walls.open_z[k, j, i], S.walls.open_z[k + 1, j, i]))
     return a < 1.0
 
 
@@ -74,7 +54,7 @@ def side(S: Solids, n: int, k: int, j: int, i: int):
 def next_body(S: Solids, last: int, k: int, j: int, i: int):
     """Return the least body after `last` beside a cell; the number of bodies if there is none."""
     least = int(S.bodies)
-    for n in range(2 * (S.planes + 1)):
+    for n in range(2 * (S.walls.planes + 1)):
         body, _share = side(S, n, k, j, i)
         if body > last and body < least:
             least = body
@@ -104,17 +84,16 @@ def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _
                     if values:
                         move = wp.vec3d()
                         turn = wp.vec3d()
-                        for n in range(2 * (S.planes + 1)):
+                        for n in range(2 * (S.walls.planes + 1)):
                             body, share = side(S, n, k, j, i)
                             if body == least:
                                 axis = n >> 1
                                 high = n & 1
-                                half = wp.float64(0.5)
-                                o = S.origin
-                                x = wp.vec3d(wp.float64(i + o[0]) - half, wp.float64(j + o[1]) - half, wp.float64(k + o[2]) - half)
-                                x[axis] = x[axis] + wp.float64(high) - half
-                                r = x * S.spacing - S.center[least]
-                                if S.planes == 1:
+                                c = k + wp.where(axis == 2, high, 0)
+                                b = j + wp.where(axis == 1, high, 0)
+                                a = i + wp.where(axis == 0, high, 0)
+                                r = face_center(S.walls, axis, c, b, a) - S.center[least]
+                                if S.walls.planes == 1:
                                     r[2] = wp.float64(0.0)
                                 normal = wp.vec3d()
                                 normal[axis] = share * wp.float64(2 * high - 1)
@@ -122,10 +101,10 @@ def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _
                                 turn += wp.cross(r, normal)
                         index[e] = (k * kind.shape[1] + j) * kind.shape[2] + i
                         block[e] = least
-                        at = e * wp.where(S.planes == 1, 3, 6)
+                        at = e * wp.where(S.walls.planes == 1, 3, 6)
                         values[at] = move[0]
                         values[at + 1] = move[1]
-                        if S.planes == 1:
+                        if S.walls.planes == 1:
                             values[at + 2] = turn[2]
                         else:
                             values[at + 2] = move[2]

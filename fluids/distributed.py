@@ -350,6 +350,9 @@ def refusals(scene: LiquidScene) -> list[str]:
         'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
         "output.surface": output.surface,
         "output.volume": output.volume,
+        "output.forces": output.forces,
+        "probe": scene.probe,
+        "wall_drag": scene.drags,
     }
     return [key for key, wanted in asked.items() if wanted]
 

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from warp_lcp.fluids.tables import Probe, WallDragSettings, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
@@ -61,6 +62,8 @@ class LiquidScene(ParticleScene):
     pressure: Pressure = Field(default_factory=Pressure)
     viscosity: Viscosity | None = Field(default=None)
     liquid: list[Liquid] = Field(default_factory=list)
+    probe: list[Probe] = Field(default_factory=list)
+    wall_drag: WallDragSettings | None = None
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return `liquid` and its shapes."""
@@ -86,7 +89,7 @@ class LiquidScene(ParticleScene):
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which tells how full cells are'
             found.append(Complaint(("particles", "narrow_band"), None, message))
-        return [*found, *self._viscosity_complaints()]
+        return [*found, *self._viscosity_complaints(), *probe_complaints(self.probe, self.domain.size, self.physics.gravity)]
 
     def _viscosity_complaints(self) -> list[Complaint]:
         """Return what needs viscosity, and what viscosity does not go with."""
@@ -128,7 +131,21 @@ class LiquidScene(ParticleScene):
             found.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
             found.append(Model("automatic tolerance", 'solver.tolerance = "auto"'))
+        if self.probe:
+            found.append(Model("probes", "[[probe]]"))
+        if self.output.forces:
+            found.append(Model("forces on solids", "output.forces"))
+        if self.drags is not None:
+            found.append(Model("drag along walls", "[wall_drag]" if self.wall_drag is not None else "drag of a solid"))
         return [*found, *super().models()]
+
+    @property
+    def drags(self) -> list[float] | None:
+        """Return c_f of the domain's walls and of each solid, see `fluids.wall_drag`; None: no wall drags."""
+        table = self.wall_drag or WallDragSettings()
+        walls = [table.domain, *(solid.drag for solid in self.solid)]
+        found = [table.coefficient if given is None else given for given in walls]
+        return found if any(found) else None
 
     @property
     def keeps_volume(self) -> bool:
@@ -179,6 +196,7 @@ class LiquidScene(ParticleScene):
             "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
             "viscosity": cells * (self.viscosity is not None) * VISCOUS_BYTES[self.dimension],
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
+            "drag along walls": cells * 4 * self.dimension * (self.drags is not None),
             "surface": cells
             * (not self.stays_full)
             * (LEVEL_SET_BYTES * (level_set or self.cuts_cells) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)),

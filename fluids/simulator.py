@@ -11,14 +11,18 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
+from warp_lcp.fluids.forces import SolidForces, WallSums
 from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.fluids.unilateral import UnilateralPressure
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
+from warp_lcp.fluids.wall_drag import WallDrag
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.material.boundary import Boundary, CutBoundary
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.coverage import start_of
@@ -119,20 +123,35 @@ class LiquidSimulation(ParticleSimulation):
         grid: the one that it starts on.
         parts: what of it belongs to that grid.
         particles: the liquid at the start.
+        solids: of the scene, where something asks for the forces on them.
         more: as of `ParticleSimulation`.
 
     Attributes:
         surface: the free surface.
+        forces: what the step has done to each solid; None: nobody asks.
         projection: the pressure's fields.
         record: takes the problem of each step before it is solved, if it is set.
     """
 
     scene: LiquidScene
 
-    def __init__(self, scene: LiquidScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any) -> None:
+    def __init__(
+        self,
+        scene: LiquidScene,
+        grid: StaggeredGrid,
+        parts: Parts,
+        particles: Particles,
+        *,
+        solids: Sequence[PlacedSolid] = (),
+        **more: Any,
+    ) -> None:
+        tell = scene.output.forces or (scene.drags is not None and more.get("bodies") is not None)
+        self.forces = SolidForces(solids, grid.dimension) if tell else None
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.reach = max(self.layers, 2 * scene.pressure.smoothing)
+        self.probes = Probes(scene.probe, self.gravity, grid.dimension) if scene.probe else None
+        self.measured: dict[str, Row] = {}
         self.mark()
 
     def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
@@ -140,6 +159,10 @@ class LiquidSimulation(ParticleSimulation):
         super().lay(grid, parts)
         self.surface = self._surface()
         self.projection = self._pressure()
+        drags, physics = self.scene.drags, self.scene.physics
+        asked = self.forces is not None or drags is not None
+        self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
+        self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
 
     def _surface(self) -> FreeSurface:
@@ -164,6 +187,8 @@ class LiquidSimulation(ParticleSimulation):
             ValueError: dt is not positive.
         """
         before = self.begin_step(dt)
+        if self.forces is not None:
+            self.forces.begin(self.time)
         window = self.window(before)
         self.bring_to_faces(window)
         speed = self.top_speed(before)
@@ -175,18 +200,61 @@ class LiquidSimulation(ParticleSimulation):
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
+        walls = self._meet_walls(window, dt)
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
+        self._measure()
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
-        row = self.move(dt, window) | self.solve_row(projected.result) | viscous
+        row = self.move(dt, window) | self.solve_row(projected.result) | viscous | walls
         if self.scene.output.diagnostics:
             row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
         automatic = self.projection.automatic
         if automatic is not None and projected.result is not None:
             row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
         return self.logged(row | {"active": projected.released})
+
+    def tables(self) -> dict[str, tuple[str, ...]]:
+        """Return the columns of the tables beside the log; `measured` has the last step's row of each.
+
+        `time` is that of pressures, levels and forces: the step's beginning; velocities are those of its middle.
+        """
+        measured = {"probes": self.probes, "forces": self.forces if self.scene.output.forces else None}
+        return {name: ("step", "time", *found.columns()) for name, found in measured.items() if found is not None}
+
+    def _measure(self) -> None:
+        """Fill the rows of the tables, if there are any."""
+        clock: Row = {"step": self.step_count + 1, "time": self.time}
+        if self.probes is not None:
+            with self.watch.stage("probes", *self.velocity, self.projection.pressure):
+                self.measured["probes"] = clock | self.probes.row(self)
+        if self.forces is not None and self.scene.output.forces:
+            self.measured["forces"] = clock | self.forces.row(self.kick_dt)
+
+    def _meet_walls(self, window: Window, dt: float) -> Row:
+        """Collect what the projection has done to solids, before closed faces take other velocities, and let walls drag.
+
+        Returns:
+            What the log says of it.
+        """
+        sums, forces = self.wall_sums, self.forces
+        row: Row = {}
+        if sums is None:
+            return row
+        with self.watch.stage("walls", *self.velocity, self.projection.pressure, self.boundary.touch):
+            if forces is not None and self.scene.output.forces:
+                forces.add_pressure(sums, window, self)
+            if self.wall_drag is not None:
+                fields = self.velocity, self.projection, self.surface.phi
+                points = forces.references if forces is not None else None
+                row["drag_work"], dragged = self.wall_drag.act(sums, window, *fields, self.kick_dt, points)
+                if forces is not None and dragged is not None:
+                    forces.add(dragged)
+                if self.bodies is not None and dragged is not None:
+                    SolidForces.push(self.bodies, dragged)
+                    self.boundary.begin_step(self.time, dt)  # their velocities are others now
+        return row
 
     def known_density(self) -> wp.array | None:
         """Return the density that the surface lies in, if it is made of one."""
@@ -202,9 +270,11 @@ class LiquidSimulation(ParticleSimulation):
         active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the projection; volume [m^3; m^2 in 2-D]:
         counts FLUID cells, or lies inside the surface where that is finer than cells. With an automatic tolerance: tolerance, the relative
         residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes. With viscosity what its
-        solve took and reached, the energy that became heat in the step, and the work of moving walls on it [J; J/m in 2-D].
+        solve took and reached, the energy that became heat in the step, and the work of moving walls on it [J; J/m in 2-D]. With drag along
+        walls: drag_work [J; J/m in 2-D], the energy that it takes from the liquid in the step.
         """
-        columns = ("active", "max_divergence", "volume") if self.scene.output.diagnostics else ("active",)
+        drags = ("drag_work",) if self.scene.drags is not None else ()
+        columns = ("active", "max_divergence", "volume", *drags) if self.scene.output.diagnostics else ("active", *drags)
         columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
@@ -376,7 +446,8 @@ class FluidsSimulator:
         particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
         outlets, spray = make_outlets(scene, grid, folder), make_spray(scene, coverage, solids)
         return LiquidSimulation(
-            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray, notes=[*warnings, *notes]
+            scene, grid, parts, particles, solids=solids, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray,
+            notes=[*warnings, *notes],
         )  # fmt: skip
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:

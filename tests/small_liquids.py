@@ -52,3 +52,19 @@ def advance(simulation: LiquidSimulation, until: float, dt_max: float = 0.02) ->
         dt = min(simulation.stable_dt(), dt_max, until - simulation.time)
         rows.append({"dt": dt, **simulation.step(dt)})
     return rows
+
+
+def random_tank(seed: int) -> dict[str, Any]:
+    """Return the tables of a pool with a few solids in it, whole or cut, that stand apart or in each other, in 2-D or 3-D."""
+    rng = np.random.default_rng(seed)
+    dimension = int(rng.integers(2, 4))
+    solids: list[dict[str, Any]] = []
+    for _ in range(rng.integers(1, 4)):
+        center, size = rng.uniform(0.1, 0.7, dimension), rng.uniform(0.06, 0.2)
+        solids.append({"shape": "sphere", "center": center.tolist(), "radius": size})
+        if rng.random() < 0.5:
+            turn = rng.uniform(0.0, 180.0, 1 if dimension == 2 else 3).tolist()
+            solids[-1] = box((center - size).tolist(), (center + size).tolist(), rotate=turn, about=center.tolist())
+    top = [0.8, float(rng.uniform(0.35, 0.65)), 0.8][:dimension]
+    tables = {"solids": str(rng.choice(["voxel", "cut-cell"])), "particles": {"seed": seed}, "solid": solids}
+    return {"size": [0.8] * dimension, "resolution": 20, "liquid": [box([0.0] * dimension, top)], **tables}

@@ -74,6 +74,20 @@ class SimulationFailed(RuntimeError):
     """The run cannot go on, for example because a field is not finite. The message names step, field and cell."""
 
 
+@runtime_checkable
+class Measured(Protocol):
+    """A simulation that fills tables of its own beside the log, a row a step.
+
+    Attributes:
+        measured: the last step's row of each table.
+    """
+
+    measured: Mapping[str, Mapping[str, float | int | str | None]]
+
+    def tables(self) -> Mapping[str, tuple[str, ...]]:
+        """Return the columns of each table, the first of which is `step`, by the name of its file."""
+
+
 @dataclass(frozen=True)
 class Points:
     """A frame of vertices. `points` [m], shape (n, 3); `fields` of shape (n,) or (n, 3)."""

@@ -36,6 +36,12 @@ Z = np.array([1.11, 1.22, 1.44, 1.67, 1.89, 2.11, 2.33, 2.56, 2.78, 3.00, 3.22, 
 TAU = np.array([0.56, 0.77, 0.93, 1.08, 1.28, 1.46, 1.66, 1.84, 2.00, 2.21, 2.45, 2.70, 3.06, 3.44, 4.20, 5.25])
 H = np.array([0.94, 0.89, 0.83, 0.78, 0.72, 0.67, 0.61, 0.56, 0.50, 0.44, 0.39, 0.33, 0.28, 0.22, 0.17, 0.11])
 
+# the same experiment farther out, as read off its figure 3 (PySPH's `db_exp_data`), and what its slope is compared over
+FAR_T = np.array([3.345, 4.034, 4.418, 5.091, 5.685, 6.306, 6.822, 7.439, 8.031, 8.633, 9.237])
+FAR_Z = np.array([4.134, 4.944, 5.881, 6.980, 7.945, 8.966, 9.986, 10.963, 11.977, 13.005, 13.970])
+FAR, FAR_LENGTH, FAR_END = (4.0, 14.0), 16.0, 11.0  # Z; of the tank, in units of a; T
+VISCOSITY = 1e-6  # of water [m^2/s]
+
 
 class Collapse(NamedTuple):
     """A collapse in the experiment's units."""
@@ -81,10 +87,36 @@ def shown_gravity(c: Collapse) -> float:
     return signals.best_pace(c.T, c.Z, T[compared], Z[compared], MAX_SHIFT) ** 2
 
 
-def create(cells: int, numerics: Numerics, **tables: Any) -> LiquidSimulation:
-    """Return a column on a floor that it can slip on, its base so many cells wide."""
+def slope(time: np.ndarray, place: np.ndarray) -> float:
+    """Return the speed of a front far from where it began, dZ/dT."""
+    far = (place >= FAR[0]) & (place <= FAR[1])
+    return float(np.polyfit(time[far], place[far], 1)[0])
+
+
+def plate_friction() -> float:
+    """Return c_f of a smooth plate by Prandtl's law for turbulent flow, 0.074 Re^(-1/5): ten a long, as fast as the experiment's front."""
+    speed = slope(FAR_T, FAR_Z) * math.sqrt(N2 * GRAVITY * A)
+    return 0.074 * (speed * 10.0 * A / VISCOSITY) ** -0.2
+
+
+@check_at("dam break with drag", "{cells} cells of a, {numerics.name}")
+def far_front(found: Findings, cells: int, numerics: Numerics = SUB_CELL) -> None:
+    """Compare the speed of the front far out, where a floor without drag lets it run too fast; the control has none."""
+    expected = slope(FAR_T, FAR_Z)
+    for label, tables in (("c_f of a smooth plate", {"wall_drag": {"coefficient": plate_friction()}}), ("no drag", {})):
+        simulation = create(cells, numerics, FAR_LENGTH, **tables)
+        unit = math.sqrt(N2 * GRAVITY / A)
+        run = [(unit * row["time"], front(fill(simulation)) / cells) for row in steps(simulation, FAR_END / unit)]
+        time, place = stays(*np.array(run).T)
+        judge = found.add if tables else found.must_break
+        judge(f"{label}: dZ/dT over the experiment's, Z from 4 to 14", slope(time, place) / expected, low=0.95, high=1.05)
+        found.curve(label, time, place)
+
+
+def create(cells: int, numerics: Numerics, length: float = LENGTH, **tables: Any) -> LiquidSimulation:
+    """Return a column on a floor that it can slip on, its base so many cells wide, in a tank of a `length` in units of it."""
     column = box([0.0, 0.0], [A, N2 * A])
-    return create_liquid(numerics, [LENGTH * A, HEIGHT * A], round(LENGTH * cells), [column], **tables)
+    return create_liquid(numerics, [length * A, HEIGHT * A], round(length * cells), [column], **tables)
 
 
 def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Collapse:
@@ -104,9 +136,18 @@ def collapse(cells: int, numerics: Numerics, *, gravity: float = GRAVITY) -> Col
 
 DAM_BREAK = Check(
     about="A dam break against the experiments of Martin & Moyce 1952: a column of base a and height n^2 a, n^2 = 2.",
-    trials=[(front_and_height, RESOLUTIONS)],
+    trials=[(front_and_height, RESOLUTIONS), (far_front, RESOLUTIONS)],
     charts=[
         plot("dam-break-front", FRONT, "T = n t sqrt(g / a)", "Z = x / a", "front", exact={DATA: (T, Z)}, marked=[DATA]),
+        plot(
+            "dam-break-drag",
+            FRONT,
+            "T = n t sqrt(g / a)",
+            "Z = x / a",
+            "c_f of a smooth plate",
+            exact={DATA: (FAR_T, FAR_Z)},
+            marked=[DATA],
+        ),
         plot("dam-break-height", HIGH, "tau = t sqrt(g / a)", "H = y / (n^2 a)", "height", exact={DATA: (TAU, H)}, marked=[DATA]),
     ],
 )

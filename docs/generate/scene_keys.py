@@ -156,7 +156,13 @@ def shapes_of(schema: Definition, name: str) -> dict[str, Definition]:
 
 def arrays_of(schema: Definition) -> list[str]:
     """Return the arrays of shapes of a simulator's scenes."""
-    return [name for name, prop in schema["properties"].items() if prop.get("type") == "array"]
+    return [name for name, prop in schema["properties"].items() if "discriminator" in prop.get("items", {})]
+
+
+def lists_of(schema: Definition) -> dict[str, Definition]:
+    """Return the arrays of tables of a simulator's scenes, but for shapes, by name."""
+    entries = {name: reference(prop.get("items", {})) for name, prop in schema["properties"].items()}
+    return {name: schema["$defs"][target] for name, target in entries.items() if target is not None}
 
 
 def shape_section(schema: Definition) -> str:
@@ -222,6 +228,7 @@ def page() -> str:
         schema = schemas[simulator]
         parts.append(f'## {material.capitalize()}\n\n`scene.simulator = "{simulator}"`.\n')
         parts += [section(3, name, definition) for name, definition in tables[simulator].items() if name not in shared]
+        parts += [section(3, f"[{name}]", definition) for name, definition in lists_of(schema).items()]
         parts += [array_section(schema, name) for name in arrays_of(schema) if name not in alike]
     return "\n".join(parts).rstrip() + "\n"
 

@@ -181,6 +181,14 @@ CASES = {
         {"solver": {"tolerance": "auto"}}, modules=("warp_lcp.tolerance",), files=("fluids/tolerance.py",),
         columns=("tolerance", "time_error"),
     ),
+    "probes": Case(
+        {"probe": [{"name": "a", "position": [0.1, 0.1], "quantity": "pressure"}]}, modules=("fluids.probes",), files=("fluids/probes.py",)
+    ),
+    "forces on solids": Case({"output": QUIET | {"forces": True}}, modules=("fluids.forces",), files=("fluids/forces.py",)),
+    "drag along walls": Case(
+        {"wall_drag": {"coefficient": 0.01}}, modules=("fluids.wall_drag",), files=("fluids/wall_drag.py", "fluids/forces.py"),
+        columns=("drag_work",),
+    ),
     "rigid bodies in sand": Case(
         {"solid": [BALL | {"density": 500.0}]}, {"solid": [SWAYING]}, modules=("granular.bodies",), files=("granular/bodies.py",),
         columns=("body0_x", "contacts"), sand=True,

@@ -111,6 +111,7 @@ class WholeCells:
             raise ValueError(f"wall_velocity has shape {np.shape(wall_velocity)}: expected ({len(solids.separating)}, 3)")
         self.base, self.touch, self.capacity = grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         self.open: Faces = []
+        self.wall_velocity = wall_velocity
         self.velocity: Faces = grid.faces() if wall_velocity is not None else []
         everywhere = Window((0, 0, 0), grid.shape, grid.device)
         everywhere.launch(kernels.base_kernel, [solids.index, self.base])

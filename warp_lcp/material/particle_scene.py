@@ -178,6 +178,8 @@ class ParticleScene(Scene):
         if self.particles.narrow_band is not None and not self.carried_by_grid:
             message = "is for liquids only: sand deep inside has a state that its particles alone know"
             found.append(Complaint(("particles", "narrow_band"), None, message))
+        if self.output.forces and not self.carried_by_grid:
+            found.append(Complaint(("output", "forces"), True, "is for liquids only"))
         return super().complaints() + found + self._reseed_complaints()
 
     def _reseed_complaints(self) -> list[Complaint]:

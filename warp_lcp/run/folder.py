@@ -41,7 +41,7 @@ SCENE = "scene.toml"
 ROUNDING = 1e-9
 BEFORE = "before its first step had ended"
 LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
-OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|log\.csv|[a-z][a-z_]*\.pvd")
+OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd")
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
 CHECKPOINTS = "checkpoints"
 STORED_STATE = re.compile(f"{CHECKPOINT_FILE.pattern}|{REFUSED_FILE.pattern}")
@@ -262,19 +262,20 @@ class RunFolder:
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
 
-    def gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
-        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.run.gaps`.
+    def gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
+        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.run.gaps`; tables as of `open_log`.
 
         Raises:
             OSError: a file cannot be read.
             OutputError: the log has other columns.
         """
-        return self._gaps(columns, step, times, frame) or []
+        return self._gaps(tables, step, times, frame) or []
 
     @on_root
-    def _gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
+    def _gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
         whole = self.frames.whole if isinstance(self.frames, RankFrames) else self.frames
-        return gaps(self.log, columns, whole, self.checkpoints, step=step, times=times, frame=frame)
+        logs = {self.log.with_stem(name): columns for name, columns in tables.items()}
+        return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
 
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
@@ -295,9 +296,9 @@ class RunFolder:
                 file.unlink()
         self.checkpoints.set_aside(step)
 
-    def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None) -> Log:
-        """Begin the log or continue it, see `Log`."""
-        return Log(self.log, columns, after_step=after_step, collective=self.collective)
+    def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None, table: str = "log") -> Log:
+        """Begin the log or continue it, see `Log`; or another table."""
+        return Log(self.log.with_stem(table), columns, after_step=after_step, collective=self.collective)
 
     def frame_writer(self, watch: Stopwatch) -> FrameWriter | RankFrameWriter:
         """Return what writes the frames while the simulation goes on."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,14 +14,13 @@ from warp_lcp.simulation import Part, Volume
 
 
 def gaps(
-    log: Path, columns: Sequence[str], frames: FrameFolder, checkpoints: CheckpointFolder, *, step: int, times: Sequence[float],
+    logs: Mapping[Path, Sequence[str]], frames: FrameFolder, checkpoints: CheckpointFolder, *, step: int, times: Sequence[float],
     frame: Sequence[Part],
 ) -> list[str]:  # fmt: skip
     """Return a line for each file or kind of files that has holes, with what to do about it; the checkpoints that it takes are spared.
 
     Args:
-        log: log.csv.
-        columns: of it.
+        logs: the columns of log.csv and of the tables beside it.
         frames: the run's frames.
         checkpoints: the run's checkpoints.
         step: that the run goes on from.
@@ -31,11 +31,12 @@ def gaps(
         OutputError: the log has other columns.
     """
     lines = []
-    rows = {int(row.split(",", 1)[0]) for row in rows_until(log, ",".join(columns), step)[1:]}
-    steps = sorted({*range(1, step + 1)} - rows)
-    if steps:
-        again = _again(checkpoints, lambda found, _: found < steps[0])
-        lines.append(f"{log.name}: rows are missing, of steps {spans(steps)}; {again}")
+    for log, columns in logs.items():
+        rows = {int(row.split(",", 1)[0]) for row in rows_until(log, ",".join(columns), step)[1:]}
+        steps = sorted({*range(1, step + 1)} - rows)
+        if steps:
+            again = _again(checkpoints, partial(_precedes, steps[0]))
+            lines.append(f"{log.name}: rows are missing, of steps {spans(steps)}; {again}")
     missing = {name: numbers for name in frames.kinds(frame) if (numbers := frames.missing(name, len(times)))}
     if missing:
         first = times[min(min(numbers) for numbers in missing.values())]
@@ -54,6 +55,11 @@ def spans(numbers: Iterable[int]) -> str:
         else:
             ends.append([number, number])
     return ", ".join(str(low) if low == high else f"{low} to {high}" for low, high in ends)
+
+
+def _precedes(first: int, step: int, time: float) -> bool:
+    """Return whether a checkpoint's step is before another."""
+    return step < first
 
 
 def _again(checkpoints: CheckpointFolder, is_before: Callable[[int, float], bool]) -> str:

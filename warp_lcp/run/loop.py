@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -32,6 +32,7 @@ from warp_lcp.simulation import (
     Cells,
     DistributedSimulation,
     Joined,
+    Measured,
     NoStopwatch,
     Part,
     Points,
@@ -221,6 +222,7 @@ class Run:
         self._below_dt_min = False
         self._missed: list[tuple[float, int]] = []  # what solves left that missed their tolerance, and in which step
         self._tolerance = scene.solver.tolerance
+        self._tables: dict[str, Log] = {}  # beside the log
         self._checkpointed: int | None = None  # the newest checkpoint's step
         self._checkpoint_time = clock.monotonic()
 
@@ -231,7 +233,10 @@ class Run:
         start = self._frame()
         self._check_space(last, start)
         try:
-            with self.writer, closing(self._resume(start) if resumed else self._start(last, start)) as log:
+            with ExitStack() as stack:
+                stack.enter_context(self.writer)
+                log = stack.enter_context(closing(self._resume(start) if resumed else self._start(last, start)))
+                self._open_tables(stack, self._first_step if resumed else None)
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
                 stopped = self._advance(log, last, stop)
                 self._write_checkpoint(log)
@@ -279,11 +284,19 @@ class Run:
         self._first_step = self.simulation.step_count
         self._count()
         times = [self.time.frame_time(index) for index in range(self.record.frames + 1)]
-        for gap in self.folder.gaps(self._columns(), self._first_step, times, frame):
+        for gap in self.folder.gaps({"log": self._columns(), **self._table_columns()}, self._first_step, times, frame):
             self._warn(gap)
         self.folder.go_on(self.record, self._first_step)
         self.folder.frames.resume(times)
         return self.folder.open_log(self._columns(), after_step=self._first_step)
+
+    def _open_tables(self, stack: ExitStack, after_step: int | None) -> None:
+        """Begin or continue the tables beside the log, to be closed by a stack."""
+        for name, columns in self._table_columns().items():
+            self._tables[name] = stack.enter_context(closing(self.folder.open_log(columns, after_step=after_step, table=name)))
+
+    def _table_columns(self) -> Mapping[str, tuple[str, ...]]:
+        return self.simulation.tables() if isinstance(self.simulation, Measured) else {}
 
     def _columns(self) -> tuple[str, ...]:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")
@@ -294,6 +307,8 @@ class Run:
         while frame <= last:
             row = self._step(self.time.frame_time(frame))
             log.append(row)
+            for name, table in self._tables.items():
+                table.append(cast(Measured, self.simulation).measured[name])
             self.observer.step(row)
             if missed(row):
                 self._missed.append((residual_of(row) or 0.0, self.simulation.step_count))
@@ -370,7 +385,8 @@ class Run:
         files: list[Path] = []
         with self.watch.stage("checkpoints"):
             if log:
-                log.sync()
+                for file in (log, *self._tables.values()):
+                    file.sync()
             if beside and isinstance(self.writer, FrameWriter):  # ranks write together
                 state = {name: np.array(array) for name, array in self.simulation.state().items()}
                 self.writer.then("checkpoints, written", partial(self._store, Checkpoint(step, self.simulation.time, state)))

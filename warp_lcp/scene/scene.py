@@ -177,6 +177,7 @@ class Output(Table):
     diagnostics: bool = Field(
         default=True, description="measure what only the log shows: volume and divergence of liquid, yielding and dissipation of sand"
     )
+    forces: bool = Field(default=False, description="write forces.csv: force and torque of a liquid on each solid, a row a step")
     checkpoint_every: CountOrZero = Field(default=50, description="steps between checkpoints; 0: not by steps")
     checkpoint_minutes: Positive | None = Field(default=None, description="the most minutes of real time between checkpoints")
     checkpoints_kept: Count = Field(default=3, description="how many of the newest checkpoints stay")

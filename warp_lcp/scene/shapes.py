@@ -248,6 +248,9 @@ class SolidProperties(Shape):
         f"{BODY_FRICTION:g} for a rigid body in a liquid",
     )
     restitution: Part = Field(default=0.0, description="of a rigid body: the part of the speed of an impact that comes back")
+    drag: NonNegative | None = Field(
+        default=None, description="of a liquid along its surface, as coefficient of [wall_drag], which it is unless given"
+    )
 
     @property
     def is_body(self) -> bool:
@@ -263,6 +266,8 @@ class SolidProperties(Shape):
         """Return what is wrong with the solid in a scene of 2 or 3 dimensions."""
         moves = self.motion.complaints(dimension) if self.motion else []
         found = super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
+        if self.drag is not None and self.rubs:
+            found.append(Complaint(("drag",), self.drag, "is for liquids: sand has friction"))
         return found + (self._body_complaints() if self.is_body else self._still_complaints())
 
     def _body_complaints(self) -> list[Complaint]:

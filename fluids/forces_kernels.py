@@ -1,0 +1,57 @@
+# mypy: ignore-errors
+"""Kernels that find what the pressure does to solids."""
+
+import warp as wp
+
+from warp_lcp.fluids.wall_kernels import Walls, closed_on, face_center, put, standing_of, wall_way
+from warp_lcp.grid.cell_kernel import F32, F64, INTS, U8, cell_kernel
+
+
+@cell_kernel("fluids.forces")
+def pressure_kernel(
+    k, j, first, end, S: Walls, references: wp.array(dtype=wp.vec3d), counts: INTS, offsets: INTS, owners: INTS,
+    values: wp.array2d(dtype=wp.float64), bodies: wp.array(dtype=wp.uint8), touch: U8, x: F64,
+    u: F32, v: F32, w: F32, kick: wp.vec3, scale: wp.float64,
+):  # fmt: skip
+    """Count the closed parts of faces that pressure acts on in a row, or with `values` write its impulses on them: `scale` x a share.
+
+    x is continued from a cell's center to the wall, see `warp_lcp.fluids.forces`; `kick` [m/s] is what gravity adds to velocities.
+    """
+    row = k * x.shape[1] + j
+    begin = int(0)
+    if values:
+        begin = offsets[row]
+    e = int(begin)
+    for i in range(first, end):
+        if x[k, j, i] != wp.float64(0.0) and touch[k, j, i] != wp.uint8(0):
+            rise = float(0.0)
+            still = int(0)
+            if not S.index:
+                rise = wp.dot(wall_way(S, k, j, i), kick)
+                still = standing_of(S, k, j, i)
+            for n in range(2 * (S.planes + 1)):
+                axis = n >> 1
+                high = n & 1
+                side = 2 * high - 1
+                c = k + wp.where(axis == 2, high, 0)
+                b = j + wp.where(axis == 1, high, 0)
+                a = i + wp.where(axis == 0, high, 0)
+                owner, own, covered, mover, moved = closed_on(S, axis, c, b, a)
+                stopped = u[c, b, a]
+                if axis == 1:
+                    stopped = v[c, b, a]
+                if axis == 2:
+                    stopped = w[c, b, a]
+                for part in range(3):
+                    solid = wp.where(part == 0, owner, wp.where(part == 1, still, mover))
+                    share = wp.where(part == 0, own, wp.where(part == 1, covered, moved))
+                    if share > 0.0:
+                        if values:
+                            more = wp.where(bodies[solid] != wp.uint8(0), 0.0, rise)
+                            if S.index or solid == 0:
+                                more = 0.5 * float(side) * stopped
+                            force = wp.vec3d()
+                            force[axis] = scale * (x[k, j, i] + wp.float64(more)) * wp.float64(share) * wp.float64(side)
+                            put(e, solid, force, face_center(S, axis, c, b, a) - references[solid], owners, values)
+                        e += 1
+    counts[row] = e - begin

@@ -1,0 +1,167 @@
+"""Probes: pressure, velocity and the surface's height at points of the scene, a row a step of `probes.csv`."""
+
+import typing
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.fluids.tables import Probe
+from warp_lcp.grid.cell_kernel import F32, F64, I8, interpolated
+from warp_lcp.material.particle_log import Row
+from warp_lcp.operators.grid_poisson import FLUID, SOLID
+
+if typing.TYPE_CHECKING:
+    from warp_lcp.fluids.simulator import LiquidSimulation
+
+_FLUID, _SOLID = wp.constant(wp.int8(FLUID)), wp.constant(wp.int8(SOLID))
+STEP = wp.constant(0.25)  # cells between two looks for the surface
+VALUES = 5  # of a probe: pressure over density, velocity, level
+
+options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.probes"}
+
+
+@wp.func
+@typing.no_type_check
+def corner(x: wp.vec3, n: int, planes: int, shape: wp.vec3i):
+    """Return corner n of the cube of cell centers around array coordinates, and its share in trilinear interpolation."""
+    high = wp.vec3i(n & 1, (n >> 1) & 1, n >> 2)
+    at = wp.vec3i(0, 0, 1)
+    share = float(1.0)
+    for axis in range(planes + 1):
+        c = wp.clamp(x[axis], 0.0, float(shape[axis]) - 1.001)
+        at[axis] = int(c) + high[axis]
+        f = c - float(int(c))
+        share *= wp.where(high[axis] == 1, f, 1.0 - f)
+    return at, share
+
+
+@wp.func
+@typing.no_type_check
+def depth_of(x: wp.vec3, planes: int, shape: wp.vec3i, kind: I8, phi: F32):
+    """Return how deep array coordinates lie below the free surface, by cells that are not SOLID, and the share of those."""
+    deep = float(0.0)
+    total = float(0.0)
+    for n in range(4 * planes):
+        at, share = corner(x, n, planes, shape)
+        what = kind[at[2], at[1], at[0]]
+        if what != _SOLID:
+            value = wp.where(what == _FLUID, 0.5, -0.5)
+            if phi:
+                value = -phi[at[2], at[1], at[0]]
+            deep += share * value
+            total += share
+    return deep, total
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def probe_kernel(
+    points: wp.array(dtype=wp.vec3), counts: wp.vec3i, planes: int, kind: I8, x: F64, phi: F32, u: F32, v: F32, w: F32,
+    kick: wp.vec3, up: wp.vec3, values: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
+    """Find x [m/s], velocity [m/s] and level [cells] at points in array coordinates, in which cell i reaches from i to i + 1.
+
+    `kick` [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points against it and has length 1.
+    """
+    t = wp.tid()
+    shape = counts + wp.vec3i(2, 2, 2)
+    p = points[t]
+    inside = bool(True)
+    cell = wp.vec3i(1, 1, 1)
+    for axis in range(planes + 1):
+        inside = inside and p[axis] >= 1.0 and p[axis] <= float(counts[axis]) + 1.0
+        cell[axis] = wp.clamp(int(p[axis]), 1, counts[axis])
+    for n in range(5):
+        values[t, n] = wp.float64(0.0)
+    c = p - wp.vec3(0.5, 0.5, 0.5)
+    wet = bool(False)
+    if inside:
+        wet = kind[cell[2], cell[1], cell[0]] == _FLUID
+    if not wet:
+        for n in range(1, 4):
+            values[t, n] = wp.float64(wp.nan)
+    if wet:
+        found = wp.float64(0.0)
+        total = float(0.0)
+        for n in range(4 * planes):
+            at, share = corner(c, n, planes, shape)
+            if kind[at[2], at[1], at[0]] == _FLUID:
+                off = c - wp.vec3(float(at[0]), float(at[1]), float(at[2]))
+                rise = float(0.0)
+                for axis in range(planes + 1):
+                    rise += kick[axis] * off[axis]
+                found += wp.float64(share) * (x[at[2], at[1], at[0]] + wp.float64(rise))
+                total += share
+        if total > 0.0:
+            values[t, 0] = found / wp.float64(total)
+        values[t, 1] = wp.float64(interpolated(u, planes, p[0], c[1], c[2]))
+        values[t, 2] = wp.float64(interpolated(v, planes, c[0], p[1], c[2]))
+        if planes == 2:
+            values[t, 3] = wp.float64(interpolated(w, planes, c[0], c[1], p[2]))
+    if inside:
+        room = float(1.0e9)  # to the grid's end
+        for axis in range(planes + 1):
+            if up[axis] != 0.0:
+                end = wp.where(up[axis] > 0.0, float(counts[axis]) + 1.0, 1.0)
+                room = wp.min(room, (end - p[axis]) / up[axis])
+        deep, total = depth_of(c, planes, shape, kind, phi)
+        level = float(0.0)
+        looking = bool(deep > 0.0)
+        while looking:
+            way = wp.min(STEP, room - level)
+            last = deep
+            deep, total = depth_of(c + (level + way) * up, planes, shape, kind, phi)
+            looking = total > 0.0 and way > 0.0
+            if looking:
+                if deep <= 0.0:
+                    level += way * last / (last - deep)
+                    looking = False
+                else:
+                    level += way
+        values[t, 4] = wp.float64(level)
+
+
+class Probes:
+    """Measure at points that stay where they are.
+
+    Pressure is interpolated trilinearly from the liquid's cells; air and solids among the eight around a point are left out, and what the
+    others have is continued to the point by the pressure at rest's gradient rho g. Velocity is trilinear on each component's faces. Where
+    the point's cell holds no liquid pressure is 0 and velocity has no value. The level is the way from the point against gravity to the
+    first surface above it, or to the solid or the domain's end that comes before; 0 if the point is not in liquid.
+
+    Args:
+        probes: of the scene.
+        gravity: [m/s^2], shape (3,).
+        dimension: 2 or 3.
+    """
+
+    def __init__(self, probes: Sequence[Probe], gravity: np.ndarray, dimension: int) -> None:
+        self.probes, self.gravity, self.dimension = tuple(probes), gravity, dimension
+        size = float(np.linalg.norm(gravity))
+        self._up = -gravity / size if size > 0.0 else np.zeros(3)
+        self._points = np.array([[*probe.position, 0.0][:3] for probe in probes])
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the columns: NAME_pressure [Pa], NAME_level [m], NAME_vx, NAME_vy and in 3-D NAME_vz [m/s]."""
+        return tuple(column for probe in self.probes for column in probe.columns(self.dimension))
+
+    def row(self, simulation: "LiquidSimulation") -> Row:
+        """Return what a step has found, before anything moves."""
+        found, scale = self._measure(simulation), simulation.scene.physics.density * simulation.grid.spacing / simulation.kick_dt
+        row: Row = {}
+        for probe, values in zip(self.probes, found, strict=True):
+            shown = {"pressure": values[:1] * scale, "velocity": values[1:4], "level": values[4:] * simulation.grid.spacing}
+            row |= dict(zip(probe.columns(self.dimension), shown[probe.quantity].tolist(), strict=False))
+        return row
+
+    def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
+        """Return x [m/s], velocity [m/s] and level [cells] of each probe."""
+        grid, projection, velocity = simulation.grid, simulation.projection, [*simulation.velocity, None][:3]
+        points = wp.array((grid.to_grid(self._points) - grid.origin).astype(np.float32), dtype=wp.vec3, device=grid.device)
+        values = wp.zeros((len(self.probes), VALUES), dtype=wp.float64, device=grid.device)
+        fields = [projection.kind, projection.pressure, simulation.surface.phi, *velocity]
+        kick = wp.vec3(*(self.gravity * simulation.kick_dt))
+        inputs = [points, wp.vec3i(*grid.counts), grid.planes, *fields, kick, wp.vec3(*self._up), values]
+        wp.launch(probe_kernel, len(self.probes), inputs, device=grid.device)
+        return np.asarray(values.numpy())

@@ -1,0 +1,56 @@
+"""Tables of a liquid's scene: what is measured in it, and how walls slow it down."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from warp_lcp.scene.scene import Complaint, Table, Vector
+from warp_lcp.settings import NonNegative
+
+
+class WallDragSettings(Table):
+    """[wall_drag]: friction along walls whose boundary layer the grid does not resolve; without the table, and `drag` of a solid, none."""
+
+    coefficient: NonNegative = Field(default=0.0, description="c_f of walls and solids: the shear stress is c_f / 2 rho u^2; about 0.005")
+    domain: NonNegative | None = Field(default=None, description="of the domain's walls; coefficient unless given")
+
+
+def _column_name(text: str) -> str:
+    """Return a name that columns may begin with."""
+    if not (text.isascii() and text.isidentifier()):
+        raise PydanticCustomError("name", 'must be a name of letters, digits and "_" that begins with no digit')
+    return text
+
+
+class Probe(Table):
+    """[[probe]]: a point at which every step is measured, for probes.csv."""
+
+    name: Annotated[str, AfterValidator(_column_name)] = Field(description="of its columns, such as NAME_pressure")
+    position: Vector = Field(description="the point [m], in the domain")
+    quantity: Literal["pressure", "velocity", "level"] = Field(description="level: height of the surface above it, against gravity [m]")
+
+    def columns(self, dimension: int) -> tuple[str, ...]:
+        """Return the names of its columns."""
+        parts = ("vx", "vy", "vz")[:dimension] if self.quantity == "velocity" else (self.quantity,)
+        return tuple(f"{self.name}_{part}" for part in parts)
+
+
+def probe_complaints(probes: Sequence[Probe], size: Sequence[float], gravity: Sequence[float]) -> list[Complaint]:
+    """Return what is wrong with the probes of a domain of these sides [m], in such a gravity [m/s^2]."""
+    found = []
+    for index, probe in enumerate(probes):
+        place = ("probe", index, "position")
+        if len(probe.position) != len(size):
+            found.append(Complaint(place, probe.position, f"must have {len(size)} entries, as domain.size has"))
+        elif not all(0.0 <= x <= side for x, side in zip(probe.position, size, strict=True)):
+            found.append(Complaint(place, probe.position, f"lies outside the domain, which reaches from the origin to {list(size)} m"))
+        if any((probe.name, probe.quantity) == (other.name, other.quantity) for other in probes[:index]):
+            message = f"is the name of another probe of the {probe.quantity}: their columns would be the same"
+            found.append(Complaint(("probe", index, "name"), probe.name, message))
+        if probe.quantity == "level" and not any(gravity):
+            found.append(Complaint(("probe", index, "quantity"), "level", "needs gravity, along which it is measured"))
+    return found

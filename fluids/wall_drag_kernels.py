@@ -1,0 +1,215 @@
+# mypy: ignore-errors
+"""Kernels of the drag along walls."""
+
+import warp as wp
+
+from warp_lcp.fluids.wall_kernels import Walls, closed_on, face_center, fields_on, put, standing_of
+from warp_lcp.grid.cell_kernel import F32, I8, INTS, U8, cell_kernel
+from warp_lcp.material.boundary_kernels import HELD
+from warp_lcp.operators.grid_poisson import FLUID
+
+_FLUID, _HELD = wp.constant(wp.int8(FLUID)), wp.constant(wp.uint8(HELD))
+HALF = wp.constant(0.5)
+
+
+@wp.struct
+class Drag:
+    """What the drag is made of; velocities are those after the projection, float32 on faces."""
+
+    walls: Walls
+    kind: I8
+    contact: U8
+    phi: F32  # distance to the free surface at cell centers [cells]; null: it lies on the cells' faces
+    u: F32
+    v: F32
+    w: F32
+    known_u: I8
+    known_v: I8
+    known_w: I8
+    coefficient: wp.array(dtype=wp.float32)  # of the domain and each solid: shear stress over rho u^2
+    turn: wp.array(dtype=wp.mat33)  # a wall's point x moves at turn x + shift
+    shift: wp.array(dtype=wp.vec3)
+
+
+@wp.func
+def open_share(S: Walls, axis: int, k: int, j: int, i: int):
+    """Return the open fraction of a face."""
+    free = float(0.0)
+    if S.index:
+        _owner, own, _covered, _mover, _moved = closed_on(S, axis, k, j, i)
+        free = 1.0 - own
+    else:
+        free, _wall = fields_on(S, axis, k, j, i)
+    return free
+
+
+@wp.func
+def fill(D: Drag, k: int, j: int, i: int):
+    """Return how full of liquid a cell is, as its surface lies."""
+    full = wp.where(D.kind[k, j, i] == _FLUID, 1.0, 0.0)
+    if D.phi:
+        full = wp.clamp(HALF - D.phi[k, j, i], 0.0, 1.0)
+        full = wp.where(D.kind[k, j, i] == _FLUID, wp.max(full, HALF), wp.min(full, HALF))
+    return full
+
+
+@wp.func
+def mean_of(field: F32, known: I8, axis: int, component: int, k: int, j: int, i: int):
+    """Return a component's mean over the projected ones of its four faces around a face of another axis [m/s]; 0 without any."""
+    total = float(0.0)
+    count = float(0.0)
+    for n in range(4):
+        a = n & 1  # the cell below the face, or the face's
+        b = n >> 1  # its lower or upper face
+        z = k - wp.where(axis == 2, a, 0) + wp.where(component == 2, b, 0)
+        y = j - wp.where(axis == 1, a, 0) + wp.where(component == 1, b, 0)
+        x = i - wp.where(axis == 0, a, 0) + wp.where(component == 0, b, 0)
+        if known[z, y, x] == wp.int8(1):
+            total += field[z, y, x]
+            count += 1.0
+    return total / wp.max(count, 1.0)
+
+
+@wp.func
+def velocity_on(D: Drag, axis: int, k: int, j: int, i: int):
+    """Return the velocity on a face [m/s]."""
+    q = wp.vec3()
+    if axis == 0:
+        q[0] = D.u[k, j, i]
+    else:
+        q[0] = mean_of(D.u, D.known_u, axis, 0, k, j, i)
+    if axis == 1:
+        q[1] = D.v[k, j, i]
+    else:
+        q[1] = mean_of(D.v, D.known_v, axis, 1, k, j, i)
+    if D.walls.planes == 2:
+        if axis == 2:
+            q[2] = D.w[k, j, i]
+        else:
+            q[2] = mean_of(D.w, D.known_w, axis, 2, k, j, i)
+    return q
+
+
+@wp.func
+def piece_of(S: Walls, n: int, along: int, k: int, j: int, i: int):
+    """Return the area of a piece of wall in a cell [faces] that drags along an axis, its normal, and whose it is.
+
+    The first 2 d pieces are what whole cells, or the domain, close of each face; the last one is what solids that cut the cell close: a
+    plane with the vector area of all their parts, which cancel in a gap of one cell.
+    """
+    faces = 2 * (S.planes + 1)
+    area = float(0.0)
+    normal = wp.vec3()
+    solid = int(0)
+    if n < faces:
+        axis = n >> 1
+        high = n & 1
+        if axis != along:
+            owner, own, _covered, _mover, _moved = closed_on(
+                S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
+            )
+            if S.index or owner == 0:
+                area = own
+                solid = wp.max(owner, 0)
+                normal[axis] = 1.0
+    elif not S.index:
+        most = float(0.0)
+        for m in range(faces):
+            axis = m >> 1
+            high = m & 1
+            owner, own, covered, mover, moved = closed_on(
+                S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
+            )
+            if owner == 0:
+                own = float(0.0)
+            normal[axis] = normal[axis] + float(2 * high - 1) * (own + covered + moved)
+            if own > most:
+                most = own
+                solid = owner
+            if covered > most:
+                most = covered
+                solid = standing_of(S, k, j, i)
+            if moved > most:
+                most = moved
+                solid = mover
+        area = wp.length(normal)
+        normal = wp.normalize(normal)
+    return area, normal, solid
+
+
+@wp.func
+def pull(D: Drag, axis: int, q: wp.vec3, x: wp.vec3, area: float, normal: wp.vec3, solid: int):
+    """Return how fast a piece of wall pulls a face's velocity, area x coefficient x speed, and what that loses until it rests [m/s]."""
+    relative = q - (D.turn[solid] * x + D.shift[solid])
+    along = relative - wp.dot(relative, normal) * normal
+    own = relative[axis]
+    lost = wp.clamp(along[axis], wp.min(own, 0.0), wp.max(own, 0.0))  # no more than all of it, nor a gain
+    return wp.where(lost == 0.0, 0.0, area * D.coefficient[solid] * wp.length(along)), lost
+
+
+@cell_kernel("fluids.wall_drag")
+def drag_kernel(
+    k, j, first, end, S: Walls, references: wp.array(dtype=wp.vec3d), counts: INTS, offsets: INTS, owners: INTS,
+    values: wp.array2d(dtype=wp.float64), D: Drag, axis: int, dt: float, mass: wp.float64, apply: int, field: F32, known: I8,
+    losses: wp.array(dtype=wp.float64),
+):  # fmt: skip
+    """Slow down the projected faces of a row beside walls that hold the liquid; count pieces of wall, or with `values` write impulses.
+
+    Nothing changes unless `apply` or `values` is given. `mass` is that of a full cell [kg]; `losses` gains the energy of each row [J].
+    """
+    row = k * field.shape[1] + j
+    begin = int(0)
+    if values:
+        begin = offsets[row]
+    e = int(begin)
+    for i in range(first, end):
+        c = k - wp.where(axis == 2, 1, 0)
+        b = j - wp.where(axis == 1, 1, 0)
+        a = i - wp.where(axis == 0, 1, 0)
+        here = bool(False)
+        below = bool(False)
+        if known[k, j, i] == wp.int8(1):
+            here = D.kind[k, j, i] == _FLUID and D.contact[k, j, i] == _HELD
+            below = D.kind[c, b, a] == _FLUID and D.contact[c, b, a] == _HELD
+        if here or below:
+            free = open_share(S, axis, k, j, i)
+            part = free * HALF * (fill(D, k, j, i) + fill(D, c, b, a))
+            center = face_center(S, axis, k, j, i)
+            x = wp.vec3(float(center[0]), float(center[1]), float(center[2]))
+            q = velocity_on(D, axis, k, j, i)
+            rates = float(0.0)
+            pulls = float(0.0)
+            now = float(0.0)
+            last = int(e)
+            for turn in range(wp.where(values, 2, 1)):  # what all pieces do, and then what of it is each one's
+                for side in range(2):
+                    z = wp.where(side == 0, k, c)
+                    y = wp.where(side == 0, j, b)
+                    s = wp.where(side == 0, i, a)
+                    if (side == 0 and here) or (side == 1 and below):
+                        o = wp.where(side == 0, 1, 0)  # the cell's other face: its upper or its lower one
+                        other = open_share(
+                            S, axis, z + wp.where(axis == 2, o, 0), y + wp.where(axis == 1, o, 0), s + wp.where(axis == 0, o, 0)
+                        )
+                        weight = dt / float(S.spacing) / wp.max(part, 1.0e-6) * free / (free + other)
+                        for n in range(2 * (S.planes + 1) + 1):
+                            area, normal, solid = piece_of(S, n, axis, z, y, s)
+                            if area > 0.0 and D.coefficient[solid] > 0.0:
+                                rate, lost = pull(D, axis, q, x, weight * area, normal, solid)
+                                if turn == 0:
+                                    rates += rate
+                                    pulls += rate * lost
+                                    e += 1
+                                else:
+                                    e -= 1  # from the last one
+                                    force = wp.vec3d()
+                                    force[axis] = mass * wp.float64(part * rate * (now - q[axis] + lost))
+                                    put(e, solid, force, center - references[solid], owners, values)
+                if turn == 0:
+                    last = e
+                now = q[axis] - pulls / (1.0 + rates)
+            e = last
+            if apply == 1 or values:
+                losses[row] = losses[row] + wp.float64(0.5) * mass * wp.float64(part) * wp.float64((q[axis] - now) * (q[axis] + now))
+                field[k, j, i] = now
+    counts[row] = e - begin

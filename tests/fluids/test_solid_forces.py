@@ -1,0 +1,230 @@
+"""Forces on solids: hydrostatics, Archimedes, momentum, and their table beside the log."""
+
+import csv
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from pydantic import ValidationError
+
+import small_sands
+from small_liquids import GRAVITY, advance, box, create, random_tank, scene
+from small_runs import run_into
+from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.fluids.forces_kernels import pressure_kernel
+from warp_lcp.scene.scene_file import load_scene
+
+WATER = 1000.0 * GRAVITY
+FORCES = {"forces": True}
+
+
+def tank(dimension: int, **tables: Any) -> LiquidSimulation:
+    """Return a tank of 20 x 20 (x 20) cells, filled to 14."""
+    size, top = [0.8] * dimension, [0.8, 0.56, 0.8][:dimension]
+    return create(scene(size=size, resolution=20, liquid=[box([0.0] * dimension, top)], output=FORCES, **tables))
+
+
+def forces(simulation: LiquidSimulation, until: float) -> dict[str, np.ndarray]:
+    """Step to a time and return the last step's force and torque on the domain and on each solid, shape (3,) in 2-D, (6,) in 3-D."""
+    if until:
+        advance(simulation, until)
+    row = simulation.measured["forces"]
+    assert tuple(row) == simulation.tables()["forces"]
+    names = ["domain", *(f"solid{n}" for n in range(len(simulation.scene.solid)))]
+    values = np.array(list(row.values())[2:], dtype=float).reshape(len(names), -1)
+    return dict(zip(names, values, strict=True))
+
+
+def ball(dimension: int, **more: Any) -> dict[str, Any]:
+    return {"shape": "sphere", "center": [0.41, 0.27, 0.37][:dimension], "radius": 0.15, **more}
+
+
+@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
+@pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_archimedes_and_the_weight_on_the_floor(dimension: int, solids: str, surface: str) -> None:
+    """The ball is pushed up by what it displaces, as cells are closed; the walls bear that and the weight of the liquid."""
+    simulation = tank(dimension, solids=solids, pressure={"surface": surface}, solid=[ball(dimension)])
+    found = forces(simulation, 0.3)
+    volume = np.pi * 0.15**2 if dimension == 2 else 4.0 / 3.0 * np.pi * 0.15**3
+    if solids == "voxel":
+        volume = simulation.boundary.solids.covered[0] * simulation.grid.cell_volume
+    up = found["solid0"][1] / (WATER * volume)
+    lost = {"voxel": 1e-3, "cut-cell": 0.015 if dimension == 2 else 0.042}[solids]  # of a ball of 3.75 cells, between the grid's nodes
+    assert up == pytest.approx(1.0, abs=lost)
+    assert np.abs(np.delete(found["solid0"], 1)).max() < 0.02 * WATER * volume, "no other force, no torque about its center"
+    filled = 0.8 * 0.56 * (0.8 if dimension == 3 else 1.0)
+    if surface == "voxel":
+        filled += 0.5 * simulation.grid.spacing * 0.8 ** (dimension - 1)  # whole cells put the surface half a cell too high
+    assert found["domain"][1] / (WATER * filled) == pytest.approx(-1.0, abs=1e-3)
+    assert abs(found["domain"][0]) < 0.01 * WATER * filled
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
+def test_floor_and_walls_bear_the_depth(dimension: int, solids: str) -> None:
+    """A floor and a wall as solids, off the cells' faces with cut cells; their torque is about the centers of their boxes."""
+    floor, wall = (0.11, 0.57) if solids == "cut-cell" else (0.12, 0.56)
+    low, high = [-0.2] * dimension, [1.0] * dimension
+    parts = [box(low, [1.0, floor, 1.0][:dimension]), box([wall, floor, -0.2][:dimension], high)]
+    found = forces(tank(dimension, solids=solids, solid=parts), 0.3)
+    depth, width = 0.56 - floor, 0.8 if dimension == 3 else 1.0
+    weight, push = WATER * depth * wall * width, 0.5 * WATER * depth**2 * width
+    both = found["solid0"] + found["solid1"]  # where they touch, either may have what is buried
+    assert both[:2] == pytest.approx([push, -weight], rel=0.01)
+    assert found["domain"][0] == pytest.approx(-push, rel=0.01), "the left wall"
+    assert found["domain"][1] == pytest.approx(0.0, abs=1e-3 * weight), "all of the floor is the solid's"
+    alone = forces(tank(dimension, solids=solids, solid=parts[:1]), 0.3)["solid0"]
+    assert alone[:2] == pytest.approx([0.0, -WATER * depth * 0.8 * width], rel=2e-3, abs=1e-3 * push)
+    aside = forces(tank(dimension, solids=solids, solid=[box([wall, -0.2, -0.2][:dimension], high)]), 0.3)["solid0"]
+    push, lever = 0.5 * WATER * 0.56**2 * width, 0.56 / 3.0 - 0.4  # of the center of pressure, above that of the box
+    assert aside[:2] == pytest.approx([push, 0.0], rel=0.01, abs=1e-3 * push)
+    assert aside[-1] == pytest.approx(-push * lever, rel=0.02)
+
+
+def crowded(dimension: int, solids: str, moves: str) -> LiquidSimulation:
+    """Return liquid in motion around solids that share cells: one stands, one moves or is a body."""
+    more: dict[str, Any] = {"stands": {}, "body": {"density": 700.0}}.get(moves, {})
+    if moves == "moves":
+        more = {"motion": {"kind": "translation", "velocity": [0.3, -0.2, 0.1][:dimension]}}
+    standing = box([0.57, 0.0, 0.0][:dimension], [0.8, 0.31, 0.8][:dimension])
+    liquid = [box([0.0] * dimension, [0.4, 0.7, 0.8][:dimension]), box([0.4, 0.0, 0.0][:dimension], [0.8, 0.5, 0.8][:dimension])]
+    tables: dict[str, Any] = {"solids": solids, "solid": [standing, ball(dimension, **more)], "pressure": {"surface": "voxel"}}
+    return create(scene(size=[0.8] * dimension, resolution=20, liquid=liquid, output=FORCES, **tables))
+
+
+CROWDED = [("voxel", "stands"), ("cut-cell", "stands"), ("cut-cell", "moves"), ("cut-cell", "body")]
+
+
+@pytest.mark.parametrize(("solids", "moves"), CROWDED)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_what_the_pressure_takes_from_the_liquid_solids_get(dimension: int, solids: str, moves: str, monkeypatch: Any) -> None:
+    """On the grid to rounding: the faces' momentum, open fractions times change of velocity, against all solids' impulses.
+
+    Of whole cells with what stops the liquid in the half cells beside closed faces, else of the pressure alone.
+    """
+    simulation = crowded(dimension, solids, moves)
+    projection, mass, checked = simulation.projection, 1000.0 * simulation.grid.cell_volume, []
+    project = projection.project
+
+    def watched(velocity: Any, window: Any, *rest: Any) -> Any:
+        before = [field.numpy().astype(np.float64) for field in velocity]
+        done = project(velocity, window, *rest)
+        x, boundary = projection.pressure, simulation.boundary
+        gained = np.zeros(3)
+        for axis, (field, u, known) in enumerate(zip(velocity, before, projection.known, strict=True)):
+            open_ = boundary.open[axis].numpy() if boundary.open else 1.0
+            gained[axis] = mass * (np.where(known.numpy() == 1, field.numpy() - u, 0.0) * open_).sum()
+            if solids == "voxel":  # on closed faces of cells with pressure
+                index, filled = boundary.solids.index.numpy() >= 0, x.numpy() != 0.0
+                beside = (index & np.roll(filled, 1, 2 - axis)) | (np.roll(index, 1, 2 - axis) & filled)
+                gained[axis] -= 0.5 * mass * u[beside].sum()
+        fields = velocity if solids == "voxel" else [wp.zeros_like(field) for field in velocity]
+        bodies = wp.zeros(3, dtype=wp.uint8, device="cpu")
+        given = [bodies, boundary.touch, x, *[*fields, fields[0]][:3], wp.vec3(), mass]
+        pushed = simulation.wall_sums.take(pressure_kernel, window, np.zeros((3, 3)), given)
+        assert np.abs(gained + pushed.sum(axis=0)[:3]).max() < 1e-5 * np.abs(pushed).max()
+        checked.append(np.abs(pushed[:, 1]).min())
+        return done
+
+    monkeypatch.setattr(projection, "project", watched)
+    for _ in range(3):
+        simulation.step(0.004)
+    assert min(checked) > 0.0, "all three bear"
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_body_is_told_what_it_got(dimension: int) -> None:
+    """The table and the coupling add up the same faces, each in its own way."""
+    simulation = crowded(dimension, "cut-cell", "body")
+    body, given = simulation.bodies.bodies[0], []
+    push = simulation.projection.push_bodies
+
+    def watched(result: Any) -> None:
+        push(result)
+        given.append(body.given[:3].copy() if dimension == 3 else body.given[[0, 1, 5]].copy())
+
+    simulation.projection.push_bodies = watched  # type: ignore[method-assign]
+    for _ in range(4):
+        simulation.step(0.004)
+        told = forces(simulation, 0.0)["solid1"][: 3 if dimension == 3 else None] * simulation.kick_dt
+        assert told == pytest.approx(given[-1], rel=1e-6, abs=1e-9)
+    assert np.abs(given).max() > 0.0
+
+
+@pytest.mark.parametrize("solids", ["voxel", "cut-cell"])
+def test_an_impact_takes_the_momentum(solids: str) -> None:
+    """A block falls into a tilted tub: what particles lose of their momentum, gravity's apart, the walls have got, to a few percent."""
+    tables: dict[str, Any] = {"solids": solids, "solid": [{"shape": "plane", "point": [0.3, 0.1], "normal": [0.3, 1.0]}]}
+    block = [box([0.2, 0.4], [0.52, 0.72], velocity=[0.6, -1.0])]
+    simulation = create(scene(size=[0.8, 0.8], resolution=40, liquid=block, output=FORCES, **tables))
+
+    def momentum() -> np.ndarray:
+        return simulation.particle_mass * simulation.particles.velocity.numpy()[:, :2].sum(axis=0, dtype=np.float64)
+
+    mass = simulation.particle_mass * simulation.particles.count
+    start, given, elapsed = momentum(), np.zeros(2), 0.0
+    while simulation.time < 0.4:
+        simulation.step(min(simulation.stable_dt(), 0.01))
+        given += sum(force[:2] for force in forces(simulation, 0.0).values()) * simulation.kick_dt
+        elapsed += simulation.kick_dt
+    change = momentum() - start - mass * elapsed * np.array([0.0, -GRAVITY])
+    assert np.abs(given).max() > mass * 1.0
+    assert np.abs(change + given).max() < 0.05 * np.abs(given).max()
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13, 14])
+def test_all_solids_together_bear_the_liquid(seed: int) -> None:
+    """Whatever stands in a pool at rest: the forces on it and on the walls add up to the weight of the particles."""
+    simulation = create(scene(**random_tank(seed), output=FORCES))
+    found = forces(simulation, 0.6)
+    weight = simulation.particle_mass * simulation.particles.count * GRAVITY
+    total = sum(force[: simulation.grid.dimension] for force in found.values())
+    assert total[1] / weight == pytest.approx(-1.0, abs=0.03)
+    assert np.abs(np.delete(total, 1)).max() < 0.01 * weight
+
+
+def test_forces_change_nothing() -> None:
+    states = []
+    for output in ({}, FORCES):
+        simulation = create(scene(size=[0.8, 0.8], resolution=20, liquid=[box([0, 0], [0.4, 0.5])], solid=[ball(2)], output=output))
+        assert bool(simulation.tables()) == bool(output)
+        advance(simulation, 0.2)
+        states.append(simulation.state())
+    assert all(np.array_equal(states[0][name], states[1][name]) for name in states[0])
+
+
+def test_reference_points_move_along() -> None:
+    """A rotating paddle: the point is the center of its box, which goes around; a plane has the origin."""
+    motion = {"kind": "rotation", "center": [0.4, 0.4], "rate": 90.0}
+    solids = [box([0.5, 0.38], [0.7, 0.42], motion=motion), {"shape": "plane", "point": [0.0, 0.05], "normal": [0.0, 1.0]}]
+    simulation = create(scene(size=[0.8, 0.8], resolution=20, liquid=[box([0, 0], [0.8, 0.3])], solid=solids, output=FORCES))
+    advance(simulation, 1.0)
+    turned = np.radians(90.0 * (simulation.time - simulation.last_dt))
+    assert simulation.forces.references[1] == pytest.approx([0.4 + 0.2 * np.cos(turned), 0.4 + 0.2 * np.sin(turned), 0.0], abs=1e-9)
+    assert (simulation.forces.references[[0, 2]] == 0.0).all()
+    assert set(simulation.tables()) == {"forces"}
+    assert simulation.tables()["forces"][-1] == "solid1_torque"
+
+
+def test_an_interrupted_run_writes_the_same_table(tmp_path: Path) -> None:
+    overrides = ["domain.resolution=24", "time.duration=0.3", "output.checkpoint_every=5", "output.forces=true"]
+    model, asked = load_scene("dam-break-2d", overrides), itertools.count(1)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert run_into(model, whole).status == "finished"
+    assert run_into(model, parts, stop=lambda: next(asked) >= 7).status == "stopped"
+    assert run_into(model, parts, resume=True).status == "finished"
+    assert (parts / "forces.csv").read_bytes() == (whole / "forces.csv").read_bytes()
+    with open(whole / "forces.csv", newline="") as table:
+        rows = list(csv.DictReader(table))
+    assert list(rows[0]) == ["step", "time", "domain_fx", "domain_fy", "domain_torque"]
+    assert all(float(row["domain_fy"]) < 0.0 for row in rows), "the floor bears"
+
+
+def test_sand_has_none() -> None:
+    sand = {"size": [1.0, 0.5], "resolution": 16, "sand": [small_sands.box([0.0, 0.0], [0.3, 0.3])]}
+    with pytest.raises(ValidationError, match="is for liquids only"):
+        small_sands.scene(**sand, output=FORCES)
