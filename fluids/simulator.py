@@ -345,6 +345,8 @@ class LiquidSimulation(ParticleSimulation):
             self.restore_bodies()
             residual = f"relative residual of {found.relative_residual:.2e} (tolerance {viscosity.tolerance})"
             raise missed_by_far("viscous", wl.SolveStatus.MAX_ITERATIONS, found.iterations, residual, "a shorter step is less stiff")
+        if self.forces is not None and self.scene.output.forces:
+            self.forces.add(viscosity.impulses(self.velocity, projection.kind, projection.contact, self.forces.references))
         viscosity.undo(self.velocity)
         for body, values in zip(self.bodies.bodies if self.bodies is not None else (), momenta, strict=True):
             body.restore_momenta(values)

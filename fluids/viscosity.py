@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.fluids.viscosity_bodies import BodyDrag
+from warp_lcp.fluids.viscosity_bodies import BodyDrag, WallPull
 from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
@@ -39,6 +39,7 @@ from warp_lcp.grid.tally import WindowTally
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rigid.body import PLANAR
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch
 
@@ -107,6 +108,7 @@ class Viscosity:
         self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)
         self._distance, self._slip, self.before = grid.faces(), grid.faces(), grid.faces()
         self.change = self.multigrid.components(self._change)
+        self._pull: WallPull | None = None  # made when it is first asked for
         self._bodies: BodyDrag | None = None
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
@@ -135,7 +137,7 @@ class Viscosity:
         self._set_up(box, inner, kind, contact, self._viscosity / self._density * dt / self.grid.spacing**2)
         given = {"u": velocity, "kind": kind, "contact": contact}
         if self._bodies is not None:
-            self._bodies.take(self._fine, self._distance, self._slip, velocity, {"kind": kind, "contact": contact})
+            self._bodies.take(self._fine, self._walls_of_faces, {"kind": kind, "contact": contact}, velocity)
             if self._bodies.moved:  # a recorded iteration knows where they lay
                 self._solver = ConjugateGradient(self._product, self.multigrid, by_error=True)
         first, lost, driven, stiff = self._force(inner, given, changed=False)
@@ -155,6 +157,33 @@ class Viscosity:
         energy = self._density * self.grid.cell_volume
         residual = norm / first if first > 0.0 else 0.0
         return ViscousResult(iterations, residual, norm <= least, energy * (lost + driven), energy * driven)
+
+    @property
+    def _walls_of_faces(self) -> dict[str, Sequence[wp.array]]:
+        """What `WallPull` takes of walls."""
+        return {"d": self._distance, "h": self._slip}
+
+    def impulses(self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array, points: np.ndarray) -> np.ndarray:
+        """Return what viscous stresses of the last step give the domain and each solid, shape (1 + solids, 6): N s, N m s.
+
+        Args:
+            velocity: that the step has made [m/s].
+            kind: as of `solve`.
+            contact: as of `solve`.
+            points: about which moments are taken [m], shape (1 + solids, 3).
+        """
+        if self._pull is None:
+            self._pull = WallPull(self.grid, self.boundary, range(len(points)), len(points), self._passes)
+        self._pull.take(self.grid.domain, self._fine, self._walls_of_faces, {"kind": kind, "contact": contact}, points)
+        pulled, drags = self._pull.pulled(velocity, points)
+        if isinstance(self.boundary, CutBoundary) and self.boundary.moves:
+            turn, shift = self.boundary.cut.turn.numpy(), self.boundary.cut.shift.numpy()
+            spins = np.stack((turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]), axis=-1)
+            six = np.concatenate((np.einsum("sij,sj->si", turn, points) + shift, spins), axis=1)
+            pulled -= np.einsum("sij,sj->si", drags, six if self.grid.dimension == 3 else six[:, PLANAR])
+        impulses = np.zeros((len(points), 6))
+        impulses[:, slice(None) if self.grid.dimension == 3 else PLANAR] = self._density * self.grid.cell_volume * pulled
+        return impulses
 
     def push_bodies(self) -> None:
         """Give the bodies the impulses of the last step, if there are bodies."""

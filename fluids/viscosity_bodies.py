@@ -1,4 +1,4 @@
-"""Rigid bodies that a thick liquid drags along, and that drag it: their velocities are unknowns of the viscous step."""
+"""Solids that a thick liquid drags along, and that drag it; the velocities of rigid bodies are unknowns of the viscous step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_lcp.fluids.viscosity_multigrid import VectorLevel
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.boundary import CutBoundary
+from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.operators.low_rank import BlockColumns, weigh_kernel
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rows.program import Launch
@@ -19,13 +19,111 @@ from warp_lcp.rows.program import Launch
 SPARE = 1.5  # room for links, times those there are when there is none left
 
 
-class BodyDrag:
-    """Solve for liquid and bodies together, see `fluids.viscosity`.
+class WallPull:
+    """Find what pulls the liquid's faces towards some solids.
 
-    What pulls a face towards a body's velocity V does so by c'V: of a link that meets its wall, the weight times the velocities g of the
-    body's unit motions there; of a product with a face in the body, those at that face. The body is pulled back by C'u - D V, C of rows c.
-    All this is an energy's, which rigid motions of liquid and body together leave 0, so D is what makes C'u = D V for those. With
-    m = rho dx^d M^-1 the body's velocity is V = V1 + m (C'u - D V), so that a change of the liquid's velocity changes it by
+    What pulls a face towards a solid's velocity V, of its motions (vx, vy, wz) or (vx, vy, vz, wx, wy, wz) about a point, does so by c'V:
+    of a link that meets its wall, the weight times the velocities of the unit motions there; of a product with a face in the solid, those
+    at that face. The solid is pulled back by C'u - D V, C of rows c. All this is an energy's, which rigid motions of liquid and solid
+    together leave 0, so D is what makes C'u = D V for those.
+
+    Args:
+        grid: the grid.
+        boundary: its solids.
+        numbers: those of the solids, 0 for the domain.
+        passes: of the viscous solve.
+
+    Attributes:
+        rows: the face of each c, in the flat field of all components.
+        blocks: its solid.
+        values: c, shape (n, 3) or (n, 6).
+    """
+
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, numbers: Sequence[int], solids: int, passes: Any) -> None:
+        self.grid, self.boundary, self._passes = grid, boundary, passes
+        self.width, self.count = 3 if grid.dimension == 2 else 6, len(numbers)
+        owners = np.full(solids, -1, dtype=np.int32)
+        owners[list(numbers)] = np.arange(len(numbers))
+        self._owners = wp.array(owners, dtype=wp.int32, device=grid.device)
+        self._counts = wp.zeros(grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
+
+    def take(
+        self,
+        window: Window | None,
+        level: VectorLevel,
+        walls: dict[str, Sequence[wp.array]],
+        where: dict[str, wp.array],
+        points: np.ndarray,
+    ) -> None:
+        """Find `rows`, `blocks` and `values`.
+
+        Args:
+            window: cells with all faces beside the solids; None: there are none.
+            level: the equations of the step.
+            walls: `d`, distance of each component's faces from walls [cells], and `h`, the slip length of those [cells].
+            where: `kind` and `contact` of cells.
+            points: about which the solids turn [m], shape (solids, 3).
+        """
+        grid, distance = self.grid, walls["d"]
+        owners: list[Any] = [*self.boundary.cut.wall] if isinstance(self.boundary, CutBoundary) else [None] * grid.dimension
+        index = self.boundary.solids.index if isinstance(self.boundary, WholeCells) else None
+        given = where | {"body": self._owners, "center": wp.array(points.ravel(), dtype=wp.float64, device=grid.device), "index": index}
+        given |= {"cell": level.cell, "mixed": level.mixed, "planes": grid.planes, "dx": grid.spacing, "width": self.width}
+        given |= dict(zip(("before_x", "before_y", "before_z"), grid.origin, strict=True)) | {"counts": self._counts}
+        found = [(np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, self.width)))]
+        for axis in range(grid.dimension if window is not None else 0):
+            assert window is not None
+            of = given | level.across(axis) | {"axis": axis, "d": distance[axis], "h": walls["h"][axis], "diagonal": level.diagonal[axis]}
+            of |= {"wall": owners[axis], "from_": axis * grid.size}
+            of |= dict(zip(("db", "dc"), level.of_others(axis, distance), strict=True))
+            of |= dict(zip(("wall_b", "wall_c"), level.of_others(axis, owners), strict=True))
+            found.append(self._entries(window, of))
+        self.rows, self.blocks, self.values = (np.concatenate(parts) for parts in zip(*found, strict=True))
+
+    def pulled(self, velocity: Sequence[wp.array], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return C'u and D of each solid, shapes (solids, width) and (solids, width, width).
+
+        Args:
+            velocity: u of each component [m/s].
+            points: as of `take`.
+        """
+        grid, dimension = self.grid, self.grid.dimension
+        axes, cells = np.divmod(self.rows, grid.size)
+        k, j, i = np.unravel_index(cells, grid.shape)
+        places = (np.stack((i, j, k), axis=-1) + np.array(grid.origin) - 0.5 - 0.5 * np.eye(3)[axes]) * grid.spacing
+        at = [field.numpy().ravel() for field in velocity]
+        speeds = np.array([at[axis][cell] for axis, cell in zip(axes, cells, strict=True)])
+        sums, drags = np.zeros((self.count, self.width)), np.zeros((self.count, self.width, self.width))
+        for n in range(self.count):
+            own = self.blocks == n
+            arms = places[own] - points[n]
+            arms[:, dimension:] = 0.0
+            turns = np.cross(np.eye(3)[None], arms[:, None])[np.arange(len(arms)), :, axes[own]]  # by the axis of the turn
+            motions = np.concatenate((np.eye(3)[axes[own]][:, :dimension], turns[:, 2:] if dimension == 2 else turns), axis=1)
+            drag = self.values[own].T @ motions
+            drags[n], sums[n] = 0.5 * (drag + drag.T), speeds[own] @ self.values[own]
+        return sums, drags
+
+    def _entries(self, window: Window, given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return rows, solids and values of a component's entries."""
+        device = self.grid.device
+        self._counts.zero_()
+        window.run(self._passes.links, whole=True, **given, **dict.fromkeys(("offsets", "entry_rows", "blocks", "values")))
+        counts = self._counts.numpy().copy()
+        total = int(counts.sum())
+        rows, blocks = (wp.zeros(total, dtype=wp.int32, device=device) for _ in range(2))
+        values = wp.zeros(total * self.width, dtype=wp.float64, device=device)
+        if total:
+            offsets = wp.array(np.cumsum(counts) - counts, dtype=wp.int32, device=device)
+            lists = {"offsets": offsets, "entry_rows": rows, "blocks": blocks, "values": values}
+            window.run(self._passes.links, whole=True, **given, **lists)
+        return rows.numpy(), blocks.numpy(), values.numpy().reshape(-1, self.width)
+
+
+class BodyDrag:
+    """Solve for liquid and bodies together, see `WallPull`.
+
+    With m = rho dx^d M^-1 a body's velocity is V = V1 + m (C'u - D V), so that a change of the liquid's velocity changes it by
 
         dV = W C'du,   W = (1 + m D)^-1 m,
 
@@ -40,96 +138,37 @@ class BodyDrag:
 
     Attributes:
         moved: whether the columns lie elsewhere since the last step.
+        change: of the bodies' velocities in the step so far.
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, passes: Any) -> None:
-        self.grid, self.boundary, self.bodies, self._passes = grid, boundary, bodies, passes
-        self._scale, self._width, n = density * grid.cell_volume, 3 if grid.dimension == 2 else 6, len(bodies.bodies)
-        self.columns = BlockColumns(grid.dimension * grid.size, n, self._width, wp.float64, grid.device)
-        body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
-        body[bodies.numbers] = np.arange(n)
-        self._body = wp.array(body, dtype=wp.int32, device=grid.device)
-        self._counts = wp.zeros(grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
+        self.grid, self.boundary, self.bodies = grid, boundary, bodies
+        self._pull = WallPull(grid, boundary, bodies.numbers, 1 + len(boundary.cut.solids), passes)
+        self._scale, self._width = density * grid.cell_volume, self._pull.width
+        self.columns = BlockColumns(grid.dimension * grid.size, len(bodies.bodies), self._width, wp.float64, grid.device)
         rank = self.columns.rank
         self._response = wp.zeros((rank, rank), dtype=wp.float64, device=grid.device)
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
 
     def take(
-        self,
-        level: VectorLevel,
-        distance: Sequence[wp.array],
-        slip: Sequence[wp.array],
-        velocity: Sequence[wp.array],
-        where: dict[str, Any],
+        self, level: VectorLevel, walls: dict[str, Sequence[wp.array]], where: dict[str, wp.array], velocity: Sequence[wp.array]
     ) -> None:
-        """Find what pulls the bodies in a step, and how they answer to the liquid's velocity as it is.
-
-        Args:
-            level: the equations of the step.
-            distance: of each component's faces from walls [cells].
-            slip: what their walls have for a slip length [cells].
-            velocity: of each component [m/s].
-            where: `kind` and `contact` of cells.
-        """
-        grid, wall = self.grid, self.boundary.cut.wall
-        block = self.boundary.cut.moving_block()
-        window = None if block is None else grid.window(*block, grow=1).common(grid.domain)
-        centers = np.array([body.position for body in self.bodies.bodies])
-        given = where | {"body": self._body, "center": wp.array(centers.ravel(), dtype=wp.float64, device=grid.device)}
-        given |= {"cell": level.cell, "mixed": level.mixed, "planes": grid.planes, "dx": grid.spacing, "width": self._width}
-        given |= dict(zip(("before_x", "before_y", "before_z"), grid.origin, strict=True)) | {"counts": self._counts}
-        found = [(np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, self._width)))]
-        for axis in range(grid.dimension if window is not None else 0):
-            assert window is not None
-            of = given | level.across(axis) | {"axis": axis, "d": distance[axis], "h": slip[axis], "diagonal": level.diagonal[axis]}
-            of |= {"wall": wall[axis], "from_": axis * grid.size}
-            of |= dict(zip(("db", "dc"), level.of_others(axis, distance), strict=True))
-            of |= dict(zip(("wall_b", "wall_c"), level.of_others(axis, wall), strict=True))
-            found.append(self._entries(window, of))
-        rows, blocks, values = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        self._find_response(rows, blocks, values, velocity)
-
-    def _entries(self, window: Window, given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return rows, bodies and values of a component's entries."""
-        device = self.grid.device
-        self._counts.zero_()
-        window.run(self._passes.links, whole=True, **given, **dict.fromkeys(("offsets", "entry_rows", "blocks", "values")))
-        counts = self._counts.numpy().copy()
-        total = int(counts.sum())
-        rows, blocks = (wp.zeros(total, dtype=wp.int32, device=device) for _ in range(2))
-        values = wp.zeros(total * self._width, dtype=wp.float64, device=device)
-        if total:
-            offsets = wp.array(np.cumsum(counts) - counts, dtype=wp.int32, device=device)
-            lists = {"offsets": offsets, "entry_rows": rows, "blocks": blocks, "values": values}
-            window.run(self._passes.links, whole=True, **given, **lists)
-        return rows.numpy(), blocks.numpy(), values.numpy().reshape(-1, self._width)
-
-    def _find_response(self, rows: np.ndarray, blocks: np.ndarray, values: np.ndarray, velocity: Sequence[wp.array]) -> None:
-        bodies, grid, dimension, width = self.bodies.bodies, self.grid, self.grid.dimension, self._width
-        self.moved = len(rows) > self.columns.capacity
+        """Find what pulls the bodies in a step, and how they answer to the liquid's velocity as it is; arguments as of `WallPull`."""
+        block, bodies, dimension = self.boundary.cut.moving_block(), self.bodies.bodies, self.grid.dimension
+        window = None if block is None else self.grid.window(*block, grow=1).common(self.grid.domain)
+        points = np.array([body.position for body in bodies])
+        self._pull.take(window, level, walls, where, points)
+        pulled, self._drag = self._pull.pulled(velocity, points)
+        count = len(self._pull.rows)
+        self.moved = count > self.columns.capacity
         if self.moved:
-            self.columns.reserve(round(SPARE * len(rows)))
-        self.columns.assign(rows, blocks, values)
-        axes, cells = np.divmod(rows, grid.size)
-        k, j, i = np.unravel_index(cells, grid.shape)
-        places = (np.stack((i, j, k), axis=-1) + np.array(grid.origin) - 0.5 - 0.5 * np.eye(3)[axes]) * grid.spacing
-        at = [field.numpy().ravel() for field in velocity]
-        speeds = np.array([at[axis][cell] for axis, cell in zip(axes, cells, strict=True)])
-        self._drag, responses = np.zeros((len(bodies), width, width)), []
-        pulled = np.zeros((len(bodies), width))
-        for n, body in enumerate(bodies):
-            own = blocks == n
-            arms = places[own] - body.position
-            arms[:, dimension:] = 0.0
-            turns = np.cross(np.eye(3)[None], arms[:, None])[np.arange(len(arms)), :, axes[own]]  # by the axis of the turn
-            motions = np.concatenate((np.eye(3)[axes[own]][:, :dimension], turns[:, 2:] if dimension == 2 else turns), axis=1)
-            drag = values[own].T @ motions
-            self._drag[n], pulled[n] = 0.5 * (drag + drag.T), speeds[own] @ values[own]
-            m = self._scale * body.inverse_mass(dimension)
-            responses.append(np.linalg.solve(np.eye(width) + m @ self._drag[n], m))
-        self._before = np.array([body.velocities(dimension) for body in bodies])
-        self._pulled = pulled - np.einsum("bij,bj->bi", self._drag, self._before)
-        W = scipy.linalg.block_diag(*responses)
+            self.columns.reserve(round(SPARE * count))
+        self.columns.assign(self._pull.rows, self._pull.blocks, self._pull.values)
+        m = [self._scale * body.inverse_mass(dimension) for body in bodies]
+        answers = [np.linalg.solve(np.eye(self._width) + a @ drag, a) for a, drag in zip(m, self._drag, strict=True)]
+        before = np.array([body.velocities(dimension) for body in bodies])
+        self._pulled = pulled - np.einsum("bij,bj->bi", self._drag, before)
+        W = scipy.linalg.block_diag(*answers)
         self._weights = 0.5 * (W + W.T)
         self._response.assign(self._weights)
 
@@ -147,7 +186,7 @@ class BodyDrag:
 
     def push(self, change: wp.array) -> None:
         """Give the bodies the impulses of a step that changed the liquid's velocity by so much."""
-        moved = self.change.reshape(self._before.shape)
+        moved = self.change.reshape(self._pulled.shape)
         pulled = self._pulled + self.columns.gather(change).numpy().reshape(moved.shape) - np.einsum("bij,bj->bi", self._drag, moved)
         for body, impulse in zip(self.bodies.bodies, self._scale * pulled, strict=True):
             body.apply_impulse(impulse)

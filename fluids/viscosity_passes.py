@@ -72,10 +72,10 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
         ),
         links=made(
             "links",
-            _fields("d h db dc cell mixed xb xc diagonal") | cells | dict.fromkeys(("wall", "wall_b", "wall_c"), wp.int16),
+            _fields("d h db dc cell mixed xb xc diagonal") | cells | _fields("wall wall_b wall_c", wp.int16) | {"index": wp.int32},
             "axis planes before_x before_y before_z dx width from_",
             whole=_fields("counts offsets entry_rows blocks body", wp.int32) | _fields("values center", wp.float64),
-            optional=("dc", "wall_c", "xc", "offsets", "entry_rows", "blocks", "values"), **near,
+            optional=("dc", "wall", "wall_b", "wall_c", "index", "xc", "offsets", "entry_rows", "blocks", "values"), **near,
         ),
         cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
         add=made("add", _fields("u total more"), ""),

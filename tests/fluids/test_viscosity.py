@@ -207,6 +207,24 @@ def test_a_body_sinks_slowly_and_a_light_one_is_stable() -> None:
     assert slower < 1.0
 
 
+@pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_solids_bear_what_the_liquid_loses(dimension: int, solids: str) -> None:
+    """Forces of pressure and stresses on all solids are the change of the liquid's momentum."""
+    ball = {"shape": "sphere", "center": [0.5] * dimension, "radius": 0.15}
+    liquid = box([0.0] * dimension, [1.0, 0.9, 1.0][:dimension], velocity=[1.0, 0.3, 0.2][:dimension])
+    tables = {"viscosity": {"value": 100.0}, "wall": "sticky", "solids": solids, "output": {"forces": True}}
+    tables |= {"physics": {"gravity": [0.0] * dimension}, "solid": [ball]}
+    simulation = create(scene(size=[1.0] * dimension, resolution={2: 32, 3: 16}[dimension], liquid=[liquid], **tables))
+    for _ in range(3):
+        before = simulation.particles.velocity.numpy()[:, 0].astype(float).sum()
+        simulation.step(0.005)
+        change = simulation.particle_mass * (simulation.particles.velocity.numpy()[:, 0].astype(float).sum() - before)
+        forces = simulation.measured["forces"]
+        borne = simulation.kick_dt * sum(value for name, value in forces.items() if name.endswith("_fx"))
+        assert borne == pytest.approx(-change, rel=0.02)
+
+
 def test_a_resumed_run_goes_on_with_the_same_bits() -> None:
     def fresh():
         return blob(2, physics={"gravity": [0.0, -9.81]})
