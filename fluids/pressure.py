@@ -50,7 +50,7 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
     flags = {"CUT": cut, "MOVING": moving, "GHOST": ghost, "BOUNDED": bounded, "THETA_MIN": THETA_MIN, "TINY_WEIGHT": TINY_WEIGHT}
 
     def made(name: str, fields: dict[str, Any], numbers: dict[str, Any], **more: Any) -> RowPass:
-        box, optional = {"kind": I8, **FACES, "phi": F32} | fields, (*FACES, "phi", "w", "lower", "shift")
+        box, optional = {"kind": I8, **FACES, "phi": F32} | fields, (*FACES, "phi", "w", "lower", "shift", "jump")
         numbers, path = {"planes": int} | numbers, HEADERS / f"{name}.h"
         return RowPass(f"{module}.{name}", path, F64, box=box, numbers=numbers, constants=CONSTANTS | flags, optional=optional, **more)
 
@@ -59,7 +59,7 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
     return SimpleNamespace(
         prepare=made("prepare", liquid | problem, {"ratio": F64}),
         subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
-        support=made("support", faces | {"weight": F32}, {"axis": int, "limit": F32}),
+        support=made("support", faces | {"weight": F32, "jump": F32}, {"axis": int, "limit": F32}),
         contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, sums=("released",), largest=("worst",)),
     )
 
@@ -144,6 +144,7 @@ class PressureProjection:
     ) -> None:  # fmt: skip
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self._weights, self._gravity = list(weights or ()), gravity
+        self.jump: wp.array | None = None
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
         self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
@@ -343,7 +344,7 @@ class PressureProjection:
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface; its faces become known after the projected ones."""
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
-            faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight}
+            faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight, "jump": self.jump}
             window.run(self._passes.support, axis=axis, limit=self._gravity * self._last, **faces)
 
     def _accept(self, x: wp.array) -> None:

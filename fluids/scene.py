@@ -11,12 +11,14 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
 from warp_lcp.scene.shapes import MaterialProperties
+from warp_lcp.settings import Positive
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
 PRESSURE_BYTES = 92  # fields of the pressure solve
 BOUND_BYTES = 9  # of them, those of walls that separate
 LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
+TENSION_BYTES = 17
 UNILATERAL_BYTES = 1
 SHORT_STEPS = 0.5  # Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at 1/8 on 20
 BODY_BYTES, POTENTIAL_BYTES = 8, 4  # of a right-hand side that bodies change, and a motion of a body, if it is light
@@ -37,13 +39,23 @@ class Pressure(Table):
     smoothing: int = Field(default=0, ge=0, le=8, description="binomial passes over the level set of a ghost-fluid surface")
 
 
+class SurfaceTensionSettings(Table):
+    """[surface_tension]: the surface pulls itself together; it does not unless the table is there."""
+
+    coefficient: Positive = Field(description="of the liquid against air [N/m]; water has 0.072")
+    contact_angle: float = Field(
+        default=90.0, ge=0, le=180, description="between surface and walls, measured in the liquid [degrees]; above 90 walls repel it"
+    )
+
+
 class LiquidScene(ParticleScene):
-    """A scene of liquid: the tables of all materials, `pressure` and `liquid`."""
+    """A scene of liquid: the tables of all materials, `pressure`, `surface_tension` and `liquid`."""
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
 
     pressure: Pressure = Field(default_factory=Pressure)
+    surface_tension: SurfaceTensionSettings | None = None
     liquid: list[Liquid] = Field(default_factory=list)
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
@@ -70,6 +82,12 @@ class LiquidScene(ParticleScene):
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which tells how full cells are'
             found.append(Complaint(("particles", "narrow_band"), None, message))
+        if self.surface_tension is not None and self.pressure.surface == "voxel":
+            message = 'needs pressure.surface = "ghost-fluid", which has a curvature'
+            found.append(Complaint(("surface_tension",), None, message))
+        if self.surface_tension is not None and self.pressure.model == "unilateral":
+            message = 'needs pressure.model = "incompressible": a pressure that never pulls keeps no surface together'
+            found.append(Complaint(("surface_tension",), None, message))
         return found
 
     def models(self) -> list[Model]:
@@ -87,6 +105,8 @@ class LiquidScene(ParticleScene):
             found.append(Model("ghost-fluid surface", closed if full else 'pressure.surface = "ghost-fluid"', built=not full))
         if self.pressure.smoothing and ghost:
             found.append(Model("smoothing", closed if full else "pressure.smoothing", built=not full))
+        if self.surface_tension is not None:
+            found.append(Model("surface tension", closed if full else "[surface_tension]", built=not full))
         if self.short_steps:
             found.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
@@ -102,6 +122,11 @@ class LiquidScene(ParticleScene):
     def settles(self) -> bool:
         """Return whether full cells settle to the density at rest, which the unilateral model has gravity do, see `fluids.unilateral`."""
         return self.pressure.model == "unilateral" and any(self.physics.gravity)
+
+    @property
+    def speeds_up(self) -> bool:
+        """Return whether full cells settle, or a surface pulls."""
+        return self.settles or self.surface_tension is not None
 
     @property
     def stays_full(self) -> bool:
@@ -144,4 +169,5 @@ class LiquidScene(ParticleScene):
             "surface": cells
             * (not self.stays_full)
             * (LEVEL_SET_BYTES * (level_set or self.cuts_cells) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)),
+            "surface tension": cells * TENSION_BYTES * (self.surface_tension is not None and not self.stays_full),
         }

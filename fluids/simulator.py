@@ -14,6 +14,7 @@ from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
+from warp_lcp.fluids.surface_tension import REACH, SurfaceTension
 from warp_lcp.fluids.unilateral import UnilateralPressure
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
@@ -59,6 +60,15 @@ def make_surface(
         smoothing = scene.pressure.smoothing
         return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=smoothing, fill=fill, counted=counted)
     return WholeCellSurface(grid, boundary, particles_a_cell=count, fill=fill)
+
+
+def make_tension(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface) -> SurfaceTension | None:
+    """Return the surface tension of a scene; None: it has none, or no surface."""
+    given = scene.surface_tension
+    if given is None or surface.phi is None:
+        return None
+    settings = {"coefficient": given.coefficient, "contact_angle": given.contact_angle, "density": scene.physics.density}
+    return SurfaceTension(grid, boundary, surface.phi, **settings)
 
 
 def pressure_settings(scene: LiquidScene, surface: FreeSurface, weights: list[wp.array]) -> dict[str, Any]:
@@ -109,6 +119,7 @@ class LiquidSimulation(ParticleSimulation):
 
     Attributes:
         surface: the free surface.
+        tension: of the surface; None: it has none.
         projection: the pressure's fields.
         record: takes the problem of each step before it is solved, if it is set.
     """
@@ -118,13 +129,14 @@ class LiquidSimulation(ParticleSimulation):
     def __init__(self, scene: LiquidScene, grid: StaggeredGrid, parts: Parts, particles: Particles, **more: Any) -> None:
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
-        self.reach = max(self.layers, 2 * scene.pressure.smoothing)
+        self.reach = max(self.layers, 2 * scene.pressure.smoothing, 0 if self.tension is None else REACH)
         self.mark()
 
     def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate what belongs to a grid."""
         super().lay(grid, parts)
         self.surface = self._surface()
+        self.tension = make_tension(self.scene, grid, self.boundary, self.surface)
         self.projection = self._pressure()
 
     def _surface(self) -> FreeSurface:
@@ -132,6 +144,11 @@ class LiquidSimulation(ParticleSimulation):
 
     def _pressure(self) -> PressureProjection:
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
+
+    def stable_dt(self) -> float:
+        """Return the longest step that advection and surface tension allow [s]."""
+        dt = super().stable_dt()
+        return dt if self.tension is None else min(dt, self.tension.longest_step())
 
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""
@@ -155,6 +172,8 @@ class LiquidSimulation(ParticleSimulation):
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
+                if self.tension is not None:
+                    self.tension.measure(window, self.projection.kind)
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
@@ -163,6 +182,8 @@ class LiquidSimulation(ParticleSimulation):
         row = self.move(dt, window) | self.solve_row(projected.result)
         if self.scene.output.diagnostics:
             row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
+            if self.tension is not None:
+                row |= {"surface_energy": self.tension.energy()}
         automatic = self.projection.automatic
         if automatic is not None and projected.result is not None:
             row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
@@ -184,6 +205,8 @@ class LiquidSimulation(ParticleSimulation):
         residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes.
         """
         columns = ("active", "max_divergence", "volume") if self.scene.output.diagnostics else ("active",)
+        if self.tension is not None and self.scene.output.diagnostics:
+            columns = (*columns, "surface_energy")
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
     def frame(self) -> list[Part]:
@@ -233,6 +256,9 @@ class LiquidSimulation(ParticleSimulation):
         with watch.stage("surface", self.particles.key, projection.kind):
             self.surface.mark(self.particles, window, projection.kind)
             self.surface.complete(window, self.velocity, self.weights, projection.known)
+        if self.tension is not None:
+            with watch.stage("surface tension", *self.velocity, self.tension.jump):
+                self.tension.act(self.velocity, window, projection.kind, self.kick_dt)
         with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
             self.boundary.begin_step(self.time, dt)
             if self.sources is not None:

@@ -1,0 +1,229 @@
+"""Surface tension: the jump of the pressure across a ghost-fluid surface, and the angle at which it meets walls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.fluids import surface_tension_kernels as kernels
+from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.level_set_kernels import BINOMIAL
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.tally import WindowTally
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.operators.grid_poisson import SOLID
+
+PASSES, MOST_PASSES = 8, 16  # binomial passes of a filter: particles' noise asks for the fewest, the cost and thin liquid for the most
+STIFFEST = 2.08  # the largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered capillary wave, omega^2 s^3 rho dx^3 / sigma
+REACH = 6  # cells around particles that are smoothed: two of the widest filter's spreads, with what `window` spares
+SAFETY = 1.5  # in the square of the longest step
+
+
+class SurfaceTension:
+    """Push liquid by the pressure p = sigma kappa that its surface asks for.
+
+    The jump of a ghost-fluid surface [Gibou et al. 2002] between a FLUID cell i and an AIR cell n at theta, with X = kick_dt sigma kappa /
+    (rho dx) there, changes u = u* - (x_right - x_left) / theta by X / theta alone. It is added to u* before the projection, so that the
+    pressure's problem stays as it is: x is the liquid's whole pressure over that of the air, and 0 <= x on separating walls means what it
+    meant.
+
+    The curvature kappa = div n, n = -grad f / |grad f|, is that of f = (2 S - S^2) f0, where f0 is the share of a cell's kernel that lies
+    below the surface, and S are m binomial passes (1, 2, 1)/4 along each axis, nearly a Gaussian of the variance s^2 = m/2. Of a ripple of
+    wavenumber q on a plane f keeps 2 e^-a - e^-2a, a = (q s)^2 / 2, so that capillary waves are slower by (q s)^4 / 8. For m >= `PASSES`;
+    more where the step asks for it: explicit leapfrog steps are stable while omega dt < 2, and no ripple then has
+    omega^2 > STIFFEST sigma / (rho (s dx)^3). So waves that a step cannot follow are pushed less instead of making it shorter.
+
+    In cells of walls, f goes on so that the distance to the surface falls along the wall's normal by the contact angle's cosine.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        phi: distance to the surface [cells], < 0 in liquid, of a `GhostFluidSurface`.
+        coefficient: sigma [N/m].
+        contact_angle: in the liquid [degrees].
+        density: of the liquid [kg/m^3].
+
+    Attributes:
+        jump: kick_dt sigma kappa / (rho dx) [m/s] in cells beside the surface, float32.
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, phi: wp.array, *, coefficient: float, contact_angle: float, density: float
+    ) -> None:  # fmt: skip
+        self.grid, self.boundary, self._phi = grid, boundary, phi
+        self.coefficient, self.density = coefficient, density
+        self._cosine = math.cos(math.radians(contact_angle)) if contact_angle != 90.0 else 0.0
+        self.jump, self._fields = grid.field(), [grid.field() for _ in range(3)]
+        self._passes = kernels.push_pass(bool(boundary.open))
+        self._energy = WindowTally(self._passes.energy, grid)
+        self._blocked = grid.field(wp.int8)
+        self._find_walls()
+
+    def longest_step(self) -> float:
+        """Return the longest step [s] that is stable with the most passes."""
+        return self._step_of(MOST_PASSES)
+
+    def _step_of(self, passes: int) -> float:
+        spread = math.sqrt(0.5 * passes) * self.grid.spacing
+        return math.sqrt(4.0 * self.density * spread**3 / (SAFETY * STIFFEST * self.coefficient))
+
+    def _passes_for(self, kick_dt: float) -> int:
+        """Return how many passes a step takes."""
+        return next((m for m in range(PASSES, MOST_PASSES) if self._step_of(m) >= kick_dt), MOST_PASSES)
+
+    def act(self, velocity: Sequence[wp.array], window: Window, kind: wp.array, kick_dt: float) -> None:
+        """Push the faces that the surface crosses.
+
+        Args:
+            velocity: u* of each component [m/s] (updated).
+            window: cells that hold all FLUID cells, with some to spare on each side.
+            kind: int8 of AIR, FLUID, SOLID, as `phi` marks them.
+            kick_dt: how long forces act [s].
+        """
+        grid, planes = self.grid, self.grid.planes
+        if self.boundary.moves:
+            self._find_walls()
+        first, second, third = self._fields
+        for field in self._fields:  # passes look beyond the window, where an earlier step may have left something
+            field.zero_()
+        window.launch(kernels.share_kernel, [self._phi, self._blocked, first])
+        passes = self._passes_for(kick_dt)
+        self.share = self._smoothed(window, first, (second, third), passes, 0)
+        twice = self._smoothed(window, self.share, tuple(f for f in self._fields if f is not self.share), passes, passes)
+        scale = kick_dt * self.coefficient / (self.density * grid.spacing**2)
+        limit = float(grid.dimension - 1)  # a radius of one cell
+        shares = {"a": self.share, "b": twice, "bend": next(f for f in self._fields if f is not self.share and f is not twice)}
+        window.run(kernels.CURVATURE, **shares, planes=planes, limit=limit)
+        window.run(kernels.JUMP, **shares, jump=self.jump, kind=kind, planes=planes, scale=scale)
+        for axis, field in enumerate(velocity):
+            window.run(self._passes.push, **self._faces(kind), phi=self._phi, jump=self.jump, field=field, axis=axis)
+
+    def measure(self, window: Window, kind: wp.array) -> None:
+        """Find the energy, for `energy` to tell."""
+        box = window.common(self.grid.domain)
+        assert box is not None, "a window has cells of the domain"
+        self._energy.take(box, **self._faces(kind), phi=self._phi, share=self.share)
+
+    def energy(self) -> float:
+        """Return the energy of surface and wet walls when it was last measured [J; J/m in 2-D]: sigma (area - cos(angle) wet area)."""
+        area, wetted = self._energy.read()
+        return self.coefficient * (area - self._cosine * wetted) * self.grid.spacing ** (self.grid.dimension - 1)
+
+    def _faces(self, kind: wp.array) -> dict[str, object]:
+        open_faces = {f"open_{axis}": field for axis, field in zip("xyz", [*self.boundary.open, None, None, None], strict=False)}
+        return {"kind": kind, "planes": self.grid.planes, **open_faces, **{f"solid_{axis}": None for axis in "xyz"}}
+
+    def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
+        """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
+        self._continue(source, before)
+        for done in range(1, passes + 1):
+            out = free[done % 2]
+            window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
+            self._continue(out, before + done)
+            source = out
+        return source
+
+    def _continue(self, share: wp.array, passes: int) -> None:
+        """Continue a share into walls, after so many passes."""
+        spread = math.sqrt(0.25 + 0.5 * passes)
+        inputs = [*self._walls, self._cosine, spread, self.grid.planes, self._blocked, share, share.flatten()]
+        launch_list(kernels.continue_kernel, len(self._walls[0]), inputs, device=self.grid.device)
+
+    def _find_walls(self) -> None:
+        """Find the cells of walls that passes read, and where what they get comes from."""
+        found = wall_cells(self.grid, self.boundary.base.numpy(), None if self.boundary.distance is None else self.boundary.distance.numpy())
+        blocked, cells, points, way = found
+        self._blocked.assign(blocked)
+        device = self.grid.device
+        self._walls = [
+            wp.array(cells.astype(np.int32), dtype=wp.int32, device=device), wp.array(points.astype(np.float32), dtype=wp.vec3, device=device),
+            wp.array(way.astype(np.float32), dtype=wp.float32, device=device),
+        ]  # fmt: skip
+
+
+def wall_cells(
+    grid: StaggeredGrid, base: np.ndarray, distance: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Return which cells are walls, and of those beside open ones: flat index, the point before the wall that each mirrors, and how far.
+
+    A cell whose center lies in a solid is a wall, mirrored along the solid's normal; so is each of the ring or, without a distance, of a
+    solid's whole cells, mirrored along the axes.
+
+    Args:
+        grid: the grid.
+        base: int8, SOLID or AIR, in the stored shape.
+        distance: to solids at the cells' low corners [cells]; None: solids are whole cells.
+
+    Returns:
+        `blocked`, int8 in the stored shape; the cells, shape (n,); the points (i, j, k) in cells' numbers, shape (n, 3); the ways [cells].
+    """
+    axes = [2, 1] if grid.dimension == 2 else [2, 1, 0]  # of arrays, along x, y, z
+    inner = np.zeros(base.shape, dtype=bool)
+    inner[(slice(1, -1),) * 3] = True
+    blocked = (base == SOLID) | ~inner
+    center, normal = None, None
+    if distance is not None:
+        center, normal = _at_centers(distance.astype(np.float64), axes)
+        blocked |= center < 0.0
+    plane = slice(1, 2) if grid.dimension == 2 else slice(None)
+    used = np.zeros(base.shape, dtype=bool)
+    used[plane] = True
+    steps = [np.array(s) - 1 for s in np.ndindex(3, 3, 3) if s != (1, 1, 1) and (grid.dimension == 3 or s[0] == 1)]
+    order = sorted(steps, key=lambda s: int(np.abs(s).sum()))
+    padded = np.pad(~blocked, 1)
+    near = np.zeros(base.shape, dtype=bool)
+    for step in steps:
+        near |= _shifted(padded, step)
+    cells = np.argwhere(blocked & near & used)
+    whole = padded[tuple(slice(1, -1) for _ in range(3))]
+    toward = np.zeros(cells.shape, dtype=np.int64)
+    least = np.full(len(cells), 4)
+    fallback = np.zeros(cells.shape, dtype=np.int64)
+    for step in order:
+        there = padded[tuple((cells + 1 + step).T)]
+        size = int(np.abs(step).sum())
+        fresh = there & (least == 4)
+        fallback[fresh], least[fresh] = step, size
+        toward[there & (least == size)] += step
+    toward = np.sign(toward)
+    target = cells + toward
+    good = whole[tuple(np.clip(target, 0, np.array(base.shape) - 1).T)] & (toward != 0).any(axis=1)
+    toward = np.where(good[:, None], toward, fallback)
+    points, way = (cells + toward).astype(np.float64), np.abs(toward).sum(axis=1).astype(np.float64)
+    if center is not None and normal is not None:
+        at = tuple(cells.T)
+        inside = (center[at] < 0.0) & inner[at]
+        depth = np.maximum(-2.0 * center[at], 1.0)
+        mirrored = cells + depth[:, None] * normal[:, *at].T
+        low, high = np.ones(3), np.array(base.shape) - 2.0
+        mirrored = np.clip(mirrored, low, high)
+        points[inside], way[inside] = mirrored[inside], depth[inside]
+    points = np.minimum(points, np.array(base.shape) - 1.0)
+    return blocked.astype(np.int8), np.ravel_multi_index(tuple(cells.T), base.shape), points[:, ::-1], way
+
+
+def _shifted(padded: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return a field's neighbors at a step, of a field with a layer around it."""
+    return padded[tuple(slice(1 + s, n - 1 + s) for s, n in zip(step, padded.shape, strict=True))]
+
+
+def _at_centers(nodes: np.ndarray, axes: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean of the values at each cell's corners, and the unit vector along which they grow (k, j, i)."""
+    center, slopes = nodes, {}
+    for axis in axes:
+        center = 0.5 * (center + _next(center, axis))
+    for axis in axes:
+        slope = _next(nodes, axis) - nodes
+        for other in axes:
+            slope = slope if other == axis else 0.5 * (slope + _next(slope, other))
+        slopes[axis] = slope
+    normal = np.stack([slopes.get(axis, np.zeros_like(nodes)) for axis in range(3)])
+    return center, normal / np.maximum(np.linalg.norm(normal, axis=0), 1e-9)
+
+
+def _next(field: np.ndarray, axis: int) -> np.ndarray:
+    """Return each element's successor along an axis, the last one's own."""
+    return np.concatenate([field.take(range(1, field.shape[axis]), axis), field.take([-1], axis)], axis)
