@@ -134,6 +134,7 @@ class PressureProjection:
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         known: int8, one field a component: which faces the last projection made valid, see `warp_lcp.grid.extrapolate`.
+        jump: of the pressure across the surface [m/s] in cells beside it, float32, which whoever pushes u* by it sets; None: there is none.
         automatic: what sets the tolerance from step to step, if something does.
     """
 
@@ -144,9 +145,9 @@ class PressureProjection:
     ) -> None:  # fmt: skip
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self._weights, self._gravity = list(weights or ()), gravity
-        self.jump: wp.array | None = None
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
+        self.jump: wp.array | None = None
         self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
         self.kind, self.cells, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)

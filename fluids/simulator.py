@@ -130,6 +130,8 @@ class LiquidSimulation(ParticleSimulation):
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.reach = max(self.layers, 2 * scene.pressure.smoothing, 0 if self.tension is None else REACH)
+        if self.tension is not None:
+            self._notes.append(f"surface tension: steps of at most {self.tension.longest_step():.3g} s")
         self.mark()
 
     def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
@@ -138,6 +140,8 @@ class LiquidSimulation(ParticleSimulation):
         self.surface = self._surface()
         self.tension = make_tension(self.scene, grid, self.boundary, self.surface)
         self.projection = self._pressure()
+        if self.tension is not None:
+            self.projection.jump = self.tension.jump
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -86,35 +87,35 @@ class SurfaceTension:
         grid, planes = self.grid, self.grid.planes
         if self.boundary.moves:
             self._find_walls()
-        first, second, third = self._fields
+        first, *free = self._fields
         for field in self._fields:  # passes look beyond the window, where an earlier step may have left something
             field.zero_()
         window.launch(kernels.share_kernel, [self._phi, self._blocked, first])
         passes = self._passes_for(kick_dt)
-        self.share = self._smoothed(window, first, (second, third), passes, 0)
-        twice = self._smoothed(window, self.share, tuple(f for f in self._fields if f is not self.share), passes, passes)
+        once = self._smoothed(window, first, free, passes, 0)
+        twice = self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
+        self._shares = {"once": once, "twice": twice, "planes": planes, **_profile(passes)}
+        (bend,) = (field for field in self._fields if field is not once and field is not twice)
+        window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=float(grid.dimension - 1))  # a radius of one cell
         scale = kick_dt * self.coefficient / (self.density * grid.spacing**2)
-        limit = float(grid.dimension - 1)  # a radius of one cell
-        shares = {"a": self.share, "b": twice, "bend": next(f for f in self._fields if f is not self.share and f is not twice)}
-        window.run(kernels.CURVATURE, **shares, planes=planes, limit=limit)
-        window.run(kernels.JUMP, **shares, jump=self.jump, kind=kind, planes=planes, scale=scale)
+        window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=scale)
         for axis, field in enumerate(velocity):
-            window.run(self._passes.push, **self._faces(kind), phi=self._phi, jump=self.jump, field=field, axis=axis)
+            window.run(self._passes.push, **self._faces(kind), planes=planes, jump=self.jump, field=field, axis=axis)
 
     def measure(self, window: Window, kind: wp.array) -> None:
         """Find the energy, for `energy` to tell."""
         box = window.common(self.grid.domain)
         assert box is not None, "a window has cells of the domain"
-        self._energy.take(box, **self._faces(kind), phi=self._phi, share=self.share)
+        self._energy.take(box, **self._faces(kind), **self._shares)
 
     def energy(self) -> float:
         """Return the energy of surface and wet walls when it was last measured [J; J/m in 2-D]: sigma (area - cos(angle) wet area)."""
         area, wetted = self._energy.read()
         return self.coefficient * (area - self._cosine * wetted) * self.grid.spacing ** (self.grid.dimension - 1)
 
-    def _faces(self, kind: wp.array) -> dict[str, object]:
+    def _faces(self, kind: wp.array) -> dict[str, Any]:
         open_faces = {f"open_{axis}": field for axis, field in zip("xyz", [*self.boundary.open, None, None, None], strict=False)}
-        return {"kind": kind, "planes": self.grid.planes, **open_faces, **{f"solid_{axis}": None for axis in "xyz"}}
+        return {"kind": kind, "phi": self._phi, **open_faces, **{f"solid_{axis}": None for axis in "xyz"}}
 
     def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
         """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
@@ -134,14 +135,17 @@ class SurfaceTension:
 
     def _find_walls(self) -> None:
         """Find the cells of walls that passes read, and where what they get comes from."""
-        found = wall_cells(self.grid, self.boundary.base.numpy(), None if self.boundary.distance is None else self.boundary.distance.numpy())
-        blocked, cells, points, way = found
+        distance, device = self.boundary.distance, self.grid.device
+        blocked, *lists = wall_cells(self.grid, self.boundary.base.numpy(), None if distance is None else distance.numpy())
         self._blocked.assign(blocked)
-        device = self.grid.device
-        self._walls = [
-            wp.array(cells.astype(np.int32), dtype=wp.int32, device=device), wp.array(points.astype(np.float32), dtype=wp.vec3, device=device),
-            wp.array(way.astype(np.float32), dtype=wp.float32, device=device),
-        ]  # fmt: skip
+        self._walls = [wp.array(v, dtype=kind, device=device) for v, kind in zip(lists, (wp.int32, wp.vec3, wp.float32), strict=True)]
+
+
+def _profile(passes: int) -> dict[str, float]:
+    """Return the series of the distance [cells] in the share 2 once - twice less 1/2, across a plane."""
+    narrow, wide = (math.sqrt(0.25 + 0.5 * count) for count in (passes, 2 * passes))
+    first, third = ((2.0 / narrow**n - 1.0 / wide**n) / math.sqrt(2.0 * math.pi) for n in (1, 3))
+    return {"linear": 1.0 / first, "cubic": third / (6.0 * first**4)}
 
 
 def wall_cells(
@@ -158,70 +162,47 @@ def wall_cells(
         distance: to solids at the cells' low corners [cells]; None: solids are whole cells.
 
     Returns:
-        `blocked`, int8 in the stored shape; the cells, shape (n,); the points (i, j, k) in cells' numbers, shape (n, 3); the ways [cells].
+        `blocked`, int8 in the stored shape; the cells, int32, shape (n,); the points (i, j, k) in cells' numbers, shape (n, 3); the ways
+        [cells], shape (n,); float32.
     """
-    axes = [2, 1] if grid.dimension == 2 else [2, 1, 0]  # of arrays, along x, y, z
+    flat, ends = grid.dimension == 2, np.array(base.shape) - 1
     inner = np.zeros(base.shape, dtype=bool)
-    inner[(slice(1, -1),) * 3] = True
-    blocked = (base == SOLID) | ~inner
-    center, normal = None, None
-    if distance is not None:
-        center, normal = _at_centers(distance.astype(np.float64), axes)
-        blocked |= center < 0.0
-    plane = slice(1, 2) if grid.dimension == 2 else slice(None)
-    used = np.zeros(base.shape, dtype=bool)
-    used[plane] = True
-    steps = [np.array(s) - 1 for s in np.ndindex(3, 3, 3) if s != (1, 1, 1) and (grid.dimension == 3 or s[0] == 1)]
-    order = sorted(steps, key=lambda s: int(np.abs(s).sum()))
+    inner[1:-1, 1:-1, 1:-1] = True
+    center, normal = _at_centers(distance, flat) if distance is not None else (np.ones(base.shape), np.zeros((3, *base.shape)))
+    blocked = (base == SOLID) | ~inner | (center < 0.0)
     padded = np.pad(~blocked, 1)
-    near = np.zeros(base.shape, dtype=bool)
-    for step in steps:
-        near |= _shifted(padded, step)
-    cells = np.argwhere(blocked & near & used)
-    whole = padded[tuple(slice(1, -1) for _ in range(3))]
-    toward = np.zeros(cells.shape, dtype=np.int64)
-    least = np.full(len(cells), 4)
-    fallback = np.zeros(cells.shape, dtype=np.int64)
-    for step in order:
-        there = padded[tuple((cells + 1 + step).T)]
-        size = int(np.abs(step).sum())
-        fresh = there & (least == 4)
-        fallback[fresh], least[fresh] = step, size
-        toward[there & (least == size)] += step
-    toward = np.sign(toward)
-    target = cells + toward
-    good = whole[tuple(np.clip(target, 0, np.array(base.shape) - 1).T)] & (toward != 0).any(axis=1)
-    toward = np.where(good[:, None], toward, fallback)
-    points, way = (cells + toward).astype(np.float64), np.abs(toward).sum(axis=1).astype(np.float64)
-    if center is not None and normal is not None:
-        at = tuple(cells.T)
-        inside = (center[at] < 0.0) & inner[at]
-        depth = np.maximum(-2.0 * center[at], 1.0)
-        mirrored = cells + depth[:, None] * normal[:, *at].T
-        low, high = np.ones(3), np.array(base.shape) - 2.0
-        mirrored = np.clip(mirrored, low, high)
-        points[inside], way[inside] = mirrored[inside], depth[inside]
-    points = np.minimum(points, np.array(base.shape) - 1.0)
-    return blocked.astype(np.int8), np.ravel_multi_index(tuple(cells.T), base.shape), points[:, ::-1], way
+    steps = [np.array(s) - 1 for s in np.ndindex(3, 3, 3) if s != (1, 1, 1) and not (flat and s[0] != 1)]
+    near = np.logical_or.reduce([padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(s, base.shape, strict=True))] for s in steps])
+    cells = np.argwhere(blocked & near)
+    first, sides, least = np.zeros_like(cells), np.zeros_like(cells), np.full(len(cells), 4)
+    for step in sorted(steps, key=lambda s: int(np.abs(s).sum())):  # faces, then edges, then corners
+        there, size = padded[tuple((cells + 1 + step).T)], int(np.abs(step).sum())
+        first[there & (least == 4)] = step
+        least[there & (least == 4)] = size
+        sides[there & (least == size)] += step
+    sides = np.sign(sides)  # between two open neighbors lies the cell that mirrors both walls, if it is open
+    both = padded[tuple((cells + 1 + sides).T)]
+    toward = np.where(both[:, None], sides, first)
+    points, way = (cells + toward).astype(np.float32), np.abs(toward).sum(axis=1).astype(np.float32)
+    at = tuple(cells.T)
+    solid = (center[at] < 0.0) & inner[at]
+    depth = np.maximum(-2.0 * center[at], 1.0)  # at least a cell, or the cell itself would count most
+    points[solid] = np.clip(cells + depth[:, None] * normal[:, *at].T, 1, ends - 1)[solid]
+    way[solid] = depth[solid]
+    return blocked.astype(np.int8), np.ravel_multi_index(at, base.shape).astype(np.int32), points[:, ::-1].copy(), way
 
 
-def _shifted(padded: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return a field's neighbors at a step, of a field with a layer around it."""
-    return padded[tuple(slice(1 + s, n - 1 + s) for s, n in zip(step, padded.shape, strict=True))]
-
-
-def _at_centers(nodes: np.ndarray, axes: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the values at each cell's corners, and the unit vector along which they grow (k, j, i)."""
-    center, slopes = nodes, {}
+def _at_centers(nodes: np.ndarray, flat: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean of the values at each cell's corners, and the unit vector (k, j, i) along which they grow; `flat`: in 2-D."""
+    axes = (1, 2) if flat else (0, 1, 2)
+    center, slopes = nodes.astype(np.float64), np.zeros((3, *nodes.shape))
     for axis in axes:
-        center = 0.5 * (center + _next(center, axis))
-    for axis in axes:
-        slope = _next(nodes, axis) - nodes
+        slope = _next(nodes.astype(np.float64), axis) - nodes
         for other in axes:
             slope = slope if other == axis else 0.5 * (slope + _next(slope, other))
         slopes[axis] = slope
-    normal = np.stack([slopes.get(axis, np.zeros_like(nodes)) for axis in range(3)])
-    return center, normal / np.maximum(np.linalg.norm(normal, axis=0), 1e-9)
+        center = 0.5 * (center + _next(center, axis))
+    return center, slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-9)
 
 
 def _next(field: np.ndarray, axis: int) -> np.ndarray:

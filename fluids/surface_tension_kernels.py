@@ -19,19 +19,19 @@ MODULE = "fluids.surface_tension"
 FLOATS = wp.array(dtype=wp.float32)
 TAIL = wp.constant(1e-4)  # shares nearer to 0 or 1 have no place on the profile
 BAND = 0.02  # cells whose share is nearer to 0 or 1 are too far from the surface to matter
+HALF = 0.3  # the part of the shares on either side of the surface that its area is found from
 FARTHEST = 1.5  # cells from one beside the surface to the smooth surface
+PROFILE = {"planes": int, "linear": wp.float32, "cubic": wp.float32}  # of the distance that a smooth share means
 _SHARES = {"headers": HEADERS, "constants": CONSTANTS | {"BAND": BAND, "FARTHEST": FARTHEST}}
-CURVATURE = cell_pass(f"{MODULE}.curvature", "a b bend", numbers={"planes": int, "limit": wp.float32}, **_SHARES)
-JUMP = cell_pass(
-    f"{MODULE}.jump", "a b bend jump", {"kind": wp.int8}, numbers={"planes": int, "scale": wp.float32}, **_SHARES
-)
+CURVATURE = cell_pass(f"{MODULE}.curvature", "once twice bend", numbers={**PROFILE, "limit": wp.float32}, **_SHARES)
+JUMP = cell_pass(f"{MODULE}.jump", "once twice bend jump", {"kind": wp.int8}, numbers={**PROFILE, "scale": wp.float32}, **_SHARES)
 
 
 @functools.cache
 def push_pass(cut: bool) -> SimpleNamespace:
     """Return `push`, which acts on the velocity, and `energy`, which sums the surface up; `cut`: whether faces have open fractions."""
     module = MODULE + "_cut" * cut
-    flags = {"CUT": cut, "MOVING": False, "GHOST": True, "BOUNDED": False, "THETA_MIN": THETA_MIN}
+    flags = {"CUT": cut, "MOVING": False, "GHOST": True, "BOUNDED": False, "THETA_MIN": THETA_MIN, "HALF": HALF}
     surface, numbers = {"kind": I8, **FACES, "phi": F32}, {"planes": int}
     optional = (*FACES,)
 
@@ -44,7 +44,7 @@ def push_pass(cut: bool) -> SimpleNamespace:
 
     return SimpleNamespace(
         push=made("push", F32, {"jump": F32, "field": F32}, numbers={"axis": int}),
-        energy=made("surface_energy", wp.float64, {"share": F32}, sums=("area", "wetted")),
+        energy=made("surface_energy", wp.float64, {"once": F32, "twice": F32}, numbers=PROFILE, sums=("area", "wetted")),
     )
 
 
