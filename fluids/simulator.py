@@ -183,6 +183,8 @@ class LiquidSimulation(ParticleSimulation):
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
+        if self.tension is not None:
+            self.tension.calm(self.particles, dt)
         row = self.move(dt, window) | self.solve_row(projected.result)
         if self.scene.output.diagnostics:
             row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}

@@ -11,16 +11,19 @@ import warp as wp
 
 from warp_lcp.fluids import surface_tension_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.level_set import REACH as REACH_OF_PHI
 from warp_lcp.grid.level_set_kernels import BINOMIAL
+from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import SOLID
 
 PASSES, MOST_PASSES = 8, 16  # binomial passes of a filter: particles' noise asks for the fewest, the cost and thin liquid for the most
+CALM = 0.2  # of the grid's capillary rate, at which gradients of the velocity near the surface decay
 STIFFEST = 2.08  # the largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered capillary wave, omega^2 s^3 rho dx^3 / sigma
 REACH = 6  # cells around particles that are smoothed: two of the widest filter's spreads, with what `window` spares
-SAFETY = 1.5  # in the square of the longest step
+SAFETY = 3.0  # in the square of the longest step: particles add noise
 
 
 class SurfaceTension:
@@ -101,6 +104,20 @@ class SurfaceTension:
         window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=scale)
         for axis, field in enumerate(velocity):
             window.run(self._passes.push, **self._faces(kind), planes=planes, jump=self.jump, field=field, axis=axis)
+
+    def calm(self, particles: Particles, dt: float) -> None:
+        """Take from particles near the surface what ripples shorter than the filter leave in their gradients: nothing pulls these back.
+
+        Without it they grow from the particles' noise, for APIC damps next to nothing, and take the surface apart.
+
+        Args:
+            particles: the liquid; `key` holds its cells (updated: gradients).
+            dt: time step [s].
+        """
+        factor = math.exp(-CALM * dt * math.sqrt(self.coefficient / (self.density * self.grid.spacing**3)))
+        for gradient in particles.affine:
+            listed = [factor, -0.99 * REACH_OF_PHI, particles.key, self._phi.flatten(), gradient]
+            wp.launch(kernels.calm_kernel, particles.count, listed, device=self.grid.device)
 
     def measure(self, window: Window, kind: wp.array) -> None:
         """Find the energy, for `energy` to tell."""

@@ -97,3 +97,11 @@ def continue_kernel(
             place = spread * 1.41421356 * wp.erfinv(2.0 * value - 1.0) + way[i] * cosine
             value = 0.5 + 0.5 * wp.erf(place / (1.41421356 * spread))
         flat[cells[i]] = value
+
+
+@wp.kernel(enable_backward=False, module=MODULE)
+def calm_kernel(factor: float, deepest: float, key: wp.array(dtype=wp.int32), phi: FLOATS, gradient: POINTS):
+    """Weaken a velocity's gradient in particles whose cell is near the surface."""
+    particle = wp.tid()
+    if phi[key[particle]] > deepest:
+        gradient[particle] = factor * gradient[particle]
