@@ -22,6 +22,7 @@ from warp_lcp.operators.grid_poisson import SOLID
 PASSES, MOST_PASSES = 8, 16  # binomial passes of a filter: particles' noise asks for the fewest, the cost and thin liquid for the most
 CALM = 0.2  # of the grid's capillary rate, at which gradients of the velocity near the surface decay
 STIFFEST = 2.08  # the largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered capillary wave, omega^2 s^3 rho dx^3 / sigma
+FARTHER = 9  # quarters of a cell from the mirror of a cell in a solid to where all cells around are open, at most
 REACH = 6  # cells around particles that are smoothed: two of the widest filter's spreads, with what `window` spares
 SAFETY = 3.0  # in the square of the longest step: particles add noise
 
@@ -189,8 +190,8 @@ def wall_cells(
     blocked = (base == SOLID) | ~inner | (center < 0.0)
     padded = np.pad(~blocked, 1)
     steps = [np.array(s) - 1 for s in np.ndindex(3, 3, 3) if s != (1, 1, 1) and not (flat and s[0] != 1)]
-    near = np.logical_or.reduce([padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(s, base.shape, strict=True))] for s in steps])
-    cells = np.argwhere(blocked & near)
+    near = _beside(~blocked, steps)  # and cells that have part of their face open ask for one layer more
+    cells = np.argwhere(blocked & (near | (_beside(near, steps) & (center < 0.0) & inner)))
     first, sides, least = np.zeros_like(cells), np.zeros_like(cells), np.full(len(cells), 4)
     for step in sorted(steps, key=lambda s: int(np.abs(s).sum())):  # faces, then edges, then corners
         there, size = padded[tuple((cells + 1 + step).T)], int(np.abs(step).sum())
@@ -201,12 +202,22 @@ def wall_cells(
     both = padded[tuple((cells + 1 + sides).T)]
     toward = np.where(both[:, None], sides, first)
     points, way = (cells + toward).astype(np.float32), np.abs(toward).sum(axis=1).astype(np.float32)
-    at = tuple(cells.T)
-    solid = (center[at] < 0.0) & inner[at]
-    depth = np.maximum(-2.0 * center[at], 1.0)  # at least a cell, or the cell itself would count most
-    points[solid] = np.clip(cells + depth[:, None] * normal[:, *at].T, 1, ends - 1)[solid]
-    way[solid] = depth[solid]
-    return blocked.astype(np.int8), np.ravel_multi_index(at, base.shape).astype(np.int32), points[:, ::-1].copy(), way
+    at, flat_index = tuple(cells.T), np.asarray(np.ravel_multi_index(tuple(cells.T), base.shape), dtype=np.int32)
+    solid = np.flatnonzero((center[at] < 0.0) & inner[at])
+    depth, along = -2.0 * center[at][solid], normal.reshape(3, -1)[:, flat_index[solid]].T
+    corners = [np.array(corner) for corner in np.ndindex(1 if flat else 2, 2, 2)]
+    for _ in range(FARTHER):  # until no cell of a wall is among those around the point
+        mirrored = np.clip(cells[solid] + depth[:, None] * along, 1, ends - 1)
+        around = [np.minimum(np.floor(mirrored).astype(int) + corner, ends) for corner in corners]
+        depth += 0.25 * np.logical_or.reduce([blocked[tuple(cell.T)] != 0 for cell in around])
+    points[solid], way[solid] = mirrored, depth
+    return blocked.astype(np.int8), flat_index, points[:, ::-1].copy(), way
+
+
+def _beside(marked: np.ndarray, steps: list[np.ndarray]) -> np.ndarray:
+    """Return which cells have a marked one at one of the steps from them."""
+    padded = np.pad(marked, 1)
+    return np.logical_or.reduce([padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(s, marked.shape, strict=True))] for s in steps])
 
 
 def _at_centers(nodes: np.ndarray, flat: bool) -> tuple[np.ndarray, np.ndarray]:
