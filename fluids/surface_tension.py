@@ -101,6 +101,7 @@ class SurfaceTension:
         self._shares = {"once": once, "twice": twice, "planes": planes, **_profile(passes)}
         (bend,) = (field for field in self._fields if field is not once and field is not twice)
         window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=float(grid.dimension - 1))  # a radius of one cell
+        self._continue(bend, 0, 0.0)  # the nearest point of the surface may lie in a wall
         scale = kick_dt * self.coefficient / (self.density * grid.spacing**2)
         window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=scale)
         for axis, field in enumerate(velocity):
@@ -137,18 +138,18 @@ class SurfaceTension:
 
     def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
         """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
-        self._continue(source, before)
+        self._continue(source, before, self._cosine)
         for done in range(1, passes + 1):
             out = free[done % 2]
             window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
-            self._continue(out, before + done)
+            self._continue(out, before + done, self._cosine)
             source = out
         return source
 
-    def _continue(self, share: wp.array, passes: int) -> None:
-        """Continue a share into walls, after so many passes."""
+    def _continue(self, field: wp.array, passes: int, cosine: float) -> None:
+        """Continue a share into walls, after so many passes; with a cosine of 0 whatever a field has."""
         spread = math.sqrt(0.25 + 0.5 * passes)
-        inputs = [*self._walls, self._cosine, spread, self.grid.planes, self._blocked, share, share.flatten()]
+        inputs = [*self._walls, cosine, spread, self.grid.planes, self._blocked, field, field.flatten()]
         launch_list(kernels.continue_kernel, len(self._walls[0]), inputs, device=self.grid.device)
 
     def _find_walls(self) -> None:
