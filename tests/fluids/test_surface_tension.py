@@ -252,7 +252,7 @@ def test_a_capillary_wave() -> None:
 @pytest.mark.slow
 def test_capillary_waves_converge() -> None:
     assert wave(64, 3.0) == pytest.approx(1.0, abs=0.012)
-    assert wave(32, 10.0) == pytest.approx(1.0, abs=0.035)
+    assert wave(32, 10.0) == pytest.approx(1.0, abs=0.05)  # the widest filter takes part of so short a wave
 
 
 def cap(angle: float, given: float) -> tuple[LiquidSimulation, float, float]:
