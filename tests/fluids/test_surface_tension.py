@@ -92,19 +92,21 @@ def test_the_push_is_a_jump_of_the_pressure(dimension: int) -> None:
 
 
 @pytest.mark.parametrize("angle", [50.0, 90.0, 130.0])
-@pytest.mark.parametrize("degrees", [0.0, 10.0, 25.0])
-def test_a_plane_at_the_contact_angle_is_straight(angle: float, degrees: float) -> None:
-    slope = math.radians(degrees)
-    wall = {"solid": [{"shape": "plane", "point": [16.0, 8.0], "normal": [math.sin(slope), math.cos(slope)]}]} if slope else {}
-    foot = np.array([16.3, 8.0 - 0.3 * math.tan(slope) if slope else 0.0, 0.0])
+@pytest.mark.parametrize(("dimension", "degrees"), [(2, 0.0), (2, 10.0), (2, 25.0), (3, 0.0), (3, 25.0)])
+def test_a_plane_at_the_contact_angle_is_straight(angle: float, dimension: int, degrees: float) -> None:
+    cells, slope = 32 if dimension == 2 else 24, math.radians(degrees)
+    normal = [math.sin(slope), math.cos(slope), 0.0]
+    wall = {"solid": [{"shape": "plane", "point": [cells / 2, 8.0, 0.0][:dimension], "normal": normal[:dimension]}]} if slope else {}
+    foot = np.array([cells / 2 + 0.3, 8.0 - 0.3 * math.tan(slope) if slope else 0.0, 0.0])
     tilt = math.radians(angle) - slope  # of the surface, whose liquid lies to its right
-    normal = np.array([-math.sin(tilt), math.cos(tilt), 0.0])
     found = {}
     for given in (angle, angle - 30.0):
-        simulation = tank(2, 32, angle=given, **wall)
-        where = centers(simulation)
-        near = np.linalg.norm(where - foot, axis=-1) < 6.0
-        tension, _ = take(simulation, (where - foot) @ normal)
+        simulation = tank(dimension, cells, angle=given, **wall)
+        away = (centers(simulation) - foot) * (1.0, 1.0, 0.0)
+        tension, _ = take(simulation, away @ (-math.sin(tilt), math.cos(tilt), 0.0))
+        near = np.linalg.norm(away, axis=-1) < 6.0
+        if dimension == 3:
+            near &= np.abs(centers(simulation)[..., 2] - cells / 2) < 2.0  # the sides have the angle, too
         found[given] = np.abs(tension.jump.numpy()[near]).max() / 1e-3
     assert found[angle] < 0.03
     assert found[angle - 30.0] > 0.06
