@@ -347,6 +347,7 @@ def refusals(scene: LiquidScene) -> list[str]:
         "particles.narrow_band": particles.narrow_band,
         "particles.reseed": particles.reseed,
         "density_correction": scene.density_correction is not None and scene.correction is not None,
+        "surface_tension": scene.surface_tension,
         'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
         "output.surface": output.surface,
         "output.volume": output.volume,

@@ -50,7 +50,7 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
     flags = {"CUT": cut, "MOVING": moving, "GHOST": ghost, "BOUNDED": bounded, "THETA_MIN": THETA_MIN, "TINY_WEIGHT": TINY_WEIGHT}
 
     def made(name: str, fields: dict[str, Any], numbers: dict[str, Any], **more: Any) -> RowPass:
-        box, optional = {"kind": I8, **FACES, "phi": F32} | fields, (*FACES, "phi", "w", "lower", "shift")
+        box, optional = {"kind": I8, **FACES, "phi": F32} | fields, (*FACES, "phi", "w", "lower", "shift", "jump")
         numbers, path = {"planes": int} | numbers, HEADERS / f"{name}.h"
         return RowPass(f"{module}.{name}", path, F64, box=box, numbers=numbers, constants=CONSTANTS | flags, optional=optional, **more)
 
@@ -59,7 +59,7 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
     return SimpleNamespace(
         prepare=made("prepare", liquid | problem, {"ratio": F64}),
         subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
-        support=made("support", faces | {"weight": F32}, {"axis": int, "limit": F32}),
+        support=made("support", faces | {"weight": F32, "jump": F32}, {"axis": int, "limit": F32}),
         contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, sums=("released",), largest=("worst",)),
     )
 
@@ -134,6 +134,7 @@ class PressureProjection:
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         known: int8, one field a component: which faces the last projection made valid, see `warp_lcp.grid.extrapolate`.
+        jump: of the pressure across the surface [m/s] in cells beside it, float32, which whoever pushes u* by it sets; None: there is none.
         automatic: what sets the tolerance from step to step, if something does.
     """
 
@@ -146,6 +147,7 @@ class PressureProjection:
         self._weights, self._gravity = list(weights or ()), gravity
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
+        self.jump: wp.array | None = None
         self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
         self.kind, self.cells, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
@@ -343,7 +345,7 @@ class PressureProjection:
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface; its faces become known after the projected ones."""
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
-            faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight}
+            faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight, "jump": self.jump}
             window.run(self._passes.support, axis=axis, limit=self._gravity * self._last, **faces)
 
     def _accept(self, x: wp.array) -> None:

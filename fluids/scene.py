@@ -13,12 +13,14 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
 from warp_lcp.scene.shapes import MaterialProperties
+from warp_lcp.settings import Positive
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
 PRESSURE_BYTES = 92  # fields of the pressure solve
 BOUND_BYTES = 9  # of them, those of walls that separate
 LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
+TENSION_BYTES = 17
 UNILATERAL_BYTES = 1
 VISCOUS_BYTES = {2: 140, 3: 220}  # its fields, those of coarse levels, and the velocity before the pressure
 SHORT_STEPS = 0.5  # Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at 1/8 on 20
@@ -53,14 +55,24 @@ class Viscosity(Table):
     )
 
 
+class SurfaceTensionSettings(Table):
+    """[surface_tension]: the surface pulls itself together; it does not unless the table is there."""
+
+    coefficient: Positive = Field(description="of the liquid against air [N/m]; water has 0.072")
+    contact_angle: float = Field(
+        default=90.0, ge=0, le=180, description="between surface and walls, measured in the liquid [degrees]; above 90 walls repel it"
+    )
+
+
 class LiquidScene(ParticleScene):
-    """A scene of liquid: the tables of all materials, `pressure`, `viscosity` and `liquid`."""
+    """A scene of liquid: the tables of all materials, `pressure`, `viscosity`, `surface_tension` and `liquid`."""
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
 
     pressure: Pressure = Field(default_factory=Pressure)
     viscosity: Viscosity | None = Field(default=None)
+    surface_tension: SurfaceTensionSettings | None = None
     liquid: list[Liquid] = Field(default_factory=list)
     probe: list[Probe] = Field(default_factory=list)
     wall_drag: WallDragSettings | None = None
@@ -89,6 +101,12 @@ class LiquidScene(ParticleScene):
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
             message = 'needs pressure.surface = "ghost-fluid", which tells how full cells are'
             found.append(Complaint(("particles", "narrow_band"), None, message))
+        if self.surface_tension is not None and self.pressure.surface == "voxel":
+            message = 'needs pressure.surface = "ghost-fluid", which has a curvature'
+            found.append(Complaint(("surface_tension",), None, message))
+        if self.surface_tension is not None and self.pressure.model == "unilateral":
+            message = 'needs pressure.model = "incompressible": a pressure that never pulls keeps no surface together'
+            found.append(Complaint(("surface_tension",), None, message))
         return [*found, *self._viscosity_complaints(), *probe_complaints(self.probe, self.domain.size, self.physics.gravity)]
 
     def _viscosity_complaints(self) -> list[Complaint]:
@@ -127,6 +145,8 @@ class LiquidScene(ParticleScene):
             found.append(Model("smoothing", closed if full else "pressure.smoothing", built=not full))
         if self.viscosity is not None:
             found.append(Model("viscosity", "viscosity.value"))
+        if self.surface_tension is not None:
+            found.append(Model("surface tension", closed if full else "[surface_tension]", built=not full))
         if self.short_steps:
             found.append(Model("support of spray", f"time.cfl is below {SHORT_STEPS}"))
         if self.solver.tolerance == "auto":
@@ -156,6 +176,11 @@ class LiquidScene(ParticleScene):
     def settles(self) -> bool:
         """Return whether full cells settle to the density at rest, which the unilateral model has gravity do, see `fluids.unilateral`."""
         return self.pressure.model == "unilateral" and any(self.physics.gravity)
+
+    @property
+    def speeds_up(self) -> bool:
+        """Return whether full cells settle, or a surface pulls."""
+        return self.settles or self.surface_tension is not None
 
     @property
     def stays_full(self) -> bool:
@@ -200,4 +225,5 @@ class LiquidScene(ParticleScene):
             "surface": cells
             * (not self.stays_full)
             * (LEVEL_SET_BYTES * (level_set or self.cuts_cells) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)),
+            "surface tension": cells * TENSION_BYTES * (self.surface_tension is not None and not self.stays_full),
         }

@@ -16,6 +16,7 @@ from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
+from warp_lcp.fluids.surface_tension import REACH, SurfaceTension
 from warp_lcp.fluids.unilateral import UnilateralPressure
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
 from warp_lcp.fluids.wall_drag import WallDrag
@@ -66,6 +67,15 @@ def make_surface(
         smoothing = scene.pressure.smoothing
         return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=smoothing, fill=fill, counted=counted)
     return WholeCellSurface(grid, boundary, particles_a_cell=count, fill=fill)
+
+
+def make_tension(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface) -> SurfaceTension | None:
+    """Return the surface tension of a scene; None: it has none, or no surface."""
+    given = scene.surface_tension
+    if given is None or surface.phi is None:
+        return None
+    settings = {"coefficient": given.coefficient, "contact_angle": given.contact_angle, "density": scene.physics.density}
+    return SurfaceTension(grid, boundary, surface.phi, **settings)
 
 
 def pressure_settings(scene: LiquidScene, surface: FreeSurface, weights: list[wp.array]) -> dict[str, Any]:
@@ -129,6 +139,7 @@ class LiquidSimulation(ParticleSimulation):
     Attributes:
         surface: the free surface.
         forces: what the step has done to each solid; None: nobody asks.
+        tension: of the surface; None: it has none.
         projection: the pressure's fields.
         record: takes the problem of each step before it is solved, if it is set.
     """
@@ -149,27 +160,37 @@ class LiquidSimulation(ParticleSimulation):
         self.forces = SolidForces(solids, grid.dimension) if tell else None
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
-        self.reach = max(self.layers, 2 * scene.pressure.smoothing)
+        self.reach = max(self.layers, 2 * scene.pressure.smoothing, 0 if self.tension is None else REACH)
         self.probes = Probes(scene.probe, self.gravity, grid.dimension) if scene.probe else None
         self.measured: dict[str, Row] = {}
+        if self.tension is not None:
+            self._notes.append(f"surface tension: steps of at most {self.tension.longest_step():.3g} s")
         self.mark()
 
     def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate what belongs to a grid."""
         super().lay(grid, parts)
         self.surface = self._surface()
+        self.tension = make_tension(self.scene, grid, self.boundary, self.surface)
         self.projection = self._pressure()
         drags, physics = self.scene.drags, self.scene.physics
         asked = self.forces is not None or drags is not None
         self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
         self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
+        if self.tension is not None:
+            self.projection.jump = self.tension.jump
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
 
     def _pressure(self) -> PressureProjection:
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
+
+    def stable_dt(self) -> float:
+        """Return the longest step that advection and surface tension allow [s]."""
+        dt = super().stable_dt()
+        return dt if self.tension is None else min(dt, self.tension.longest_step())
 
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""
@@ -200,6 +221,8 @@ class LiquidSimulation(ParticleSimulation):
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
+                if self.tension is not None:
+                    self.tension.measure(window, self.projection.kind)
         walls = self._meet_walls(window, dt)
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
@@ -207,9 +230,13 @@ class LiquidSimulation(ParticleSimulation):
         self._measure()
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles(window, self.projection.kind, dt)
+        if self.tension is not None:
+            self.tension.calm(self.particles, dt)
         row = self.move(dt, window) | self.solve_row(projected.result) | viscous | walls
         if self.scene.output.diagnostics:
             row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
+            if self.tension is not None:
+                row |= {"surface_energy": self.tension.energy()}
         automatic = self.projection.automatic
         if automatic is not None and projected.result is not None:
             row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
@@ -275,6 +302,8 @@ class LiquidSimulation(ParticleSimulation):
         """
         drags = ("drag_work",) if self.scene.drags is not None else ()
         columns = ("active", "max_divergence", "volume", *drags) if self.scene.output.diagnostics else ("active", *drags)
+        if self.tension is not None and self.scene.output.diagnostics:
+            columns = (*columns, "surface_energy")
         columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
@@ -320,11 +349,14 @@ class LiquidSimulation(ParticleSimulation):
         self.restore(state_of(pieces, self.state()))
 
     def _find_surface(self, window: Window) -> None:
-        """Mark the liquid's cells, and give velocity to their faces."""
+        """Mark the liquid's cells, give velocity to their faces, and let the surface's tension push them."""
         projection = self.projection
         with self.watch.stage("surface", self.particles.key, projection.kind):
             self.surface.mark(self.particles, window, projection.kind)
             self.surface.complete(window, self.velocity, self.weights, projection.known)
+        if self.tension is not None:
+            with self.watch.stage("surface tension", *self.velocity, self.tension.jump):
+                self.tension.act(self.velocity, window, projection.kind, self.kick_dt)
 
     def _rub(self, viscosity: Viscosity, window: Window, dt: float, speed: float) -> Row:
         """Change the velocity before the pressure by what viscosity does to that after it; return what the log says of it.

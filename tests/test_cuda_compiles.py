@@ -16,6 +16,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.fluids.pressure import pressure_passes
+from warp_lcp.fluids.surface_tension_kernels import push_pass
 from warp_lcp.granular.bodies_kernels import body_kernels
 from warp_lcp.granular.coupled import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
@@ -220,6 +221,7 @@ def modules_of_every_kernel(reals):
     use_every_kernel(reals)
     for cut in (False, True):
         displacement_pass(cut)
+        push_pass(cut)
     for endless in (0, 1, 4, 5):
         advect_pass(endless)
         distance_pass(endless)

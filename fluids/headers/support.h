@@ -4,6 +4,9 @@
 #include "pressure_face.h"
 const int nx = given.kind.shape[2], ny = given.kind.shape[1], nz = given.kind.shape[0];
 const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1), steps[6] = {-1, 1, -s2, s2, -s1, s1};
+auto over = [&](long long liquid, long long air) {  // of the jump of surface tension, see push.h
+    return jump[liquid]*(inverse_theta(liquid, air) - 1.0f) + jump[air];
+};
 const bool inside_y = j > 0 && j < (axis == 1 ? ny : ny - 1), inside_z = planes != 2 || (k > 0 && k < (axis == 2 ? nz : nz - 1));
 const int low = first > 1 ? first : 1, end = axis == 0 ? nx : nx - 1, high = last < end ? last : end;
 for (int i = low; i < high && inside_y && inside_z; ++i) {
@@ -15,7 +18,9 @@ for (int i = low; i < high && inside_y && inside_z; ++i) {
         const long long e = there[n] ? i + steps[n] : i;
         if (known[e] != 1) continue;
         const float inverse = kind[e] == AIR ? inverse_theta(e - s, e) : (kind[e - s] == AIR ? inverse_theta(e, e - s) : 1.0f);
-        change -= (float)(x[e] - x[e - s])*inverse; velocity += field[e]; ++found;
+        change -= (float)(x[e] - x[e - s])*inverse;
+        if (jump && kind[e] != kind[e - s]) change += kind[e] == AIR ? -over(e - s, e) : over(e, e - s);
+        velocity += field[e]; ++found;
     }
     if (found == 0) continue;
     change /= (float)found;

@@ -142,6 +142,10 @@ CASES = {
         files=("fluids/surface.py", "warp_lcp/grid/level_set.py"),
     ),
     "smoothing": Case({"pressure": {"smoothing": 2}}, {"pressure": {}}),
+    "surface tension": Case(
+        {"pressure": {}, "surface_tension": {"coefficient": 0.072}}, {"pressure": {}}, modules=("fluids.surface_tension",),
+        files=("fluids/surface_tension.py",),
+    ),
     "separating walls": Case({"wall": "separating"}, modules=("warp_lcp.bounds",), files=("warp_lcp/problem/bounds.py",)),
     "unilateral pressure": Case(
         {"pressure": {"model": "unilateral"}}, {"pressure": {}}, modules=("fluids.unilateral",), files=("fluids/unilateral.py",)

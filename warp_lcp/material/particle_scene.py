@@ -150,6 +150,11 @@ class ParticleScene(Scene):
         return False
 
     @property
+    def speeds_up(self) -> bool:
+        """Return whether the material's own forces may make what flies move faster within itself."""
+        return self.settles
+
+    @property
     def stays_full(self) -> bool:
         """Return whether the material fills the domain for ever."""
         return False

@@ -124,7 +124,7 @@ class ParticleSimulation(ParticleFrames):
 
     def _flights(self) -> Flights | None:
         s = self.scene
-        return Flights(self.grid, self.boundary, coheres=s.coheres, settles=s.settles) if s.flies else None
+        return Flights(self.grid, self.boundary, coheres=s.coheres, settles=s.speeds_up) if s.flies else None
 
     @abstractmethod
     def mark(self) -> None:

@@ -1,0 +1,239 @@
+"""Surface tension: the jump of the pressure across a ghost-fluid surface, and the angle at which it meets walls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.fluids import surface_tension_kernels as kernels
+from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.level_set import REACH as REACH_OF_PHI
+from warp_lcp.grid.level_set_kernels import BINOMIAL
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.tally import WindowTally
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.operators.grid_poisson import SOLID
+
+PASSES, MOST_PASSES = 8, 16  # binomial passes of a filter: particles' noise asks for the fewest, the cost and thin liquid for the most
+CALM = 0.2  # of the grid's capillary rate, at which gradients of the velocity near the surface decay
+STIFFEST = 2.08  # the largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered capillary wave, omega^2 s^3 rho dx^3 / sigma
+FARTHER = 9  # quarters of a cell from the mirror of a cell in a solid to where all cells around are open, at most
+REACH = 6  # cells around particles that are smoothed: two of the widest filter's spreads, with what `window` spares
+SAFETY = 3.0  # in the square of the longest step: particles add noise
+
+
+class SurfaceTension:
+    """Push liquid by the pressure p = sigma kappa that its surface asks for.
+
+    The jump of a ghost-fluid surface [Gibou et al. 2002] between a FLUID cell i and an AIR cell n at theta, with X = kick_dt sigma kappa /
+    (rho dx) there, changes u = u* - (x_right - x_left) / theta by X / theta alone. It is added to u* before the projection, so that the
+    pressure's problem stays as it is: x is the liquid's whole pressure over that of the air, and 0 <= x on separating walls means what it
+    meant.
+
+    The curvature kappa = div n, n = -grad f / |grad f|, is that of f = (2 S - S^2) f0, where f0 is the share of a cell's kernel that lies
+    below the surface, and S are m binomial passes (1, 2, 1)/4 along each axis, nearly a Gaussian of the variance s^2 = m/2. Of a ripple of
+    wavenumber q on a plane f keeps 2 e^-a - e^-2a, a = (q s)^2 / 2, so that capillary waves are slower by (q s)^4 / 8. For m >= `PASSES`;
+    more where the step asks for it: explicit leapfrog steps are stable while omega dt < 2, and no ripple then has
+    omega^2 > STIFFEST sigma / (rho (s dx)^3). So waves that a step cannot follow are pushed less instead of making it shorter.
+
+    In cells of walls, f goes on so that the distance to the surface falls along the wall's normal by the contact angle's cosine.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        phi: distance to the surface [cells], < 0 in liquid, of a `GhostFluidSurface`.
+        coefficient: sigma [N/m].
+        contact_angle: in the liquid [degrees].
+        density: of the liquid [kg/m^3].
+
+    Attributes:
+        jump: kick_dt sigma kappa / (rho dx) [m/s] in cells beside the surface, float32.
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, phi: wp.array, *, coefficient: float, contact_angle: float, density: float
+    ) -> None:  # fmt: skip
+        self.grid, self.boundary, self._phi = grid, boundary, phi
+        self.coefficient, self.density = coefficient, density
+        self._cosine = math.cos(math.radians(contact_angle)) if contact_angle != 90.0 else 0.0
+        self.jump, self._fields = grid.field(), [grid.field() for _ in range(3)]
+        self._passes = kernels.push_pass(bool(boundary.open))
+        self._energy = WindowTally(self._passes.energy, grid)
+        self._blocked = grid.field(wp.int8)
+        self._find_walls()
+
+    def longest_step(self) -> float:
+        """Return the longest step [s] that is stable with the most passes."""
+        return self._step_of(MOST_PASSES)
+
+    def _step_of(self, passes: int) -> float:
+        spread = math.sqrt(0.5 * passes) * self.grid.spacing
+        return math.sqrt(4.0 * self.density * spread**3 / (SAFETY * STIFFEST * self.coefficient))
+
+    def _passes_for(self, kick_dt: float) -> int:
+        """Return how many passes a step takes."""
+        return next((m for m in range(PASSES, MOST_PASSES) if self._step_of(m) >= kick_dt), MOST_PASSES)
+
+    def act(self, velocity: Sequence[wp.array], window: Window, kind: wp.array, kick_dt: float) -> None:
+        """Push the faces that the surface crosses.
+
+        Args:
+            velocity: u* of each component [m/s] (updated).
+            window: cells that hold all FLUID cells, with some to spare on each side.
+            kind: int8 of AIR, FLUID, SOLID, as `phi` marks them.
+            kick_dt: how long forces act [s].
+        """
+        grid, planes = self.grid, self.grid.planes
+        if self.boundary.moves:
+            self._find_walls()
+        first, *free = self._fields
+        for field in self._fields:  # passes look beyond the window, where an earlier step may have left something
+            field.zero_()
+        window.launch(kernels.share_kernel, [self._phi, self._blocked, first])
+        passes = self._passes_for(kick_dt)
+        once = self._smoothed(window, first, free, passes, 0)
+        twice = self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
+        self._shares = {"once": once, "twice": twice, "planes": planes, **_profile(passes)}
+        (bend,) = (field for field in self._fields if field is not once and field is not twice)
+        window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=float(grid.dimension - 1))  # a radius of one cell
+        self._continue(bend, 0, 0.0)  # the nearest point of the surface may lie in a wall
+        scale = kick_dt * self.coefficient / (self.density * grid.spacing**2)
+        window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=scale)
+        for axis, field in enumerate(velocity):
+            window.run(self._passes.push, **self._faces(kind), planes=planes, jump=self.jump, field=field, axis=axis)
+
+    def calm(self, particles: Particles, dt: float) -> None:
+        """Take from particles near the surface what ripples shorter than the filter leave in their gradients: nothing pulls these back.
+
+        Without it they grow from the particles' noise, for APIC damps next to nothing, and take the surface apart.
+
+        Args:
+            particles: the liquid; `key` holds its cells (updated: gradients).
+            dt: time step [s].
+        """
+        factor = math.exp(-CALM * dt * math.sqrt(self.coefficient / (self.density * self.grid.spacing**3)))
+        for gradient in particles.affine:
+            listed = [factor, -0.99 * REACH_OF_PHI, particles.key, self._phi.flatten(), gradient]
+            wp.launch(kernels.calm_kernel, particles.count, listed, device=self.grid.device)
+
+    def measure(self, window: Window, kind: wp.array) -> None:
+        """Find the energy, for `energy` to tell."""
+        box = window.common(self.grid.domain)
+        assert box is not None, "a window has cells of the domain"
+        self._energy.take(box, **self._faces(kind), **self._shares)
+
+    def energy(self) -> float:
+        """Return the energy of surface and wet walls when it was last measured [J; J/m in 2-D]: sigma (area - cos(angle) wet area)."""
+        area, wetted = self._energy.read()
+        return self.coefficient * (area - self._cosine * wetted) * self.grid.spacing ** (self.grid.dimension - 1)
+
+    def _faces(self, kind: wp.array) -> dict[str, Any]:
+        open_faces = {f"open_{axis}": field for axis, field in zip("xyz", [*self.boundary.open, None, None, None], strict=False)}
+        return {"kind": kind, "phi": self._phi, **open_faces, **{f"solid_{axis}": None for axis in "xyz"}}
+
+    def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
+        """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
+        self._continue(source, before, self._cosine)
+        for done in range(1, passes + 1):
+            out = free[done % 2]
+            window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
+            self._continue(out, before + done, self._cosine)
+            source = out
+        return source
+
+    def _continue(self, field: wp.array, passes: int, cosine: float) -> None:
+        """Continue a share into walls, after so many passes; with a cosine of 0 whatever a field has."""
+        spread = math.sqrt(0.25 + 0.5 * passes)
+        inputs = [*self._walls, cosine, spread, self.grid.planes, self._blocked, field, field.flatten()]
+        launch_list(kernels.continue_kernel, len(self._walls[0]), inputs, device=self.grid.device)
+
+    def _find_walls(self) -> None:
+        """Find the cells of walls that passes read, and where what they get comes from."""
+        distance, device = self.boundary.distance, self.grid.device
+        blocked, *lists = wall_cells(self.grid, self.boundary.base.numpy(), None if distance is None else distance.numpy())
+        self._blocked.assign(blocked)
+        self._walls = [wp.array(v, dtype=kind, device=device) for v, kind in zip(lists, (wp.int32, wp.vec3, wp.float32), strict=True)]
+
+
+def _profile(passes: int) -> dict[str, float]:
+    """Return the series of the distance [cells] in the share 2 once - twice less 1/2, across a plane."""
+    narrow, wide = (math.sqrt(0.25 + 0.5 * count) for count in (passes, 2 * passes))
+    first, third = ((2.0 / narrow**n - 1.0 / wide**n) / math.sqrt(2.0 * math.pi) for n in (1, 3))
+    return {"linear": 1.0 / first, "cubic": third / (6.0 * first**4)}
+
+
+def wall_cells(
+    grid: StaggeredGrid, base: np.ndarray, distance: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Return which cells are walls, and of those beside open ones: flat index, the point before the wall that each mirrors, and how far.
+
+    A cell whose center lies in a solid is a wall, mirrored along the solid's normal; so is each of the ring or, without a distance, of a
+    solid's whole cells, mirrored along the axes.
+
+    Args:
+        grid: the grid.
+        base: int8, SOLID or AIR, in the stored shape.
+        distance: to solids at the cells' low corners [cells]; None: solids are whole cells.
+
+    Returns:
+        `blocked`, int8 in the stored shape; the cells, int32, shape (n,); the points (i, j, k) in cells' numbers, shape (n, 3); the ways
+        [cells], shape (n,); float32.
+    """
+    flat, ends = grid.dimension == 2, np.array(base.shape) - 1
+    inner = np.zeros(base.shape, dtype=bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    center, normal = _at_centers(distance, flat) if distance is not None else (np.ones(base.shape), np.zeros((3, *base.shape)))
+    blocked = (base == SOLID) | ~inner | (center < 0.0)
+    padded = np.pad(~blocked, 1)
+    steps = [np.array(s) - 1 for s in np.ndindex(3, 3, 3) if s != (1, 1, 1) and not (flat and s[0] != 1)]
+    near = _beside(~blocked, steps)  # and cells that have part of their face open ask for one layer more
+    cells = np.argwhere(blocked & (near | (_beside(near, steps) & (center < 0.0) & inner)))
+    first, sides, least = np.zeros_like(cells), np.zeros_like(cells), np.full(len(cells), 4)
+    for step in sorted(steps, key=lambda s: int(np.abs(s).sum())):  # faces, then edges, then corners
+        there, size = padded[tuple((cells + 1 + step).T)], int(np.abs(step).sum())
+        first[there & (least == 4)] = step
+        least[there & (least == 4)] = size
+        sides[there & (least == size)] += step
+    sides = np.sign(sides)  # between two open neighbors lies the cell that mirrors both walls, if it is open
+    both = padded[tuple((cells + 1 + sides).T)]
+    toward = np.where(both[:, None], sides, first)
+    points, way = (cells + toward).astype(np.float32), np.abs(toward).sum(axis=1).astype(np.float32)
+    at, flat_index = tuple(cells.T), np.asarray(np.ravel_multi_index(tuple(cells.T), base.shape), dtype=np.int32)
+    solid = np.flatnonzero((center[at] < 0.0) & inner[at])
+    depth, along = -2.0 * center[at][solid], normal.reshape(3, -1)[:, flat_index[solid]].T
+    corners = [np.array(corner) for corner in np.ndindex(1 if flat else 2, 2, 2)]
+    for _ in range(FARTHER):  # until no cell of a wall is among those around the point
+        mirrored = np.clip(cells[solid] + depth[:, None] * along, 1, ends - 1)
+        around = [np.minimum(np.floor(mirrored).astype(int) + corner, ends) for corner in corners]
+        depth += 0.25 * np.logical_or.reduce([blocked[tuple(cell.T)] != 0 for cell in around])
+    points[solid], way[solid] = mirrored, depth
+    return blocked.astype(np.int8), flat_index, points[:, ::-1].copy(), way
+
+
+def _beside(marked: np.ndarray, steps: list[np.ndarray]) -> np.ndarray:
+    """Return which cells have a marked one at one of the steps from them."""
+    padded = np.pad(marked, 1)
+    return np.logical_or.reduce([padded[tuple(slice(1 + d, 1 + d + n) for d, n in zip(s, marked.shape, strict=True))] for s in steps])
+
+
+def _at_centers(nodes: np.ndarray, flat: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean of the values at each cell's corners, and the unit vector (k, j, i) along which they grow; `flat`: in 2-D."""
+    axes = (1, 2) if flat else (0, 1, 2)
+    center, slopes = nodes.astype(np.float64), np.zeros((3, *nodes.shape))
+    for axis in axes:
+        slope = _next(nodes.astype(np.float64), axis) - nodes
+        for other in axes:
+            slope = slope if other == axis else 0.5 * (slope + _next(slope, other))
+        slopes[axis] = slope
+        center = 0.5 * (center + _next(center, axis))
+    return center, slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-9)
+
+
+def _next(field: np.ndarray, axis: int) -> np.ndarray:
+    """Return each element's successor along an axis, the last one's own."""
+    return np.concatenate([field.take(range(1, field.shape[axis]), axis), field.take([-1], axis)], axis)

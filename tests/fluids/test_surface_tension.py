@@ -1,0 +1,333 @@
+"""Surface tension: curvature, the pressure's jump, walls, frequencies of drops and waves, against what theory says."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.optimize import curve_fit
+
+import warp_lcp as wl
+from small_liquids import advance, box, create, scene
+from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.fluids.distributed import refusals
+from warp_lcp.fluids.surface_tension import MOST_PASSES, SurfaceTension, wall_cells
+
+SIGMA, RHO, RADIUS = 0.072, 1000.0, 0.01  # of water [N/m, kg/m^3], and of drops [m]
+SPEED, TIME = math.sqrt(SIGMA / (RHO * RADIUS)), math.sqrt(RHO * RADIUS**3 / SIGMA)  # of a drop
+WATER: dict[str, Any] = {"coefficient": SIGMA}
+
+
+def tank(dimension: int, cells: int, *, angle: float = 90.0, **tables: Any) -> LiquidSimulation:
+    """Return a simulation of unit cells, whose own liquid does not matter."""
+    side = float(cells)
+    liquid = [box([0.0] * dimension, [side / 2] * dimension)]
+    tension = {"coefficient": 1.0, "contact_angle": angle}
+    physics = {"density": 1.0, "gravity": [0.0] * dimension}
+    return create(scene(size=[side] * dimension, resolution=cells, liquid=liquid, surface_tension=tension, physics=physics, **tables))
+
+
+def centers(simulation: LiquidSimulation) -> np.ndarray:
+    """Return the centers (x, y, z) of the stored cells in unit cells."""
+    k, j, i = np.indices(simulation.grid.shape)
+    z = np.zeros_like(k, dtype=float) if simulation.grid.dimension == 2 else k - 0.5
+    return np.stack([i - 0.5, j - 0.5, z], axis=-1)
+
+
+def take(simulation: LiquidSimulation, distance: np.ndarray) -> tuple[SurfaceTension, np.ndarray]:
+    """Let the surface tension act on a given distance to the surface; return it and the cells' kinds."""
+    assert simulation.tension is not None and simulation.surface.phi is not None
+    kind = simulation.boundary.base.numpy().copy()
+    kind[(kind == wl.AIR) & (distance < 0.0)] = wl.FLUID
+    simulation.surface.phi.assign(np.clip(distance, -1.5, 1.5).astype(np.float32))
+    simulation.projection.kind.assign(kind)
+    simulation.tension.act(simulation.velocity, simulation.grid.everywhere, simulation.projection.kind, 1e-3)
+    return simulation.tension, kind
+
+
+def curvatures(simulation: LiquidSimulation, distance: np.ndarray) -> np.ndarray:
+    """Return the curvature [1/cells] in cells beside the surface."""
+    tension, _ = take(simulation, distance)
+    jump = tension.jump.numpy() / 1e-3
+    return np.asarray(jump[jump != 0.0])
+
+
+@pytest.mark.parametrize(("dimension", "radius"), [(2, 6.0), (2, 12.0), (3, 7.0)])
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["drop", "bubble"])
+def test_the_curvature_of_a_sphere(dimension: int, radius: float, sign: float) -> None:
+    rng = np.random.default_rng(71)
+    simulation = tank(dimension, math.ceil(2 * radius + 12))
+    for _ in range(2):
+        middle = simulation.grid.counts[0] / 2 + rng.uniform(-0.5, 0.5, 3)
+        middle[dimension:] = 0.0
+        distance = sign * (np.linalg.norm(centers(simulation) - middle, axis=-1) - radius)
+        found = curvatures(simulation, distance) * radius / (dimension - 1)
+        assert found.mean() == pytest.approx(sign, abs=0.05 if radius < 10 else 0.015)
+        assert found.std() < 0.03
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_push_is_a_jump_of_the_pressure(dimension: int) -> None:
+    simulation = tank(dimension, 16)
+    middle = np.array([8.2, 7.9, 8.1 if dimension == 3 else 0.0])
+    tension, kind = take(simulation, np.linalg.norm(centers(simulation) - middle, axis=-1) - 5.0)
+    for field in simulation.velocity:
+        field.zero_()
+    tension.jump.fill_(0.25)
+    window, projection = simulation.grid.everywhere, simulation.projection
+    for axis, field in enumerate(simulation.velocity):
+        window.run(
+            tension._passes.push, kind=projection.kind, phi=simulation.surface.phi, planes=simulation.grid.planes, jump=tension.jump,
+            field=field, axis=axis, **{f"{what}_{a}": None for what in ("open", "solid") for a in "xyz"},
+        )  # fmt: skip
+    assert max(np.abs(field.numpy()).max() for field in simulation.velocity) > 0.25
+    projection.tolerance = 1e-8
+    assert projection.prepare(simulation.velocity, 1e-3, 1e-3)
+    result, criteria = projection.solve(1.0)
+    assert result
+    projection.project(simulation.velocity, window, result, criteria)
+    np.testing.assert_allclose(projection.pressure.numpy()[kind == wl.FLUID], 0.25, rtol=1e-5)
+    assert max(np.abs(field.numpy()).max() for field in simulation.velocity) < 1e-4  # the push is up to 0.25 / theta
+
+
+@pytest.mark.parametrize("angle", [50.0, 90.0, 130.0])
+@pytest.mark.parametrize(("dimension", "degrees"), [(2, 0.0), (2, 10.0), (2, 25.0), (3, 0.0), (3, 25.0)])
+def test_a_plane_at_the_contact_angle_is_straight(angle: float, dimension: int, degrees: float) -> None:
+    cells, slope = 32 if dimension == 2 else 24, math.radians(degrees)
+    normal = [math.sin(slope), math.cos(slope), 0.0]
+    wall = {"solid": [{"shape": "plane", "point": [cells / 2, 8.0, 0.0][:dimension], "normal": normal[:dimension]}]} if slope else {}
+    foot = np.array([cells / 2 + 0.3, 8.0 - 0.3 * math.tan(slope) if slope else 0.0, 0.0])
+    tilt = math.radians(angle) - slope  # of the surface, whose liquid lies to its right
+    found = {}
+    for given in (angle, angle - 30.0):
+        simulation = tank(dimension, cells, angle=given, **wall)
+        away = (centers(simulation) - foot) * (1.0, 1.0, 0.0)
+        tension, _ = take(simulation, away @ (-math.sin(tilt), math.cos(tilt), 0.0))
+        near = np.linalg.norm(away, axis=-1) < 6.0
+        if dimension == 3:
+            near &= np.abs(centers(simulation)[..., 2] - cells / 2) < 2.0  # the sides have the angle, too
+        found[given] = np.abs(tension.jump.numpy()[near]).max() / 1e-3
+    assert found[angle] < 0.03
+    assert found[angle - 30.0] > 0.06
+
+
+def test_cells_of_walls_mirror_what_is_before_them() -> None:
+    simulation = tank(2, 8, solid=[box([4.0, 0.0], [8.0, 2.0])])
+    base = simulation.boundary.base.numpy()
+    blocked, cells, points, way = wall_cells(simulation.grid, base, None)
+    assert ((blocked != 0)[1, 1:-1, 1:-1] == (base == wl.SOLID)[1, 1:-1, 1:-1]).all()
+    found = {tuple(np.array(np.unravel_index(c, base.shape))[::-1]): (p, w) for c, p, w in zip(cells, points, way, strict=True)}
+    for cell, (point, length) in {
+        (0, 3, 1): ((1, 3, 1), 1.0),  # the domain's left wall
+        (0, 0, 1): ((1, 1, 1), 2.0),  # its corner
+        (6, 2, 1): ((6, 3, 1), 1.0),  # the top of the box
+        (5, 2, 1): ((4, 3, 1), 2.0),  # its upper corner
+    }.items():
+        np.testing.assert_array_equal(found[cell][0], point)
+        assert found[cell][1] == length
+
+
+def drop(across: int, dimension: int = 2, *, seed: int = 2015, **tables: Any) -> LiquidSimulation:
+    """Return a drop in free space, that many cells in diameter."""
+    side = (4 if dimension == 2 else 3) * RADIUS
+    liquid = [{"shape": "sphere", "center": [side / 2] * dimension, "radius": RADIUS}]
+    settings = {"particles": {"seed": seed}, "surface_tension": WATER} | tables
+    return create(
+        scene(size=[side] * dimension, resolution=across * (4 if dimension == 2 else 3) // 2, liquid=liquid,
+              physics={"gravity": [0.0] * dimension}, **settings)
+    )  # fmt: skip
+
+
+def capillary_step(simulation: LiquidSimulation) -> float:
+    """Return the step [s] beyond which pushes without a filter are unstable."""
+    return math.sqrt(RHO * simulation.grid.spacing**3 / (math.pi * SIGMA))
+
+
+def laplace(simulation: LiquidSimulation, dimension: int) -> float:
+    """Return the pressure deep inside over sigma kappa."""
+    assert simulation.surface.phi is not None
+    deep = (simulation.projection.cells.numpy() == wl.FLUID) & (simulation.surface.phi.numpy() < -1.4)
+    return float(simulation.projection.pressures(RHO)[deep].mean()) * RADIUS / ((dimension - 1) * SIGMA)
+
+
+@pytest.mark.parametrize(("across", "dimension", "error"), [(16, 2, 0.03), (32, 2, 0.02), (16, 3, 0.05), (32, 3, 0.02)])
+def test_the_pressure_in_a_drop(across: int, dimension: int, error: float) -> None:
+    simulation = drop(across, dimension)
+    rows = advance(simulation, 0.2 * TIME, capillary_step(simulation))
+    assert laplace(simulation, dimension) == pytest.approx(1.0, abs=error)
+    area = 2.0 * math.pi * RADIUS * (1.0 if dimension == 2 else 2.0 * RADIUS)
+    assert rows[-1]["surface_energy"] == pytest.approx(SIGMA * area, rel=0.08 if across == 16 else 0.03)
+
+
+@pytest.mark.parametrize(("times", "bound"), [(1.0, 1e-2), (10.0, 1e-2)])
+def test_a_drop_at_rest_stays_so(times: float, bound: float) -> None:
+    simulation = drop(16)
+    rows = advance(simulation, 12.0 * TIME, times * capillary_step(simulation))
+    speeds = [row["max_speed"] / SPEED for row in rows]
+    assert max(speeds) < 0.1
+    assert max(speeds[-len(rows) // 6 :]) < 0.03
+    velocity = simulation.particles.velocity.numpy()
+    assert math.sqrt((velocity**2).sum(axis=1).mean()) / SPEED < bound
+    assert rows[-1]["volume"] == pytest.approx(rows[0]["volume"], rel=5e-3)
+
+
+def moved(simulation: LiquidSimulation, position: np.ndarray) -> None:
+    """Put the particles elsewhere."""
+    arrays = {name: array.numpy() for name, array in simulation.particles.arrays().items()}
+    simulation.particles.assign(arrays | {"position": position.astype(np.float32)})
+    simulation.particles.sort()
+
+
+def frequency(times: list[float], values: list[float], guess: float) -> tuple[float, float]:
+    """Return the frequency and the damping of an oscillation over a guess."""
+
+    def decaying(t: np.ndarray, a: float, b: float, w: float, c: float, d: float) -> np.ndarray:
+        return np.exp(-c * t) * (a * np.cos(w * t) + b * np.sin(w * t)) + d
+
+    found, _ = curve_fit(decaying, np.array(times), np.array(values), p0=[values[0], 0.0, guess, 0.01 * guess, 0.0])
+    return float(found[2]) / guess, float(found[3]) / guess
+
+
+def oscillation(across: int, dimension: int, times: float, periods: float = 1.6) -> tuple[float, float]:
+    """Return the frequency of an ellipsoid over Lamb's, and its damping."""
+    guess = math.sqrt((6.0 if dimension == 2 else 8.0) / TIME**2)
+    simulation, stretch = drop(across, dimension), 0.05
+    middle = simulation.grid.extent[0] / 2
+    position = simulation.particles.position.numpy()
+    position[:, 0] = middle + (position[:, 0] - middle) * math.exp(stretch)
+    position[:, 1:dimension] = middle + (position[:, 1:dimension] - middle) * math.exp(-stretch / (dimension - 1))
+    moved(simulation, position)
+    at, shape = [], []
+    while simulation.time < periods * 2.0 * math.pi / guess:
+        simulation.step(min(simulation.stable_dt(), times * capillary_step(simulation)))
+        spread = simulation.particles.position.numpy().var(axis=0)
+        at.append(simulation.time)
+        shape.append(math.log(spread[0] / spread[1:dimension].mean()))
+    return frequency(at, shape, guess)
+
+
+@pytest.mark.parametrize("times", [2.0, 6.0])
+def test_a_drop_oscillates(times: float) -> None:
+    found, damping = oscillation(16, 2, times)
+    assert found == pytest.approx(1.0, abs=0.03)
+    assert 0.0 < damping < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_drop_oscillates_at_lambs_frequency(dimension: int) -> None:
+    errors = [abs(oscillation(across, dimension, 3.0)[0] - 1.0) for across in (8, 16, 32)]
+    assert errors[2] < 0.01
+    assert errors[0] > 2.0 * errors[1] or errors[1] > 1.5 * errors[2]  # first order at least
+    assert errors[0] > 4.0 * errors[2]
+
+
+def wave(cells: int, times: float = 1.0) -> float:
+    """Return the frequency of a standing capillary wave over sqrt(sigma k^3 tanh(k h) / rho)."""
+    length = 2.0 * RADIUS
+    k, depth, height = 2.0 * math.pi / length, length / 2, 0.02 * length
+    liquid = [box([0.0, 0.0], [length, depth])]
+    simulation = create(
+        scene(
+            size=[length, length], resolution=cells, liquid=liquid, wall="free-slip", physics={"gravity": [0.0, 0.0]}, surface_tension=WATER
+        )
+    )
+    position = simulation.particles.position.numpy()
+    x, y = position[:, 0].copy(), position[:, 1].copy()
+    position[:, 0] -= height * np.sin(k * x) * np.cosh(k * y) / math.sinh(k * depth)
+    position[:, 1] += height * np.cos(k * x) * np.sinh(k * y) / math.sinh(k * depth)
+    moved(simulation, position)
+    guess = math.sqrt(SIGMA * k**3 / RHO * math.tanh(k * depth))
+    at, shape = [], []
+    while simulation.time < 2.0 * 2.0 * math.pi / guess:
+        simulation.step(min(simulation.stable_dt(), times * capillary_step(simulation)))
+        at.append(simulation.time)
+        shape.append(float(np.cos(k * simulation.particles.position.numpy()[:, 0]).mean()))
+    return frequency(at, shape, guess)[0]
+
+
+def test_a_capillary_wave() -> None:
+    assert wave(32) == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.slow
+def test_capillary_waves_converge() -> None:
+    assert wave(64, 3.0) == pytest.approx(1.0, abs=0.012)
+    assert wave(32, 10.0) == pytest.approx(1.0, abs=0.05)  # the widest filter takes part of so short a wave
+
+
+def cap(angle: float, given: float) -> tuple[LiquidSimulation, float, float]:
+    """Return a drop on the floor that meets it at an angle, the height of its center of mass and the radius of its surface [m]."""
+    a = math.radians(angle)
+    radius = RADIUS * math.sqrt(0.5 * math.pi / (a - math.sin(a) * math.cos(a)))
+    side = 6.0 * RADIUS
+    liquid = [{"shape": "sphere", "center": [side / 2, -radius * math.cos(a)], "radius": radius}]
+    tension = WATER | {"contact_angle": given}
+    tables = {"wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}, "surface_tension": tension}
+    simulation = create(scene(size=[side, side / 2], resolution=96, liquid=liquid, **tables))
+    height = radius * (2.0 * math.sin(a) ** 3 / 3.0 / (a - math.sin(a) * math.cos(a)) - math.cos(a))
+    return simulation, height, radius
+
+
+@pytest.mark.parametrize("angle", [60.0, 90.0, 120.0])
+def test_a_drop_keeps_its_contact_angle(angle: float) -> None:
+    heights = {}
+    for given in (angle, 180.0 - angle if angle != 90.0 else 60.0):
+        simulation, height, _ = cap(angle, given)
+        advance(simulation, 1.0 * TIME, 2.0 * capillary_step(simulation))
+        heights[given] = float(simulation.particles.position.numpy()[:, 1].mean()) / height
+    kept, other = heights.values()
+    assert kept == pytest.approx(1.0, abs=0.05)
+    assert abs(other - 1.0) > 0.15
+
+
+def test_a_step_is_no_longer_than_the_filter_allows() -> None:
+    simulation = drop(16)
+    assert simulation.tension is not None
+    longest = simulation.tension.longest_step()
+    assert longest == simulation.tension._step_of(MOST_PASSES)
+    assert simulation.stable_dt() == longest > 6.0 * capillary_step(simulation)
+    assert any("surface tension: steps of at most" in note for note in simulation.notes())
+
+
+def test_without_the_table_there_is_none() -> None:
+    simulation = drop(8, surface_tension=None)
+    assert simulation.tension is None and simulation.projection.jump is None
+    assert "surface_energy" not in simulation.columns()
+    assert "surface_energy" in drop(8).columns()
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"surface_tension": {"coefficient": 0.0}}, "greater than 0"),
+        ({"surface_tension": {"coefficient": 0.1, "contact_angle": 181.0}}, "less than or equal to 180"),
+        ({"surface_tension": WATER, "pressure": {"surface": "voxel"}}, "ghost-fluid"),
+        ({"surface_tension": WATER, "pressure": {"model": "unilateral"}}, "incompressible"),
+    ],
+)
+def test_what_cannot_be_is_refused(tables: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])], **tables)
+
+
+def test_several_ranks_refuse_it() -> None:
+    model = scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])], surface_tension=WATER)
+    assert "surface_tension" in refusals(model)
+
+
+def test_a_full_box_has_no_surface() -> None:
+    simulation = create(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [1.0, 1.0])], surface_tension=WATER))
+    assert simulation.tension is None
+    assert simulation.step(1e-3)["max_speed"] < 1e-5
+
+
+def test_a_moving_solid_and_short_steps_are_taken_along() -> None:
+    motion = {"kind": "translation", "velocity": [0.1, 0.0]}
+    solid = [{"shape": "sphere", "center": [0.02, 0.01], "radius": 0.004, "motion": motion}]
+    liquid = [box([0.0, 0.0], [0.04, 0.01])]
+    simulation = create(scene(size=[0.04, 0.02], resolution=32, liquid=liquid, solid=solid, surface_tension=WATER, cfl=0.4))
+    rows = advance(simulation, 0.01)
+    assert simulation.projection.jump is not None and isinstance(simulation.projection.jump, wp.array)
+    assert max(row["max_speed"] for row in rows) < 0.4
