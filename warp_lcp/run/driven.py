@@ -11,7 +11,6 @@ from typing import Any, Self
 
 import numpy as np
 import warp as wp
-from pydantic import BaseModel
 
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.particle_simulation import ParticleSimulation
@@ -23,7 +22,7 @@ from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
 from warp_lcp.run.log import Value
 from warp_lcp.run.loop import RunLoop, RunRequest, running_scene
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.scene_file import SceneSource, load_scene
+from warp_lcp.scene.scene_file import SceneSource, load_scene, single_tables
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError, Part, Simulation, SimulationFailed
@@ -331,7 +330,7 @@ def _folder(folder: str | PathLike[str] | None) -> Path | None:
 
 def _overrides(scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Mapping[str, Any]) -> list[str]:
     """Return overrides as `load_scene` has them, those of `keys` with their tables found."""
-    tables = _tables(load_scene(scene)) if keys else {}
+    tables = single_tables(scene) if keys else {}
     given = dict(overrides or {})
     for key, value in keys.items():
         owners = [table for table, names in tables.items() if key in names]
@@ -341,15 +340,6 @@ def _overrides(scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Ma
             raise SceneError("Run", [KeyFault(key, which)])
         given[f"{owners[0]}.{key}"] = value
     return [f"{key}={_written(key, value)}" for key, value in given.items()]
-
-
-def _tables(scene: Scene) -> dict[str, set[str]]:
-    """Return the keys of each table of a scene of which there is one."""
-    return {
-        name: {field.alias or key for key, field in type(table).model_fields.items()}
-        for name, table in scene
-        if isinstance(table, BaseModel)
-    }
 
 
 def _written(key: str, value: Any) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import numpy as np
 import tomli_w
@@ -17,7 +17,7 @@ import tomli_w
 from warp_lcp.scene.scene import Scene, file_name
 from warp_lcp.scene.shapes import BUILTIN
 from warp_lcp.scene.simulator import Simulator, simulators
-from warp_lcp.scene.table import KeyFault, SceneError, validate, written
+from warp_lcp.scene.table import KeyFault, SceneError, Table, validate, written
 from warp_lcp.settings import nearest
 
 DEEPEST = 16  # tables and arrays in each other; a scene needs six
@@ -121,6 +121,21 @@ def scene_value(source: SceneSource, override: str) -> str:
         else:
             value = value.get(key) if isinstance(value, dict) else None
     return written(value)
+
+
+def single_tables(source: SceneSource) -> dict[str, set[str]]:
+    """Return the keys of each table of which a scene of its simulator has one at most, such as `domain`.
+
+    Raises:
+        SceneError: the file cannot be read, or names no simulator.
+    """
+    data, label, _, _ = _raw(source)
+    found = {}
+    for name, field in _scene_model(data, label).model_fields.items():
+        kinds = [kind for kind in (field.annotation, *get_args(field.annotation)) if isinstance(kind, type) and issubclass(kind, Table)]
+        if kinds and get_origin(field.annotation) is not list:
+            found[name] = {inner.alias or key for key, inner in kinds[0].model_fields.items()}
+    return found
 
 
 def check_shapes(scene: Scene, source: str) -> None:
