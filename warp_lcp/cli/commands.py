@@ -26,6 +26,7 @@ from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.run.check import check_memory, check_scene, start
 from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
 from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
+from warp_lcp.run.foretell import doubts, foretold
 from warp_lcp.run.interruption import Interrupted, Interruption
 from warp_lcp.run.launcher import default_folder, launcher_of
 from warp_lcp.run.loop import RunRequest
@@ -212,7 +213,10 @@ def check(
         _print_pairs(lines)
         if not force_memory:
             check_memory(loaded, chosen)
-            _print_pairs([("note", note) for note in start(loaded, chosen).notes()])
+            beginning = start(loaded, chosen)
+            _print_pairs([("note", note) for note in (*beginning.notes(), *doubts(loaded, beginning))])
+            if not calibrate:
+                _print_pairs(foretold(loaded, beginning))
         if not calibrate:
             return
         try:
@@ -220,6 +224,8 @@ def check(
         except (StepFailed, SimulationFailed) as error:
             _end(str(error), FAILED)
     _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
+    if not force_memory:
+        _print_pairs(foretold(loaded, beginning, seconds))
     if isinstance(loaded, ParticleScene):
         _print_pairs(loaded.model_plan(seconds))
 

@@ -448,7 +448,7 @@ class ParticleSimulation(ParticleFrames):
         settings, wanted = self.scene.particles, self.particles.arrays().keys()
         state = without_band(state, spacing, settings.seed)
         arrays, moved = resampled(
-            {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=spacing,
+            {name: np.asarray(state[name]) for name in wanted}, self.grid, self.admits, spacing=spacing,
             per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
         )  # fmt: skip
         self._assign(arrays)
@@ -509,7 +509,7 @@ class ParticleSimulation(ParticleFrames):
         row = totals_row(self.spray.with_own(totals), moved, self.particles.count + flying, self.grid.spacing)
         return row | {"interior_density": density, "spray": flying}
 
-    def _admits(self, points: np.ndarray) -> np.ndarray:
+    def admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m], shape (n, 3), a particle may be at."""
         i, j, k = np.clip(self.particles.cells_of(points), -1, self.grid.counts).T + 1
         return (self.boundary.base.numpy()[k, j, i] != wl.SOLID) & self.boundary.admits(points)
