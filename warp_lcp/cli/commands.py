@@ -50,7 +50,6 @@ app = typer.Typer(
     cls=Commands,
     help="Simulate scenes with complementarity solvers. Exit codes: 0 done, 1 the run failed or was stopped, 2 the input is wrong.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -82,6 +81,19 @@ ThreadsOption = Annotated[
     ),
 ]
 ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        tell(versions()["warp-lcp"])
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and end.")] = False,
+) -> None:
+    """Take what concerns no command."""
 
 
 def main() -> None:
