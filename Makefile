@@ -8,7 +8,7 @@ OUT ?= out/dam-break
 # Processes that run the tests.
 WORKERS ?= 2
 
-.PHONY: demo test check test-distributed emulated-cuda slow fuzz mutants docs wheel-check clean
+.PHONY: demo test check test-distributed emulated-cuda slow fuzz mutants docs wheel-check dist-check clean
 
 demo: $(VENV)/.run
 	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
@@ -68,6 +68,13 @@ wheel-check: $(VENV)/.dev
 	cd build/wheel-check && venv/bin/warp-lcp run hourglass-2d --out sand --set time.duration=0.01 --set domain.resolution=24
 	cp .ci/typed.py build/wheel-check
 	cd build/wheel-check && $(abspath $(BIN))/mypy --config-file= --python-executable venv/bin/python --strict --ignore-missing-imports typed.py
+
+# What a release uploads, in build/dist: sdist and wheel, whose description and names the package index must take.
+dist-check: $(VENV)/.dev
+	rm -rf build/dist
+	$(BIN)/python -m pip install --quiet --editable '.[publish]'
+	$(BIN)/python -m build --outdir build/dist
+	$(BIN)/twine check --strict build/dist/*
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

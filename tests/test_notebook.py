@@ -17,7 +17,11 @@ def load(name):
     return module
 
 
-TITLES = {"first-steps": ("First steps", 5), "inverse-problem": ("An obstacle from the shape of a membrane", 4)}  # and cells that print
+TITLES = {  # and cells that print
+    "first-steps": ("First steps", 5),
+    "driving-a-run": ("Driving a run", 4),
+    "inverse-problem": ("An obstacle from the shape of a membrane", 4),
+}
 
 
 @pytest.fixture(scope="module", params=TITLES)

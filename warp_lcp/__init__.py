@@ -1,6 +1,8 @@
 """Matrix-free solvers for large linear complementarity problems, as NVIDIA Warp kernels on CPU and CUDA."""
 
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
 
 from warp_lcp.gradients.vjp import Gradients, vjp
 from warp_lcp.linear_complementarity import linear_complementarity
@@ -49,12 +51,23 @@ from warp_lcp.solvers.registry import METHODS
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
+if TYPE_CHECKING:
+    from warp_lcp.run.driven import Run
+
 hear_kernels()
 
 try:
     __version__ = version("warp-lcp")
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
+
+
+def __getattr__(name: str) -> Any:
+    """Import what drives simulations when it is asked for: who solves problems needs none of it."""
+    if name == "Run":
+        return import_module("warp_lcp.run.driven").Run
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 __all__ = [
     "AIR",
@@ -96,6 +109,7 @@ __all__ = [
     "QuadraticProgram",
     "Recommendation",
     "Record",
+    "Run",
     "SolveResult",
     "SolveStatus",
     "SparseOperator",

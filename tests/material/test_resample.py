@@ -76,7 +76,7 @@ def test_a_simulation_goes_on(before, after, tables):
     notes = new.resample(old.state())
     assert notes[0].startswith(f"resampled from cells of {old.grid.spacing:.4g} m to {new.grid.spacing:.4g} m: {new.particles.count}")
     assert (new.time, new.step_count) == (old.time, old.step_count)
-    assert new._admits(new.particles.position.numpy().astype(np.float64)).mean() > 0.99
+    assert new.admits(new.particles.position.numpy().astype(np.float64)).mean() > 0.99
     at = new.particles.totals()
     assert at.mean_square_speed == pytest.approx(old.particles.totals().mean_square_speed, rel=0.05)
     np.testing.assert_allclose(at.center, old.particles.totals().center, atol=0.2 * max(old.grid.spacing, new.grid.spacing))

@@ -62,7 +62,7 @@ def test_frame_times_end_with_the_run():
         ({"time": {}}, "time.duration: is missing"),
         ({"time": 3}, "time = 3: must be a table"),
         ({"domain.resolution": 64.5}, "domain.resolution = 64.5: must be a whole number"),
-        ({"domain.wall": "sticky"}, "domain.wall = \"sticky\": must be 'separating' or 'free-slip'"),
+        ({"domain.wall": "glue"}, "domain.wall = \"glue\": must be 'separating', 'free-slip' or 'sticky'"),
         ({"domain.size": [1.6]}, "domain.size = [1.6]: must have at least 2 entries"),
         ({"domain.size": [1.6, -0.8]}, "domain.size[1] = -0.8: must be greater than 0"),
         ({"domain.size": [1.6, 0.83]}, "domain.size[1] = 0.83: must be a whole number of cells of 0.025 m; the nearest: 0.825 and 0.85"),

@@ -26,6 +26,7 @@ from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.run.check import check_memory, check_scene, start
 from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
 from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
+from warp_lcp.run.foretell import doubts, foretold
 from warp_lcp.run.interruption import Interrupted, Interruption
 from warp_lcp.run.launcher import default_folder, launcher_of
 from warp_lcp.run.loop import RunRequest
@@ -49,7 +50,6 @@ app = typer.Typer(
     cls=Commands,
     help="Simulate scenes with complementarity solvers. Exit codes: 0 done, 1 the run failed or was stopped, 2 the input is wrong.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -81,6 +81,19 @@ ThreadsOption = Annotated[
     ),
 ]
 ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        tell(versions()["warp-lcp"])
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and end.")] = False,
+) -> None:
+    """Take what concerns no command."""
 
 
 def main() -> None:
@@ -212,7 +225,10 @@ def check(
         _print_pairs(lines)
         if not force_memory:
             check_memory(loaded, chosen)
-            _print_pairs([("note", note) for note in start(loaded, chosen).notes()])
+            beginning = start(loaded, chosen)
+            _print_pairs([("note", note) for note in (*beginning.notes(), *doubts(loaded, beginning))])
+            if not calibrate:
+                _print_pairs(foretold(loaded, beginning))
         if not calibrate:
             return
         try:
@@ -220,6 +236,8 @@ def check(
         except (StepFailed, SimulationFailed) as error:
             _end(str(error), FAILED)
     _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
+    if not force_memory:
+        _print_pairs(foretold(loaded, beginning, seconds))
     if isinstance(loaded, ParticleScene):
         _print_pairs(loaded.model_plan(seconds))
 

@@ -172,7 +172,7 @@ def seed_materials(
     """
     key, materials = scene.materials()
     geometries = [material.to_geometry(folder, scene.dimension) for material in materials]
-    regions = [_region(geometry, boundary, grid.device) for geometry in geometries]
+    regions = [region_of(geometry, boundary, grid.device) for geometry in geometries]
     names = [f"{key}[{number}] ({material.shape})" for number, material in enumerate(materials)]
     notes: list[str] = []
     for name, geometry in zip(names, geometries, strict=True):
@@ -260,7 +260,7 @@ def start_band(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, fo
     """Put the material that particles need not carry into a band, and return its cells, bool of shape (nz, ny, nx); None: no band."""
     if band is None:
         return None
-    regions = [_region(material.to_geometry(folder, scene.dimension), boundary, grid.device) for material in scene.materials()[1]]
+    regions = [region_of(material.to_geometry(folder, scene.dimension), boundary, grid.device) for material in scene.materials()[1]]
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
     position, number = seed(grid, regions, open_cells, per_axis=1, jitter=0.0, random_seed=0)
     i, j, k = ((position / grid.spacing).astype(int) - np.array(grid.origin)).T
@@ -353,7 +353,7 @@ def _inside(geometry: Geometry, device: wp.Device) -> Callable[[np.ndarray], np.
     return lambda points: inside([geometry], points, device=device)
 
 
-def _region(geometry: Geometry, boundary: Boundary, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
+def region_of(geometry: Geometry, boundary: Boundary, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that tells which points lie in a geometry and outside solids."""
 
     def holds(points: np.ndarray) -> np.ndarray:

@@ -76,6 +76,7 @@ class ParticleSimulation(ParticleFrames):
     """
 
     shared = False  # whether others have parts of the grid
+    added = 0  # particles, by a program
     vicinity: Vicinity | None = None
 
     def __init__(
@@ -391,7 +392,8 @@ class ParticleSimulation(ParticleFrames):
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too."""
         flying = self.spray.particles.count
-        particles = self._particle_arrays() | ({"spray": np.array(flying)} if flying else {})
+        counts = {"spray": flying, "added": self.added}
+        particles = self._particle_arrays() | {name: np.array(count) for name, count in counts.items() if count}
         clock = {name: np.array(getattr(self, name)) for name in ("time", "step_count", "last_dt")}
         bodies = self.bodies.state() if self.bodies is not None else {}
         return clock | {"signature": signature(self.scene, self.grid)} | particles | self._fields() | bodies | box_of(self.grid)
@@ -405,7 +407,8 @@ class ParticleSimulation(ParticleFrames):
         state = self._on_this_grid(state)
         self.rearrangement.expect(state)
         expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
-        varies = bool(self.sources or self.outlets or self.band)
+        self.added = int(state.get("added", 0))
+        varies = bool(self.sources or self.outlets or self.band or self.added)
         check_state(state, expected, changing=[*self.particles.arrays()] if varies else [], solids_move=self.boundary.moves)
         self._assign(state, int(state.get("spray", 0)))
         self._take_fields(state)
@@ -445,7 +448,7 @@ class ParticleSimulation(ParticleFrames):
         settings, wanted = self.scene.particles, self.particles.arrays().keys()
         state = without_band(state, spacing, settings.seed)
         arrays, moved = resampled(
-            {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=spacing,
+            {name: np.asarray(state[name]) for name in wanted}, self.grid, self.admits, spacing=spacing,
             per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
         )  # fmt: skip
         self._assign(arrays)
@@ -454,6 +457,13 @@ class ParticleSimulation(ParticleFrames):
         self.particles.sort()
         self.mark()
         return resampling_notes(len(state["position"]), self.particles.count, moved, spacing, self.grid)
+
+    def add(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Add particles between two steps; positions [m] and velocities [m/s] of shape (n, 3), where the material may be."""
+        self.particles.append(position, velocity)
+        self.added += len(position)
+        self._faces_know = False
+        self.particles.sort()
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
@@ -499,7 +509,7 @@ class ParticleSimulation(ParticleFrames):
         row = totals_row(self.spray.with_own(totals), moved, self.particles.count + flying, self.grid.spacing)
         return row | {"interior_density": density, "spray": flying}
 
-    def _admits(self, points: np.ndarray) -> np.ndarray:
+    def admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m], shape (n, 3), a particle may be at."""
         i, j, k = np.clip(self.particles.cells_of(points), -1, self.grid.counts).T + 1
         return (self.boundary.base.numpy()[k, j, i] != wl.SOLID) & self.boundary.admits(points)

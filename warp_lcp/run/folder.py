@@ -125,6 +125,8 @@ class RunFolder:
         SceneError: a mesh file of the scene cannot be read.
     """
 
+    keeps = True  # what a run shows
+
     def __init__(self, path: Path, scene: Scene, collective: Collective | None = None) -> None:
         """Look at a folder, there or not; nothing is written yet."""
         self.path, self.scene, self.log = path, scene, path / "log.csv"

@@ -9,7 +9,7 @@ from pathlib import Path
 from warp_lcp.run.continuation import RESOLUTION
 from warp_lcp.run.folder import SCENE, OutputError, holds_run, read_record, recorded_keys
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.scene_file import keys, load_scene, override_key, override_value, scene_value
+from warp_lcp.scene.scene_file import SceneSource, keys, load_scene, override_key, override_value, scene_value
 
 Overrides = list[dict[str, str]]  # `set`: what was given, `file`: the value that the scene's file had, if that was looked at
 
@@ -29,7 +29,7 @@ class GivenScene:
     kept: list[str] = field(default_factory=list)
 
 
-def given_scene(source: str, overrides: Sequence[str]) -> GivenScene:
+def given_scene(source: SceneSource, overrides: Sequence[str]) -> GivenScene:
     """Return the scene of a new run.
 
     Args:
@@ -80,7 +80,7 @@ def _edited(entry: Mapping[str, str], source: str) -> bool:
     return "file" in entry and scene_value(source, entry["set"]) not in (entry["file"], override_value(entry["set"]))
 
 
-def _noted(source: str, overrides: Sequence[str]) -> Overrides:
+def _noted(source: SceneSource, overrides: Sequence[str]) -> Overrides:
     return [{"set": override, "file": scene_value(source, override)} for override in overrides]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import time as clock
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,7 @@ from warp_lcp.run.devices import Engine
 from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
 from warp_lcp.run.interruption import Interrupted
 from warp_lcp.run.log import Log, Value
+from warp_lcp.run.no_folder import NoFolder
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer, missed, residual_of
@@ -57,7 +58,7 @@ class RunRequest:
 
     Args:
         scene: what to simulate, the same on all ranks.
-        out: the run's folder, which all ranks see.
+        out: the run's folder, which all ranks see; None: nothing is written.
         device: a Warp device, such as `cuda:0`; of this rank.
         overrides: by which the scene differs from its file, for run.json, see `warp_lcp.run.given_scene`.
         last_frame: end after this frame; the scene's last one without it.
@@ -68,7 +69,7 @@ class RunRequest:
     """
 
     scene: Scene
-    out: Path
+    out: Path | None
     device: str = "cpu"
     overrides: Sequence[dict[str, str]] = ()
     last_frame: int | None = None
@@ -88,12 +89,37 @@ def run_scene(
 ) -> RunRecord:
     """Simulate a scene into a folder; collective where ranks share the run.
 
+    Arguments, what it returns and what it raises are those of `running_scene`.
+    """
+    running = running_scene(request, observer=observer, stop=stop, profile=profile, collective=collective)
+    while True:
+        try:
+            next(running)
+        except StopIteration as end:
+            return cast(RunRecord, end.value)
+
+
+def running_scene(
+    request: RunRequest,
+    *,
+    observer: Observer,
+    stop: Callable[[], bool | str] = lambda: False,
+    profile: Profile | None = None,
+    collective: Collective | None = None,
+) -> Generator[RunLoop, None, RunRecord]:
+    """Simulate a scene as far as its frames are asked for; collective where ranks share the run.
+
+    Between frames the caller may change the simulation. Once the generator is closed, the run ends as one that was stopped.
+
     Args:
         request: what is asked for.
         observer: learns of every step.
         stop: asked after every step; True, or what it is interrupted by, ends the run with a checkpoint, on any rank.
         profile: measures the run's stages; written to profile.json at the end.
         collective: of the ranks that share the run; None: this process has it alone.
+
+    Yields:
+        The loop before it begins, and again at each frame of this run, with the simulation as the frame shows it.
 
     Returns:
         How the run ended, as in run.json.
@@ -111,7 +137,7 @@ def run_scene(
             check_ranks(scene)
         if not request.force_memory:
             check_memory(scene, request.device, share=share)
-    folder = RunFolder(request.out, scene, collective)
+    folder: RunFolder = NoFolder(scene) if request.out is None else RunFolder(request.out, scene, collective)
     record = RunRecord(scene.scene.name, scene.scene.simulator, request.device, overrides=list(request.overrides))
     if collective is not None:
         record.engine, record.ranks = Engine.PETSC.value, collective.ranks.size
@@ -134,9 +160,10 @@ def run_scene(
         for change in record.changed:
             observer.note(f"changed: {change}")
         checkpoint = continued.checkpoint if continued else None
-        run = Run(simulation, folder, record, observer, profile)
+        run = RunLoop(simulation, folder, record, observer, profile)
         with profile.kernels_apart() if profile else nullcontext():
-            return run.execute(request.last_frame, stop, resumed=checkpoint is not None)
+            yield run
+            return (yield from run.execute(request.last_frame, stop, resumed=checkpoint is not None))
 
 
 def _simulation(
@@ -190,7 +217,7 @@ def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more
     simulation.record = ProblemFolder(folder, more=more).write
 
 
-class Run:
+class RunLoop:
     """A simulation on its way through its frames.
 
     Args:
@@ -226,8 +253,8 @@ class Run:
         self._checkpointed: int | None = None  # the newest checkpoint's step
         self._checkpoint_time = clock.monotonic()
 
-    def execute(self, last_frame: int | None, stop: Callable[[], bool | str], *, resumed: bool) -> RunRecord:
-        """Run to the last frame, and write in run.json how that ended, whatever happened."""
+    def execute(self, last_frame: int | None, stop: Callable[[], bool | str], *, resumed: bool) -> Generator[RunLoop, None, RunRecord]:
+        """Run from frame to frame to the last, and write in run.json how that ended, whatever happened."""
         count = self.time.frame_count
         last = count if last_frame is None else min(last_frame, count)
         start = self._frame()
@@ -238,7 +265,10 @@ class Run:
                 log = stack.enter_context(closing(self._resume(start) if resumed else self._start(last, start)))
                 self._open_tables(stack, self._first_step if resumed else None)
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
-                stopped = self._advance(log, last, stop)
+                try:
+                    stopped = yield from self._advance(log, last, stop, resumed=resumed)
+                except GeneratorExit:  # nobody asks for more frames; the state is that of the last one
+                    stopped = f"left by its program after frame {self._frames_done()}"
                 self._write_checkpoint(log)
             self.record.status = "stopped" if stopped else "finished"
             self.record.reason = stopped or f"frame {last} of {count} reached"
@@ -262,6 +292,8 @@ class Run:
         return self.record
 
     def _check_space(self, last: int, frame: list[Part]) -> None:
+        if not self.folder.keeps:
+            return
         frames = max(0, last - self._frames_done() + 1)
         state = sum(array.nbytes for array in self.simulation.state().values())
         states = self.output.checkpoints_kept + 1  # the one being written too
@@ -301,9 +333,11 @@ class Run:
     def _columns(self) -> tuple[str, ...]:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")
 
-    def _advance(self, log: Log, last: int, stop: Callable[[], bool | str]) -> str:
+    def _advance(self, log: Log, last: int, stop: Callable[[], bool | str], *, resumed: bool) -> Generator[RunLoop, None, str]:
         """Step until the last frame is written; return why the run stopped before, "" if it did not."""
         frame = self._frames_done() + 1
+        if not resumed:
+            yield self
         while frame <= last:
             row = self._step(self.time.frame_time(frame))
             log.append(row)
@@ -315,6 +349,7 @@ class Run:
             self.writer.check()
             if self._frames_done() >= frame:
                 self._write_frame(frame, last, self._frame())
+                yield self
                 frame += 1
             if self._checkpoint_is_due():
                 self._write_checkpoint(log, beside=True)
@@ -355,7 +390,7 @@ class Run:
     def _frame(self) -> list[Part]:
         """Return what the scene wants to see of the simulation now."""
         output = self.output
-        if not (output.particles or output.grid or output.surface or output.volume or self._has_bodies):
+        if not self.folder.keeps or not (output.particles or output.grid or output.surface or output.volume or self._has_bodies):
             return []
         wanted = {Points: output.particles, Cells: output.grid, Surface: True, Volume: True}
         with self.watch.stage("frames"):
@@ -380,7 +415,7 @@ class Run:
             beside: the run goes on meanwhile.
         """
         step = self.simulation.step_count
-        if self._checkpointed == step:
+        if self._checkpointed == step or not self.folder.keeps:
             return
         files: list[Path] = []
         with self.watch.stage("checkpoints"):

@@ -9,19 +9,23 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
+import numpy as np
 import tomli_w
 
 from warp_lcp.scene.scene import Scene, file_name
 from warp_lcp.scene.shapes import BUILTIN
 from warp_lcp.scene.simulator import Simulator, simulators
-from warp_lcp.scene.table import KeyFault, SceneError, validate, written
+from warp_lcp.scene.table import KeyFault, SceneError, Table, validate, written
 from warp_lcp.settings import nearest
 
 DEEPEST = 16  # tables and arrays in each other; a scene needs six
 MOST_TABLES = 10_000  # in an array of them, such as [[liquid]]: each is a shape whose distances are taken by itself
+GIVEN = "the scene given"  # to Python as tables
 LARGEST = 1e18  # of a number: its square is a float32, and sums of cubes are float64
+
+SceneSource = str | Path | Mapping[str, Any] | Scene  # a file, the name of a built-in scene, the tables of a file, a scene
 
 HEADER = "# The scene as it ran: defaults filled in, overrides applied, paths absolute.\n"
 
@@ -45,29 +49,53 @@ def installed_simulators() -> dict[str, Simulator]:
         raise SceneError("warp-lcp", [problem]) from error
 
 
-def load_scene(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scene:
+def load_scene(source: SceneSource, overrides: Sequence[str] = ()) -> Scene:
     """Return a scene, checked, with absolute paths: the class is the `scene_model` of its simulator.
 
     Args:
-        path_or_name: a TOML file, or the name of a built-in scene.
+        source: a TOML file, the name of a built-in scene, tables as such a file has them, or a scene.
         overrides: `section.key=value` with values as in TOML (bare words are text); `liquid.0.max=[1, 1]` reaches into an array of tables.
 
     Raises:
         SceneError: listing everything that is wrong.
     """
-    file = _find(str(path_or_name))
-    source = str(path_or_name)
-    data = _parse(file, source)
+    data, label, folder, name = _raw(source)
     for override in overrides:
-        _override(data, override, source)
-    _refuse_extremes(data, source)
-    _resolve_paths(data, Path.cwd() if source in built_in_scenes() else Path(source).resolve().parent)
-    model = _scene_model(data, source)
+        _override(data, override, label)
+    _refuse_extremes(data, label)
+    _resolve_paths(data, folder)
+    model = _scene_model(data, label)
     about = data["scene"]
-    data["scene"] = {**about, "name": about.get("name") or file_name(file.name.removesuffix(".toml"))}
-    scene = validate(model, data, source)
-    _find_meshes(scene, source)
+    data["scene"] = {**about, "name": about.get("name") or name}
+    scene = validate(model, data, label)
+    _find_meshes(scene, label)
     return scene
+
+
+def _raw(source: SceneSource) -> tuple[dict[str, Any], str, Path, str]:
+    """Return a scene's tables, what messages call it, the folder that its files are relative to, and its name where it has none."""
+    if isinstance(source, Scene):
+        source = source.model_dump(by_alias=True, exclude_none=True)
+    if isinstance(source, Mapping):
+        return _plain(source), GIVEN, Path.cwd(), "scene"
+    if not isinstance(source, (str, Path)):
+        message = "must be a scene file, the name of a built-in scene, a dict of its tables or a Scene"
+        raise SceneError(GIVEN, [KeyFault("", message, type(source).__name__)])
+    label = str(source)
+    file = _find(label)
+    folder = Path.cwd() if label in built_in_scenes() else Path(label).resolve().parent
+    return _parse(file, label), label, folder, file_name(file.name.removesuffix(".toml"))
+
+
+def _plain(value: Any) -> Any:
+    """Return tables and arrays as a TOML file would give them, so that no caller's object is changed."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    return str(value) if isinstance(value, Path) else value
 
 
 def override_key(override: str) -> str:
@@ -80,19 +108,34 @@ def override_value(override: str) -> str:
     return written(_value(override.partition("=")[2].strip()))
 
 
-def scene_value(path_or_name: str, override: str) -> str:
+def scene_value(source: SceneSource, override: str) -> str:
     """Return the value that a scene's file has where an override sets one, in words; `null` if there is none.
 
     Raises:
         SceneError: the file cannot be read.
     """
-    value: Any = _parse(_find(path_or_name), path_or_name)
+    value: Any = _raw(source)[0]
     for key in override_key(override).split("."):
         if isinstance(value, list) and key.isdecimal() and int(key) < len(value):
             value = value[int(key)]
         else:
             value = value.get(key) if isinstance(value, dict) else None
     return written(value)
+
+
+def single_tables(source: SceneSource) -> dict[str, set[str]]:
+    """Return the keys of each table of which a scene of its simulator has one at most, such as `domain`.
+
+    Raises:
+        SceneError: the file cannot be read, or names no simulator.
+    """
+    data, label, _, _ = _raw(source)
+    found = {}
+    for name, field in _scene_model(data, label).model_fields.items():
+        kinds = [kind for kind in (field.annotation, *get_args(field.annotation)) if isinstance(kind, type) and issubclass(kind, Table)]
+        if kinds and get_origin(field.annotation) is not list:
+            found[name] = {inner.alias or key for key, inner in kinds[0].model_fields.items()}
+    return found
 
 
 def check_shapes(scene: Scene, source: str) -> None:

@@ -1,0 +1,98 @@
+"""What `check` foretells of a run, against the run: steps and bytes; and the doubts that it has about scenes."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from small_runs import run_into
+from warp_lcp.cli.commands import app
+from warp_lcp.grid.triangle_mesh import builtin_mesh
+from warp_lcp.run.check import start
+from warp_lcp.run.foretell import doubts, expected_bytes, expected_steps, foretold
+from warp_lcp.scene.scene_file import dump_scene, load_scene
+
+FACTOR = 1.5
+POOL = {
+    "scene": {"simulator": "fluids"},
+    "time": {"duration": 0.2},
+    "domain": {"size": [1.0, 0.5], "resolution": 24},
+    "liquid": [{"shape": "box", "min": [0.0, 0.0], "max": [1.0, 0.2]}],
+}
+
+
+def told(**tables):
+    scene = load_scene(POOL | tables)
+    return list(doubts(scene, start(scene, "cpu")))
+
+
+@pytest.mark.parametrize("name", ["dam-break-2d", "splash-in-circle", "tap-and-drain", "column-collapse-2d"])
+def test_steps_and_bytes_are_those_of_the_run(name: str, tmp_path: Path) -> None:
+    scene = load_scene(name, ["domain.resolution=32"])
+    simulation = start(scene, "cpu")
+    steps, size = expected_steps(scene, simulation), expected_bytes(scene, simulation, expected_steps(scene, simulation))
+    record = run_into(scene, tmp_path / "run")
+    taken = sum(file.stat().st_size for file in (tmp_path / "run").rglob("*") if file.is_file())
+    assert 1 / FACTOR < steps / record.steps < FACTOR
+    assert 1 / FACTOR < size / taken < FACTOR
+
+
+def test_twice_the_cells_take_more_steps_and_more_frames_take_more_bytes() -> None:
+    coarse, fine, often = (
+        load_scene("dam-break-2d", [o]) for o in ("domain.resolution=64", "domain.resolution=256", "time.frames_per_second=300")
+    )
+    steps = [expected_steps(scene, start(scene, "cpu")) for scene in (coarse, fine, often)]
+    assert steps[1] > 2 * steps[0]
+    assert steps[2] >= often.time.frame_count
+    size = [expected_bytes(scene, start(scene, "cpu"), 0) for scene in (load_scene("dam-break-2d"), often)]
+    assert size[1] > 4 * size[0]
+
+
+def test_a_measured_step_makes_the_whole_run() -> None:
+    scene = load_scene(POOL)
+    lines = dict(foretold(scene, start(scene, "cpu"), seconds=2.0))
+    assert "as measured, 2e+03 ms a step" in lines["whole run"]
+    assert set(lines) == {"steps", "whole run", "disk"}
+
+
+def test_a_usual_scene_raises_no_doubts() -> None:
+    assert told() == []
+    for name in ("dam-break-2d", "splash-in-circle", "hourglass-2d", "floating-bodies-2d"):
+        scene = load_scene(name)
+        assert list(doubts(scene, start(scene, "cpu"))) == []
+
+
+def test_what_was_hardly_meant_is_told() -> None:
+    assert told(time={"duration": 500.0}) == ["15,000 frames: time.duration 500 s at time.frames_per_second 30; were so many meant?"]
+    half = told(solid=[{"shape": "box", "min": [0.0, 0.0], "max": [0.625, 0.5]}])
+    assert half == ["liquid[0] (box): 62 % of it lies inside solids, and is left out"]
+    tiny = {"shape": "sphere", "center": [0.5, 0.1], "radius": 0.045, "invert": True}
+    full = told(solid=[tiny])
+    assert full[0].startswith("solids fill 9")
+    assert "invert = true" in full[0]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda v, t: (v, t[:, ::-1]), "the mesh was inside out; turned"),
+        (lambda v, t: (v, [*t[:9, ::-1], *t[9:]]), "turned 9 of 9216 triangles that disagreed"),
+        (lambda v, t: (v, [*t, *t[:20]]), "dropped 20 repeated triangles"),
+        (lambda v, t: ([*v, *(0.9 * v + [0.3, 0.0, 0.0])], [*t, *(t + len(v))]), "triangles cross others"),
+    ],
+)
+def test_what_is_wrong_with_a_mesh_is_told_with_its_repair(spoil, words, tmp_path: Path) -> None:
+    """Flipped and repeated triangles are repaired by the run itself; surfaces that cross themselves have a rule."""
+    torus = builtin_mesh("torus")
+    vertices, triangles = spoil(torus.vertices, torus.triangles)
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in (map(float, p) for p in vertices)]
+    lines += ["f " + " ".join(str(int(n) + 1) for n in triangle) for triangle in triangles]
+    (tmp_path / "torus.obj").write_text("\n".join(lines) + "\n")
+    mesh = {"shape": "mesh", "file": str(tmp_path / "torus.obj"), "scale": 0.4, "translate": [0.6, 0.3, 0.5]}
+    liquid = {"shape": "box", "min": [0.0, 0.0, 0.0], "max": [0.2, 0.6, 1.0]}
+    scene = load_scene(POOL | {"domain": {"size": [1.0, 1.0, 1.0], "resolution": 16}, "liquid": [liquid], "solid": [mesh]})
+    (tmp_path / "scene.toml").write_text(dump_scene(scene))
+    outcome = CliRunner().invoke(app, ["check", str(tmp_path / "scene.toml"), "--device", "cpu"])
+    assert outcome.exit_code == 0, outcome.output
+    assert any(words in line for line in outcome.output.splitlines() if line.startswith("note"))
+    assert "whole run" in outcome.output

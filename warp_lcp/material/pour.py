@@ -1,0 +1,41 @@
+"""Material that a program adds between two steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import warp_lcp as wl
+from warp_lcp.grid.particles import seed
+from warp_lcp.material.particle_assembly import region_of
+from warp_lcp.material.particle_scene import MaterialProperties
+from warp_lcp.material.particle_simulation import ParticleSimulation
+
+
+def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -> int:
+    """Fill what of a shape is empty, outside solids and cells of material, and return how many particles that took.
+
+    Args:
+        simulation: between two steps (updated).
+        shape: an entry of a scene's `[[liquid]]` or `[[sand]]`, with the velocity of what comes.
+        name: of the shape, for messages.
+
+    Raises:
+        ValueError: the shape holds no empty cell, or the grid covers but a part of the domain.
+    """
+    grid, settings, boundary = simulation.grid, simulation.scene.particles, simulation.boundary
+    if grid.whole is not None:
+        raise ValueError(f"{name}: the grid follows the material and need not reach there; give the scene domain.follow = false")
+    cells = grid.interior(simulation.own_state()["cells"])
+    free = (cells == wl.AIR) & (grid.interior(boundary.base.numpy()) != wl.SOLID)
+    i, j, k = simulation.particles.cells_of(simulation.particles.position.numpy()).T
+    free[k, j, i] = False  # where material has gone since the last solve
+    region = region_of(shape.to_geometry(Path.cwd(), grid.dimension), boundary, grid.device)
+    points, _ = seed(grid, [region], free, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed)
+    if not len(points):
+        raise ValueError(f"{name} holds no empty cell: it lies in solids, in material or outside the domain, or is too small")
+    velocity = np.zeros((len(points), 3), dtype=np.float32)
+    velocity[:, : grid.dimension] = shape.velocity or 0.0
+    simulation.add(points, velocity)
+    return len(points)

@@ -1,0 +1,353 @@
+"""A run that a Python program drives: frame by frame, with a hand in every step."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.particles import Particles
+from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.material.pour import pour
+from warp_lcp.rigid.body import RigidBody
+from warp_lcp.run.devices import choose_device
+from warp_lcp.run.folder import RunRecord
+from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
+from warp_lcp.run.log import Value
+from warp_lcp.run.loop import RunLoop, RunRequest, running_scene
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import SceneSource, load_scene, single_tables
+from warp_lcp.scene.table import KeyFault, SceneError
+from warp_lcp.settings import nearest
+from warp_lcp.simulation import InputError, Part, Simulation, SimulationFailed
+
+
+class RunError(InputError):
+    """What a program asks of its run is wrong. The message names the argument and says what is allowed."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a run shows at the time of a frame: the simulation's own arrays, without copies, as they are until the run goes on.
+
+    Args:
+        index: number of the frame, 0 at the start.
+        time: of the simulation [s].
+        row: the last step's row of the log, by column; empty before the first step.
+        simulation: itself.
+    """
+
+    index: int
+    time: float
+    row: Mapping[str, Value]
+    simulation: Simulation
+
+    @property
+    def particles(self) -> Particles:
+        """The particles' `position` [m], `velocity` [m/s] and `affine`: Warp arrays, wp.vec3, shape (count,). Spray is not among them."""
+        return _of_particles(self.simulation).particles
+
+    @property
+    def bodies(self) -> Sequence[RigidBody]:
+        """The rigid bodies in the order of their solids: `position` [m], `velocity`, `rotation`, `angular_velocity`, `momentum`."""
+        bodies = _of_particles(self.simulation).bodies
+        return bodies.bodies if bodies is not None else ()
+
+    @property
+    def fields(self) -> dict[str, wp.array]:
+        """The fields on the faces of the grid, `velocity_x` to `velocity_z` [m/s], shape (nz + 2, ny + 2, nx + 2): a ring of cells around.
+
+        Entry [k, j, i] is of the lower face of cell (i - 1, j - 1, k - 1) along the axis.
+        """
+        faces = _of_particles(self.simulation).velocity
+        return {f"velocity_{axis}": field for axis, field in zip("xyz", faces, strict=False)}
+
+    def parts(self) -> list[Part]:
+        """Return copies of what a frame's files show: points, cells with their pressure, surfaces and volumes if the scene wants them."""
+        return self.simulation.frame()
+
+
+class Run:
+    """Run a scene from Python: `for frame in run` takes the steps from one frame to the next.
+
+    The steps are those of `warp-lcp run`, and with a `folder` so are log, frames and checkpoints, bit for bit. Once the loop is left, with
+    `break` or by an error in it, the run ends as one that was stopped, with a checkpoint that `Run.resume` goes on from.
+
+    Args:
+        scene: a scene file, the name of a built-in scene, its tables as a dict, or a Scene.
+        folder: takes log, frames and checkpoints; None: nothing is written.
+        device: a Warp device; a GPU where there is one unless given.
+        frames: end after this frame; the scene's last one unless given.
+        force: delete the run that is in the folder.
+        on_step: called after each step, as by `on_step`.
+        overrides: keys of the scene with other values, such as {"domain.resolution": 96, "liquid.0.max": [1, 1]}.
+        keys: the same for keys that only one table has, without its name: `resolution=96`.
+
+    Attributes:
+        scene: what runs.
+        record: how the run goes, as in run.json.
+
+    Raises:
+        SceneError: the scene is wrong; the message lists everything that is.
+        RunError: an argument is wrong.
+        DeviceError: there is no such device.
+    """
+
+    def __init__(
+        self,
+        scene: SceneSource,
+        *,
+        folder: str | PathLike[str] | None = None,
+        device: str | None = None,
+        frames: int | None = None,
+        force: bool = False,
+        on_step: Callable[[Run], object] | None = None,
+        overrides: Mapping[str, Any] | None = None,
+        **keys: Any,
+    ) -> None:
+        """Load the scene; nothing is built and nothing written before the first frame is asked for."""
+        given = given_scene(scene, _overrides(scene, overrides, keys))
+        self._set_up(given, RunRequest(scene=given.scene, out=_folder(folder), force=force), device, frames, on_step)
+
+    @classmethod
+    def resume(
+        cls,
+        folder: str | PathLike[str],
+        *,
+        device: str | None = None,
+        frames: int | None = None,
+        on_step: Callable[[Run], object] | None = None,
+        overrides: Mapping[str, Any] | None = None,
+        **keys: Any,
+    ) -> Self:
+        """Return the run of a folder, to go on from its newest checkpoint with the next frame; arguments as of `Run`.
+
+        What callbacks have changed is in the checkpoint, but for gravity: that is the scene's again.
+
+        Raises:
+            OutputError: there is no run in the folder.
+        """
+        path, run = _folder(folder), cls.__new__(cls)
+        if path is None:
+            raise RunError("folder: must be that of a run, which None is not")
+        scene = path / "scene.toml"
+        given = scene_to_resume(path, None, _overrides(scene, overrides, keys) if overrides or keys else ())
+        run._set_up(given, RunRequest(scene=given.scene, out=path, resume=True), device, frames, on_step)
+        return run
+
+    def _set_up(
+        self, given: GivenScene, request: RunRequest, device: str | None, frames: int | None, on_step: Callable[[Run], object] | None
+    ) -> None:
+        if frames is not None and (not isinstance(frames, int) or isinstance(frames, bool) or frames < 0):
+            raise RunError(f"frames = {frames!r}: must be a whole number of at least 0, or None")
+        self.scene: Scene = given.scene
+        self.row: Mapping[str, Value] = {}
+        self.notes: list[str] = []
+        self._request = replace(request, device=choose_device(device), overrides=given.overrides, last_frame=frames)
+        self._callbacks: list[Callable[[Run], object]] = []
+        self._stopped, self._used, self._loop, self._index = "", False, None, -1
+        self.record: RunRecord | None = None
+        if on_step is not None:
+            self.on_step(on_step)
+
+    _loop: RunLoop | None
+
+    def on_step(self, callback: Callable[[Run], object]) -> Callable[[Run], object]:
+        """Have a function called with the run after each step, before the frame and the checkpoint of that time; may decorate it.
+
+        It may look (`run.row`, `run.time`, `run.simulation`), `push` a body, change `gravity`, `add` material and `stop` the run. An error
+        that it raises ends the run.
+
+        Raises:
+            RunError: it cannot be called.
+        """
+        if not callable(callback):
+            raise RunError(f"on_step: must be a function of the run, not {type(callback).__name__}")
+        self._callbacks.append(callback)
+        return callback
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Simulate, and yield each frame when its time is reached.
+
+        Raises:
+            OutputError: the folder cannot take the run.
+            SceneError: the scene cannot be simulated.
+            SimulationFailed: the run has failed; the message is the reason in run.json.
+        """
+        if self._used:
+            raise RunError("this run has been driven already; Run.resume(folder) goes on, another Run begins anew")
+        self._used = True
+        running = running_scene(self._request, observer=_Ears(self), stop=lambda: self._stopped)
+        try:
+            self._loop = next(running)
+            self.record = self._loop.record
+            for _ in running:
+                yield Frame(self._index, self.simulation.time, self.row, self.simulation)
+        finally:
+            running.close()
+        if self.record.status == "failed":
+            raise SimulationFailed(self.record.reason)
+
+    def finish(self) -> RunRecord:
+        """Run to the last frame, and return how the run ended.
+
+        Raises:
+            SimulationFailed: the run has failed.
+        """
+        for _ in self:
+            pass
+        assert self.record is not None
+        return self.record
+
+    @property
+    def simulation(self) -> Simulation:
+        """The simulation, from the first frame on.
+
+        Raises:
+            RunError: the run has not begun.
+        """
+        if self._loop is None:
+            raise RunError("the run has not begun: its simulation is there from the first frame on")
+        return self._loop.simulation
+
+    @property
+    def time(self) -> float:
+        """Time of the simulation [s]."""
+        return self.simulation.time
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """Gravity [m/s^2], a copy, shape (3,); to be set with as many numbers as the scene has dimensions.
+
+        Bounds that the pressure of liquids takes from gravity, as for what rests on shelves of particles, stay those of the scene's.
+        """
+        return _of_particles(self.simulation).gravity.copy()
+
+    @gravity.setter
+    def gravity(self, value: Sequence[float]) -> None:
+        _of_particles(self.simulation).gravity[:] = self._vector("gravity", value)
+
+    def push(self, body: int, impulse: Sequence[float], *, at: Sequence[float] | None = None) -> None:
+        """Give a rigid body an impulse.
+
+        Args:
+            body: its number, counted from 0 in the order of the scene's solids.
+            impulse: [N s; N s/m in 2-D].
+            at: the point that it acts on [m]; the center of mass unless given.
+
+        Raises:
+            RunError: there is no such body, or a vector is not finite or of another dimension.
+        """
+        bodies = _of_particles(self.simulation).bodies
+        there = bodies.bodies if bodies is not None else []
+        if not isinstance(body, (int, np.integer)) or not 0 <= body < len(there):
+            raise RunError(f"body = {body!r}: " + (f"must be from 0 to {len(there) - 1}" if there else "the scene has no rigid bodies"))
+        pushed, given = there[body], self._vector("impulse", impulse)
+        arm = np.zeros(3) if at is None else self._vector("at", at) - pushed.position
+        pushed.push(np.concatenate([given, np.cross(arm, given)]))
+
+    def add(self, **shape: Any) -> int:
+        """Add material at rest or with a `velocity`, where there is none and no solid; return how many particles that took.
+
+        Args:
+            shape: the keys of an entry of the scene's `[[liquid]]` or `[[sand]]`, such as shape="box", min=[0, 1], max=[1, 2].
+
+        Raises:
+            SceneError: a key is wrong.
+            RunError: there is no room.
+        """
+        simulation = _of_particles(self.simulation)
+        table = simulation.scene.materials()[0]
+        data = self.scene.model_dump(by_alias=True, exclude_none=True)
+        data[table] = [*data.get(table, []), shape]
+        entries = load_scene(data).materials()[1]  # type: ignore[attr-defined]
+        try:
+            return pour(simulation, entries[-1], f"{table}[{len(entries) - 1}] ({entries[-1].shape})")
+        except ValueError as error:
+            raise RunError(f"add: {error}") from error
+
+    def stop(self) -> None:
+        """End the run after the step that is being taken, with a checkpoint."""
+        self._stopped = "its program"
+
+    def _vector(self, name: str, value: Sequence[float]) -> np.ndarray:
+        """Return a vector of the scene's dimension [as given], shape (3,)."""
+        try:
+            given = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            given = np.zeros(0)
+        if given.shape != (self.scene.dimension,) or not np.isfinite(given).all():
+            raise RunError(f"{name} = {value!r}: must be {self.scene.dimension} finite numbers")
+        return np.array([*given, 0.0][:3])
+
+
+class _Ears:
+    """The observer of a driven run.
+
+    Args:
+        run: that hears of its steps.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def note(self, text: str) -> None:
+        """Keep a remark."""
+        self._run.notes.append(text)
+
+    def start(self, time: float, end: float) -> None:
+        """Do nothing."""
+
+    def step(self, row: Mapping[str, Value]) -> None:
+        """Hand the step on to the callbacks."""
+        self._run.row = row
+        for callback in self._run._callbacks:
+            callback(self._run)
+
+    def frame(self, index: int, last: int) -> None:
+        """Remember the number of the frame that is due."""
+        self._run._index = index
+
+
+def _of_particles(simulation: Simulation) -> ParticleSimulation:
+    if not isinstance(simulation, ParticleSimulation):
+        raise RunError(f"{type(simulation).__name__} has no particles; its `state()` and `frame()` have what it shows")
+    return simulation
+
+
+def _folder(folder: str | PathLike[str] | None) -> Path | None:
+    try:
+        return None if folder is None else Path(folder)
+    except TypeError as error:
+        raise RunError(f"folder = {folder!r}: must be a path, or None for none") from error
+
+
+def _overrides(scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Mapping[str, Any]) -> list[str]:
+    """Return overrides as `load_scene` has them, those of `keys` with their tables found."""
+    tables = single_tables(scene) if keys else {}
+    given = dict(overrides or {})
+    for key, value in keys.items():
+        owners = [table for table, names in tables.items() if key in names]
+        if len(owners) != 1:
+            known = [name for names in tables.values() for name in names]
+            which = f"is a key of {', '.join(owners)}: name one in `overrides`" if owners else f"no such key; {nearest(key, known)}"
+            raise SceneError("Run", [KeyFault(key, which)])
+        given[f"{owners[0]}.{key}"] = value
+    return [f"{key}={_written(key, value)}" for key, value in given.items()]
+
+
+def _written(key: str, value: Any) -> str:
+    """Return a value as TOML."""
+    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value) if isinstance(value, Path) else value
+    try:
+        return json.dumps(plain, ensure_ascii=False)
+    except TypeError as error:
+        raise RunError(
+            f"{key}: a value of a scene is a number, a text, true, false or a list of them, not {type(value).__name__}"
+        ) from error
