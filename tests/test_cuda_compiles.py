@@ -17,6 +17,7 @@ import warp_lcp as wl
 from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.fluids.pressure import pressure_passes
 from warp_lcp.fluids.surface_tension_kernels import push_pass
+from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.granular.bodies_kernels import body_kernels
 from warp_lcp.granular.coupled import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
@@ -227,6 +228,8 @@ def modules_of_every_kernel(reals):
         distance_pass(endless)
     for variant in itertools.product((False, True), repeat=4):
         pressure_passes(*variant)
+    for dimension, *walls in itertools.product((2, 3), *((False, True),) * 3):
+        viscous_passes(dimension, *walls)
     for axis in (0, 1, 2, CENTERS):
         carry_pass(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):

@@ -17,7 +17,8 @@ from warp_lcp.rows.vectors import Reduction, rows_of
 RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
 RR = wp.constant(3)  # those of the decision to go on begin here, as elsewhere at the residual's square
 TOLERANCE, BEST, ITERATIONS, LIMIT = (wp.constant(int(RR) + i) for i in range(1, 5))  # the least norm so far; done, and the most allowed
-SLOTS = 8
+BY_ERROR = wp.constant(8)
+SLOTS = 9
 
 GROWTH = wp.constant(wp.float64(1e3))  # of the carried residual over its least: A or M is not positive definite to this precision
 
@@ -48,8 +49,9 @@ def next_iteration(scalars: wp.array(dtype=wp.float64), rr: int):
 
 @no_type_check
 @wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")
-def begin_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int), tolerance: wp.float64, limit: int):
+def begin_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int), tolerance: wp.float64, limit: int, by_error: int):
     """Before the first iteration: no old direction."""
+    scalars[BY_ERROR] = wp.float64(by_error)
     scalars[RZ_OLD] = wp.float64(0.0)
     going[0] = first_iteration(scalars, RR, tolerance, limit)
 
@@ -57,18 +59,11 @@ def begin_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)
 @no_type_check
 @wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")
 def end_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)):
-    """After an iteration: remember r.z for beta, and decide whether to go on."""
-    scalars[RZ_OLD] = scalars[RZ]
-    going[0] = next_iteration(scalars, RR)
-
-
-@no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")
-def end_by_error_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)):
-    """The same where r.z decides, of the residual before the iteration; the tolerance is relative to the first."""
-    if scalars[ITERATIONS] == wp.float64(0.0):
-        scalars[TOLERANCE] = scalars[TOLERANCE] * wp.sqrt(scalars[RZ])
-    scalars[RR] = scalars[RZ]
+    """After an iteration: remember r.z for beta, and decide whether to go on; by r.z of the iteration's start if that was asked for."""
+    if scalars[BY_ERROR] > wp.float64(0.0):
+        if scalars[ITERATIONS] == wp.float64(0.0):
+            scalars[TOLERANCE] = scalars[TOLERANCE] * wp.sqrt(scalars[RZ])
+        scalars[RR] = scalars[RZ]
     scalars[RZ_OLD] = scalars[RZ]
     going[0] = next_iteration(scalars, RR)
 
@@ -112,14 +107,9 @@ class ConjugateGradient:
         preconditioner: M. If it is recorded (has a `program`), so must A be, and an iteration is one program.
         weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1. Rows that a large shift makes stiff would
             else decide when to stop.
-        by_error: whether (r'M r)^(1/2) decides, the error's energy norm as M sees it, a step late; `solve` then takes a tolerance relative
-            to that of the start. Where a system is stiff a small residual may leave much of the error in what A hardly sees.
     """
 
-    def __init__(
-        self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None, by_error: bool = False
-    ) -> None:
-        self._end = end_by_error_kernel if by_error else end_kernel
+    def __init__(self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None) -> None:
         self._product, self._preconditioner, r = product, preconditioner, preconditioner.r
         self.device, self.x, self._p, self._q = r.device, zeros_like(r), zeros_like(r), zeros_like(r)
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=r.device)
@@ -130,8 +120,14 @@ class ConjugateGradient:
         self._direction = DIRECTION.bind(rows, z=preconditioner.z, **given)
         self._update = UPDATE.bind(rows, q=self._q, w=weight, x=self.x, r=r, out=self._reduction.partials, **given)
 
-    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
+    def solve(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> tuple[int, float]:
         """Iterate from x = 0 until ||r|| <= tolerance, ||r|| is no number, or it has grown by GROWTH over its least.
+
+        Args:
+            tolerance: of the norm.
+            max_iterations: the most.
+            by_error: whether (r'M r)^(1/2) decides, the error's energy norm as M sees it, a step late, by a tolerance relative to that of
+                the start. Where a system is stiff a small residual may leave much of the error in what A hardly sees.
 
         Returns:
             The iterations done and the norm of the carried residual, an estimate that rounding bounds from below.
@@ -139,7 +135,7 @@ class ConjugateGradient:
         self.x.zero_()
         self._p.zero_()
         self._q.zero_()  # A writes its own rows only
-        wp.launch(begin_kernel, 1, [self._scalars, self._going, tolerance, max_iterations], device=self.device)
+        wp.launch(begin_kernel, 1, [self._scalars, self._going, tolerance, max_iterations, int(by_error)], device=self.device)
         cycle = getattr(self._preconditioner, "program", None)
         if cycle is None:
             wp.capture_while(self._going, self._iterate)
@@ -166,4 +162,4 @@ class ConjugateGradient:
         self._reduction.dot(self._p, self._q, int(PQ), launch=launch)
         self._update.launch(launch)
         self._reduction.add_up(int(RR), launch=launch)
-        launch(self._end, 1, [self._scalars, self._going], device=self.device)
+        launch(end_kernel, 1, [self._scalars, self._going], device=self.device)

@@ -1,0 +1,90 @@
+"""What a viscous solve costs beside a pressure solve of the same cells: `python -m benchmarks.viscosity [CELLS ...]`, in the source tree.
+
+A tank of three fifths liquid with a wavy surface, whose velocity is a few smooth waves: the viscous step at several viscosities, and the
+pressure of that velocity, cold, with walls as equations and with walls that let go, all to 1e-4, in turns; medians of processor times.
+"""
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warp_lcp as wl
+from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
+
+VISCOSITIES = (1e-3, 1.0, 1e3, 1e5)  # [Pa s]
+TURNS, DT = 5, 1e-2
+
+
+def tank(cells: int, viscosity: float, wall: str) -> LiquidSimulation:
+    """Return the tank with its velocity, before a step."""
+    blocks: list[dict[str, Any]] = [{"shape": "box", "min": [0.0, 0.0, 0.0], "max": [1.0, 0.5, 1.0]}]
+    blocks += [{"shape": "sphere", "center": [x, 0.5, 0.5], "radius": 0.2} for x in (0.25, 0.75)]
+    data: dict[str, Any] = {
+        "scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "domain": {"size": [1.0] * 3, "resolution": cells, "wall": wall},
+        "viscosity": {"value": viscosity}, "liquid": blocks, "solver": {"tolerance": 1e-4},
+    }  # fmt: skip
+    simulation = SIMULATOR.create(LiquidScene.model_validate(data), device="cpu", folder=Path())
+    wave(simulation)
+    return simulation
+
+
+def wave(simulation: LiquidSimulation) -> None:
+    """Give the faces their velocity [m/s]."""
+    index = np.indices(simulation.grid.shape)[::-1] / max(simulation.grid.counts) * 2.0 * np.pi
+    for axis, field in enumerate(simulation.velocity):
+        field.assign((np.sin(index[(axis + 1) % 3]) * np.cos(2.0 * index[axis]) + 0.3 * np.sin(3.0 * index[axis - 1])).astype(np.float32))
+
+
+def viscous(simulation: LiquidSimulation) -> tuple[float, int]:
+    """Return the seconds of a viscous solve, and its iterations."""
+    wave(simulation)
+    projection = simulation.projection
+    projection.contact.fill_(1)
+    begun = time.process_time()
+    assert simulation.viscosity is not None
+    found = simulation.viscosity.solve(simulation.velocity, simulation.grid.everywhere, projection.kind, projection.contact, DT, 1.0)
+    assert found.converged, "the viscous solve must reach its tolerance"
+    return time.process_time() - begun, found.iterations
+
+
+def pressure(simulation: LiquidSimulation) -> tuple[float, int]:
+    """Return the seconds of a cold pressure solve, and its iterations."""
+    wave(simulation)
+    projection = simulation.projection
+    projection.pressure.zero_()
+    begun = time.process_time()
+    projection.prepare(simulation.velocity, DT, DT, simulation.grid.everywhere)
+    result, _ = projection.solve(1.0)
+    assert result.status is wl.SolveStatus.CONVERGED, result.status
+    return time.process_time() - begun, result.iterations
+
+
+def measure(cells: int) -> None:
+    """Print a row for each viscosity."""
+    held, free = tank(cells, 1.0, "sticky"), tank(cells, 1.0, "separating")
+    thick = {viscosity: tank(cells, viscosity, "sticky") for viscosity in VISCOSITIES}
+    rows: dict[object, list[tuple[float, int]]] = {}
+    for turn in range(TURNS + 1):
+        done: dict[object, tuple[float, int]] = {"held": pressure(held), "free": pressure(free)}
+        done |= {viscosity: viscous(simulation) for viscosity, simulation in thick.items()}
+        for name, found in done.items():
+            rows.setdefault(name, []).extend([found] if turn else [])  # the first turn loads kernels
+    seconds = {name: float(np.median([s for s, _ in found])) for name, found in rows.items()}
+    pairs = {v: [a / b for (a, _), (b, _) in zip(rows[v], rows["held"], strict=True)] for v in VISCOSITIES}
+    for viscosity in VISCOSITIES:
+        ratio, iterations = float(np.median(pairs[viscosity])), rows[viscosity][0][1]
+        beside = f"{1e3 * seconds['held']:.1f} | {1e3 * seconds['free']:.1f}"
+        sys.stdout.write(f"| {cells}^3 | {viscosity:g} | {iterations} | {1e3 * seconds[viscosity]:.1f} | {beside} | {ratio:.2f} |\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.stdout.write(
+        "| cells | Pa s | iterations | viscous [ms] | pressure, equations [ms] | pressure, bounds [ms] | viscous / equations |\n"
+    )
+    sys.stdout.write("|---|---|---|---|---|---|---|\n")
+    for cells in map(int, sys.argv[1:] or (32, 64, 128)):
+        measure(cells)
