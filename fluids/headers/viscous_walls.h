@@ -14,4 +14,7 @@ const auto head_on = [&](long long i, long long q, long long c) {  // along the 
     const float slip = along ? 0.0f : h[q];
     return held && slip < INFINITY ? cell[c]*beyond(i, q, slip) : 0.0f;
 };
-const auto beside = [&](long long i, long long q, float weight) { return h[q] < INFINITY ? weight*beyond(i, q, h[q]) : 0.0f; };
+const auto beside = [&](long long i, long long q, float weight) {  // which knows already of a length above 1
+    const float inverse = h[q] < INFINITY ? beyond(i, q, h[q]) : 0.0f;
+    return weight*(inverse > 1.0f ? inverse : (h[q] < INFINITY ? 1.0f : 0.0f));
+};

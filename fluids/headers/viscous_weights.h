@@ -25,7 +25,7 @@ for (int i = first; i < last; ++i) {
     bool solid = false, sticks = share == 1.0f && holds(i);
     if (inside) for (int axis = 0; axis <= planes; ++axis) for (int side = 0; side < 2; ++side) {
         const long long f = i + side*step[axis];
-        if (d[axis][f] <= (float)CLOSE) { solid = true; sticks = sticks && h[axis][f] < INFINITY; }
+        if (d[axis][f] <= (float)CLOSE) { solid = true; sticks = sticks && h[axis][f] == 0.0f; }
     }
     if (solid && sticks) {  // and no edge reaches the surface
         walled = 1.0f;
@@ -50,7 +50,12 @@ for (int i = first; i < last; ++i) {
         for (int c = 0; c < 4; ++c) { released = released || let_go(cells[c]); held = held || holds(cells[c]); }
         for (int f = 0; f < 4; ++f) {
             const int axis = f < 2 ? a : b;
-            if (d[axis][faces[f]] <= (float)CLOSE) { wall = true; if (!(h[axis][faces[f]] < INFINITY)) factor = 0.0f; }
+            const long long q = faces[f], p = faces[f ^ 1];  // of one component
+            if (!(d[axis][q] <= (float)CLOSE)) continue;
+            wall = true;
+            // a link that slip makes longer than 1 pulls less, and so do its products: what is left is a square
+            const float length = d[axis][p] > (float)CLOSE ? (d[axis][p] + h[axis][q])/(d[axis][p] - d[axis][q]) : 1.0f;
+            factor = !(h[axis][q] < INFINITY) ? 0.0f : (length*factor > 1.0f ? 1.0f/length : factor);
         }
         edge[e][i] = wall && (released || !held) ? 0.0f : factor*scale*filled(cells, 4);
     }
