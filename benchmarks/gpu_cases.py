@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ def methods(device: str) -> Arrays:
     cells[0, 0], cells[2, 3] = wl.AIR, wl.SOLID
     field = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0.0)
     for name, cls in METHODS.items():
+        if cls is wl.QuadraticProgram and find_spec("piqp") is None:  # an extra
+            continue
         n = min(getattr(cls, "most_unknowns", 30), 30)
         for family in ("dense", "sparse", "grid") if n == 30 else ("dense",):
             if family not in families(cls):
