@@ -74,7 +74,7 @@ def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
     readbacks, launches, allocations = np.array(counts[2:]).max(axis=0)  # of steps after the kernels have been loaded
     assert allocations == 0
     assert readbacks <= 2  # what the solve has come to, and what the step has
-    assert launches <= 155
+    assert launches <= 200  # most of them in graphs: levels of 16^3 cells are quicker so than in one block
 
 
 @EMULATED

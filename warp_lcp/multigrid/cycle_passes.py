@@ -32,15 +32,6 @@ CORRECT = RowPass(
     "cycle.correct", HEADERS / "correct.h", "S", stencil=("F", "S"), reads=BOUNDS, optional=("lower", "upper"), writes={"x": "S"},
     other={"coarse": "S"}, numbers={"scale": "S", "projected": bool},
 )  # fmt: skip
-# On CUDA, where nothing stays in a cache from pass to pass, what is cheap to compute again is not stored.
-FIRST_PAIR = RowPass(
-    "cycle.first_pair", HEADERS / "first_pair.h", "S", stencil=("F", "S"), reads={"b": "S"}, writes={"y": "S"},
-    numbers={"omega": "S", "second": "S"},
-)  # fmt: skip
-CORRECTED_SWEEP = RowPass(
-    "cycle.corrected_sweep", HEADERS / "corrected_sweep.h", "S", stencil=("F", "S"), reads={"x": "S", "b": "S"}, writes={"y": "S"},
-    other={"coarse": "S"}, numbers={"omega": "S", "scale": "S"},
-)  # fmt: skip
 COARSE_BOUNDS = RowPass(
     "cycle.bounds", HEADERS / "coarse_bounds.h", "S", stencil=("F", "S"), finer=True, other={"x": "S", **BOUNDS},
     writes={"coarse_lower": "S", "coarse_upper": "S"}, optional=("upper", "coarse_upper"), numbers={"scale": "S"},

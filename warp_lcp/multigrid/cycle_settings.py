@@ -45,7 +45,8 @@ class CycleSettings(Smoothing):
         coarsest_cuda: the same on a GPU; without `one_launch_cuda` one thread factors it, which is quick for 16 cells only.
         one_launch_cpu: the most cells of levels that run together in one launch of one thread; 0: none do. On the CPU a captured graph's
             launches cost next to nothing, and its legs that stream through a level are faster.
-        one_launch_cuda: the same on a GPU, in one block of threads: 16^3 cells are few enough for one multiprocessor.
+        one_launch_cuda: the same on a GPU, in one block of threads: 8^3 cells; with 16^3 one multiprocessor
+            works longer than launches would take, 2 ms of a solve on an H200.
         semi: axes whose mean weight is below this share of the strongest one's are not coarsened until they have caught up.
         projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
     """
@@ -59,7 +60,7 @@ class CycleSettings(Smoothing):
     coarsest_cpu: Count = 64
     coarsest_cuda: Count = 64
     one_launch_cpu: CountOrZero = 0
-    one_launch_cuda: CountOrZero = 4096
+    one_launch_cuda: CountOrZero = 512
     semi: Part = 0.3
     projected_sweeps: Count = 8
 

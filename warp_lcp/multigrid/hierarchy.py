@@ -119,37 +119,14 @@ class Level:
 
     def descending(self, coarse: Level, settings: CycleSettings, *, projected: bool, from_zero: bool) -> Iterator[Stage]:
         """Yield a leg of a cycle down: a pair of Chebyshev-Jacobi sweeps, and the residual on the next level."""
-        if from_zero and not projected and self.computes_again:
-            yield self._first_pair(settings.weights)
-        else:
-            yield from self.pair(settings.weights, projected=projected, from_zero=from_zero)
+        yield from self.pair(settings.weights, projected=projected, from_zero=from_zero)
         yield from self.filling("x")
         yield self.restricting(coarse)
 
     def ascending(self, coarse: Level, settings: CycleSettings, *, projected: bool) -> Iterator[Stage]:
         """Yield a leg up: the correction and the reverse pair, which keeps the cycle symmetric."""
-        weights = settings.weights[::-1]
-        if not projected and self.computes_again:
-            yield self._corrected_sweep(coarse, settings.over_correction, weights[0])
-            yield self.sweeping(self.x, self.t, weights[1], projected=False)
-            return
         yield self.correcting(coarse, settings.over_correction, projected=projected)
-        yield from self.pair(weights, projected=projected)
-
-    @property
-    def computes_again(self) -> bool:
-        """Whether a pass computes what another one would store: on CUDA, unless ghost cells would have to be filled between."""
-        return bool(self.stencil.device.is_cuda and not self.stencil.has_ghosts)
-
-    def _first_pair(self, weights: tuple[float, float]) -> Bound:
-        numbers: dict[str, Any] = {"omega": weights[0], "second": weights[1]}
-        fields = {"b": self.b, "y": self.x}
-        return self._once("first", lambda: passes.FIRST_PAIR.bind(self.stencil.rows, stencil=self.stencil, **fields, **numbers))
-
-    def _corrected_sweep(self, coarse: Level, scale: float, omega: float) -> Bound:
-        given: dict[str, Any] = {"x": self.x, "b": self.b, "y": self.t, "coarse": coarse.x, "omega": omega, "scale": scale}
-        rows = self._finer_rows(coarse)
-        return self._once(("corrected", coarse), lambda: passes.CORRECTED_SWEEP.bind(rows, stencil=self.stencil, **given))
+        yield from self.pair(settings.weights[::-1], projected=projected)
 
     def coarsened(self, coarse: Level, settings: CycleSettings) -> Iterator[Stage]:
         """Yield the making of the next level."""
