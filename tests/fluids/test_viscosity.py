@@ -167,6 +167,26 @@ def test_couette_flow_between_cut_walls() -> None:
     assert errors[0] / errors[1] > 2.8
 
 
+@pytest.mark.parametrize("slip", [0.0, 0.1])
+def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
+    """The front of a thin layer on a no-slip floor, Huppert 1982: 1.411 (g q^3 t / (3 nu))^(1/5), q the area on each side of the middle."""
+    given = {"viscosity": {"value": 1000.0, "slip_length": slip}, "physics": {"gravity": [0.0, -10.0], "density": 1000.0}}
+    simulation = create(scene(size=[4.0, 1.0], resolution=96, liquid=[box([1.75, 0.0], [2.25, 0.5])], **given))
+    fronts = []
+    while simulation.time < 12.0:
+        simulation.step(min(simulation.stable_dt(), 0.05))
+        x = simulation.particles.position.numpy()[:, 0]
+        fronts.append([simulation.time, 0.5 * float(x.max() - x.min())])
+    t, front = np.array([row for row in fronts if row[0] > 6.0]).T
+    expected = 1.411 * (10.0 * 0.125**3 / 3.0) ** 0.2
+    rate = np.polyfit(t, front**5, 1)[0] ** 0.2 / expected  # a block's start is no similarity solution's: the rate forgets it sooner
+    if slip:
+        assert rate > 1.1  # the floor is what slows it
+    else:
+        assert abs(rate - 1.0) < 0.05
+        assert abs(front[-1] / (expected * t[-1] ** 0.2) - 1.0) < 0.05
+
+
 def test_a_slip_length_moves_the_wall_away() -> None:
     """A layer over a floor that drags it: u - nu dt u'' = 1 with u(0) = slip u'(0), u'(H) = 0."""
     depth, length = 0.125, math.sqrt(0.02)
