@@ -12,7 +12,7 @@ from warp_lcp.fluids.tables import Probe, WallDragSettings, probe_complaints
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
-from warp_lcp.scene.shapes import MaterialProperties
+from warp_lcp.scene.shapes import MaterialProperties, SourceProperties
 from warp_lcp.settings import Positive
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
@@ -113,13 +113,27 @@ class LiquidScene(ParticleScene):
         """Return what needs viscosity, and what viscosity does not go with."""
         if self.viscosity is not None and self.endless:
             return [Complaint(("viscosity",), None, "not on a domain with periodic axes")]
+        own = [
+            (key, n, shape.viscosity)
+            for key, shapes in (("liquid", self.liquid), ("source", self.source))
+            for n, shape in enumerate(shapes)
+        ]
+        own = [given for given in own if given[-1] is not None]
         if self.viscosity is not None:
-            return []
+            message = "has no meaning for liquids that differ in viscosity: the grid carries one inside"
+            return [Complaint(("particles", "narrow_band"), None, message)] if own and self.particles.narrow_band is not None else []
         message = 'needs the table [viscosity]: without it nothing sticks, use "free-slip"'
         walls = [(("domain", "wall"), self.domain.wall), *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid))]
         found = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
         slips = [(n, solid.slip_length) for n, solid in enumerate(self.solid) if solid.slip_length is not None]
+        found += [Complaint((key, n, "viscosity"), value, "needs the table [viscosity]") for key, n, value in own]
         return found + [Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]") for n, slip in slips]
+
+    def kept(self, materials: Sequence[MaterialProperties | SourceProperties]) -> list[float] | None:
+        """Return viscosities in units of `viscosity.value`; None: all liquid has the same."""
+        if self.viscosity is None or all(shape.viscosity is None for shape in (*self.liquid, *self.source)):
+            return None
+        return [(getattr(shape, "viscosity", None) or self.viscosity.value) / self.viscosity.value for shape in materials]
 
     @property
     def slip_lengths(self) -> list[float]:
@@ -219,7 +233,9 @@ class LiquidScene(ParticleScene):
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
             "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
-            "viscosity": cells * (self.viscosity is not None) * VISCOUS_BYTES[self.dimension],
+            "viscosity": cells
+            * (self.viscosity is not None)
+            * (VISCOUS_BYTES[self.dimension] + 4 * self.dimension * (self.kept(()) is not None)),
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "drag along walls": cells * 4 * self.dimension * (self.drags is not None),
             "surface": cells

@@ -23,6 +23,7 @@ from warp_lcp.fluids.wall_drag import WallDrag
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.transfer import particles_to_faces
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.material.boundary import Boundary, CutBoundary
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
@@ -117,6 +118,8 @@ def make_viscosity(
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
     settings: dict[str, Any] = {"viscosity": scene.viscosity.value, "density": scene.physics.density, "slip_lengths": scene.slip_lengths}
+    kept = scene.kept([*scene.liquid, *scene.source])
+    settings["thickest"] = None if kept is None else max(*kept, 1.0)
     return Viscosity(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies, **settings)
 
 
@@ -213,6 +216,9 @@ class LiquidSimulation(ParticleSimulation):
         window = self.window(before)
         self.bring_to_faces(window)
         speed = self.top_speed(before)
+        if self.viscosity is not None and self.viscosity.relative:
+            p, fields = self.particles, (self.viscosity.relative, self.weights)  # which stay what they are
+            particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets)
         self._find_surface(window)
         viscous: Row = {}
         if self.viscosity is not None:
@@ -308,9 +314,9 @@ class LiquidSimulation(ParticleSimulation):
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
     def frame(self) -> list[Part]:
-        """Return the particles (velocity, speed) and the liquid's cells of the last solve (pressure [Pa], wall and released flags).
+        """Return the particles and the liquid's cells of the last solve, and its surface and volume if the scene wants them.
 
-        And the liquid's surface and volume, if the scene wants them.
+        Particles have velocity, speed and, where it differs, viscosity [Pa s]; cells pressure [Pa], wall and released flags.
         """
         cells, grid = self.projection.fluid_cells(), self.grid
         at = tuple(cells.T)
@@ -320,8 +326,11 @@ class LiquidSimulation(ParticleSimulation):
             "wall": (contact != TOUCHES_NOTHING).astype(np.uint8),
             "released": (contact == RELEASED).astype(np.uint8),
         }
+        points = self.points()
+        if self.scene.viscosity is not None and self.particles.kept is not None:
+            points.fields["viscosity"] = self.scene.viscosity.value * self._particle_arrays()["kept"][:, 0]
         return [
-            self.points(),
+            points,
             Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, self.image_counts),
             *self.surfaces(),
             *self.volumes(),

@@ -83,22 +83,31 @@ class Viscosity:
         slip_lengths: of the domain's wall and each solid [m], shape (1 + solids,); inf: free slip.
         phi: float32 distance to the free surface at cell centers [cells], < 0 in liquid; None: it lies on the cells' faces.
         tolerance: relative residual at which a solve is done.
-        max_iterations: of conjugate gradients in a step.
+        thickest: the largest viscosity, in units of `viscosity`; None: there is only one.
+        max_iterations: of conjugate gradients in a step; 200 unless given, 1000 where viscosities differ.
         bodies: those that the liquid moves, among the solids; None: there are none.
         sources: whether cells may turn SOLID, as those of sources do.
 
     Attributes:
         change: what the last step changed of each component [m/s].
         before: of a velocity that a caller keeps, see `undo`.
+        relative: viscosity on the faces of each component, in units of `viscosity`, 0 where there is no liquid; empty: there is only one.
     """
 
     def __init__(
         self, grid: StaggeredGrid, boundary: Boundary, *, viscosity: float, density: float, slip_lengths: Sequence[float],
-        phi: wp.array | None, tolerance: float, max_iterations: int = 200, sources: bool = False, bodies: RigidBodies | None = None,
+        phi: wp.array | None, tolerance: float, thickest: float | None = None, max_iterations: int | None = None, sources: bool = False,
+        bodies: RigidBodies | None = None,
     ) -> None:  # fmt: skip
-        self.grid, self.boundary, self.tolerance, self.max_iterations = grid, boundary, tolerance, max_iterations
+        self.grid, self.boundary, self.tolerance, self.max_iterations = (
+            grid,
+            boundary,
+            tolerance,
+            max_iterations or (200 if thickest is None else 1000),
+        )
         self._viscosity, self._density, self._phi = viscosity, density, phi
-        self._passes = viscous_passes(grid.dimension, bool(boundary.open), phi is not None, bool(boundary.velocity))
+        self._passes = viscous_passes(grid.dimension, bool(boundary.open), phi is not None, bool(boundary.velocity), thickest is not None)
+        self._thickest = thickest or 1.0
         slips = np.asarray(slip_lengths, dtype=np.float32) / np.float32(grid.spacing)
         self._slips = wp.array(slips, dtype=wp.float32, device=grid.device)
         self._walls = ~open_sides_of(grid, boundary.open_sides) & (1 << 2 * grid.dimension) - 1
@@ -108,6 +117,7 @@ class Viscosity:
         size = grid.dimension * grid.size
         self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)
         self._distance, self._slip, self.before = grid.faces(), grid.faces(), grid.faces()
+        self.relative = [] if thickest is None else grid.faces()
         self.change = self.multigrid.components(self._change)
         self._pull: WallPull | None = None  # made when it is first asked for
         self._bodies: BodyDrag | None = None
@@ -147,7 +157,9 @@ class Viscosity:
         while norm > least and iterations < self.max_iterations:
             before = norm
             goal: dict[str, Any] = (
-                {"tolerance": self.tolerance, "by_error": True} if tau > STIFF and not iterations else {"tolerance": 0.7 * least}
+                {"tolerance": self.tolerance, "by_error": True}
+                if tau * self._thickest > STIFF and not iterations
+                else {"tolerance": 0.7 * least}
             )
             done, _ = self._solver.solve(max_iterations=self.max_iterations - iterations, **goal)
             iterations += done
@@ -224,9 +236,12 @@ class Viscosity:
         self._placed = True
         fields = zip("vdh", (fine.volume, distance, slip), strict=True)
         faces: dict[str, Any] = {f"{letter}{axis}": field for letter, of in fields for axis, field in zip("xyz", [*of, None], strict=False)}
+        thick = dict(zip(("mx", "my", "mz"), [*self.relative, *[None] * 3], strict=False))
         # edges and faces on the upper ends of the domain, too; below the first cell there is nothing
         above = Window.of([max(low, 1) for low in box.low], box.high, box.device)
-        above.run(passes.weights, cell=fine.cell, mixed=fine.mixed, phi=self._phi, planes=planes, scale=tau, **edges, **faces, **where)
+        above.run(
+            passes.weights, cell=fine.cell, mixed=fine.mixed, phi=self._phi, planes=planes, scale=tau, **edges, **faces, **thick, **where
+        )
         for axis in range(self.grid.dimension):
             given = {"diagonal": fine.diagonal[axis], "drag": fine.drag[axis], "held": fine.hold[axis], "volume": fine.volume[axis]}
             given |= {"d": distance[axis], "h": slip[axis], "cell": fine.cell, "axis": axis, "planes": planes}

@@ -17,9 +17,10 @@ HEADERS = Path(__file__).parent / "headers"
 F32, I8, U8 = wp.float32, wp.int8, wp.uint8
 CLOSE = 1e-3  # cells: a face within it of a wall, or behind it, has the wall's velocity
 THETA = 0.02  # cells: the shortest link to a wall
+ALIKE = 1.001  # viscosities at most as far apart are one
 ALONG = 0.95  # of a cell that the distance changes by from face to face: the wall lies across the axis
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
-LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG}
+LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE}
 
 
 def _fields(names: str, dtype: Any = F32) -> dict[str, Any]:
@@ -27,7 +28,7 @@ def _fields(names: str, dtype: Any = F32) -> dict[str, Any]:
 
 
 @functools.cache
-def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, moving: bool = False) -> SimpleNamespace:
+def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, moving: bool = False, varies: bool = False) -> SimpleNamespace:
     """Return the passes of a dimension; those that look at walls differ by these.
 
     Args:
@@ -35,6 +36,7 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
         cut: whether solids cut cells.
         ghost: whether the free surface lies between cells.
         moving: whether solids have velocities.
+        varies: whether viscosities differ.
     """
     deep = dimension == 3
 
@@ -57,8 +59,9 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
             whole={"slip": F32}, optional=("nodes", "kind", "wall", "index"), **near,
         ),
         weights=made(
-            "weights", _fields("cell mixed xy xz yz vx vy vz dx dy dz hx hy hz phi") | cells, "planes scale",
-            optional=("xz", "yz", "vz", "dz", "hz", "phi"), **near,
+            "weights", _fields("cell mixed xy xz yz vx vy vz dx dy dz hx hy hz phi mx my mz") | cells, "planes scale",
+            optional=("xz", "yz", "vz", "dz", "hz", "phi", "mx", "my", "mz"), apart=walls + "_varies" * varies,
+            constants=macros | {"VARIES": varies},
         ),
         diagonal=made(
             "diagonal", _fields("diagonal drag held d h cell xb xc volume") | cells, "axis planes", optional=("xc",), **near

@@ -227,7 +227,7 @@ def modules_of_every_kernel(reals):
         distance_pass(endless)
     for variant in itertools.product((False, True), repeat=4):
         pressure_passes(*variant)
-    for dimension, *walls in itertools.product((2, 3), *((False, True),) * 3):
+    for dimension, *walls in itertools.product((2, 3), *((False, True),) * 4):
         viscous_passes(dimension, *walls)
     for axis in (0, 1, 2, CENTERS):
         carry_pass(axis)

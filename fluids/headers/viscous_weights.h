@@ -16,6 +16,13 @@ const auto filled = [&](const long long* cells, int n) {  // the mean over some 
     for (int c = 0; c < n; ++c) { open += kind[cells[c]] != SOLID; wet += kind[cells[c]] == FLUID; }
     return open ? (float)wet/(float)open : 0.0f;
 };
+// The liquid's viscosity, in units of that which `scale` has: the mean over faces that have some, and the least of them where it differs.
+const float* m[3] = {VARIES ? mx : dx, VARIES ? my : dx, VARIES && deep ? mz : dx};
+struct Thick { float sum, least, most; int n; };
+const auto add = [&](Thick& t, int axis, long long f) {
+    const float v = m[axis][f];
+    if (v > 0.0f) { t.sum += v; t.least = v < t.least ? v : t.least; t.most = v > t.most ? v : t.most; ++t.n; } };
+const auto mean = [](const Thick& t) { return t.n ? t.sum/(float)t.n : 1.0f; };
 const auto let_go = [&](long long c) { return (kind[c] == FLUID) & (contact[c] == RELEASED); };
 const auto holds = [&](long long c) { return (kind[c] == FLUID) & (contact[c] != RELEASED); };
 for (int i = first; i < last; ++i) {
@@ -23,6 +30,9 @@ for (int i = first; i < last; ++i) {
     const long long here[1] = {i};
     float share = inside ? filled(here, 1) : 0.0f, walled = 0.0f;
     bool solid = false, sticks = share == 1.0f && holds(i);
+    Thick own = {0.0f, 1e30f, 0.0f, 0};
+    if (VARIES && inside) for (int axis = 0; axis <= planes; ++axis) for (int side = 0; side < 2; ++side) add(own, axis, i + side*step[axis]);
+    const float thick = mean(own);
     if (inside) for (int axis = 0; axis <= planes; ++axis) for (int side = 0; side < 2; ++side) {
         const long long f = i + side*step[axis];
         if (d[axis][f] <= (float)CLOSE) { solid = true; sticks = sticks && h[axis][f] == 0.0f; }
@@ -33,9 +43,11 @@ for (int i = first; i < last; ++i) {
             const long long A = step[e < 2 ? 0 : 1], B = step[e < 1 ? 1 : 2], o = i + (corner & 1)*A + (corner >> 1)*B;
             const long long cells[4] = {o - A - B, o - A, o - B, o};
             if (filled(cells, 4) < 1.0f) walled = 0.0f;
+            if (VARIES) for (int f = 0; f < 4; ++f) add(own, f < 2 ? (e < 2 ? 0 : 1) : (e < 1 ? 1 : 2), f < 2 ? o - (f & 1)*B : o - (f & 1)*A);
         }
+        if (VARIES && own.n) walled = own.most > (float)ALIKE*own.least ? 0.0f : walled*own.least;
     }
-    cell[i] = scale*(2.0f*share - walled);
+    cell[i] = scale*(2.0f*share*thick - walled);
     mixed[i] = scale*walled;
     for (int axis = 0; axis <= planes; ++axis) {
         const long long cells[2] = {i - step[axis], i};
@@ -46,6 +58,8 @@ for (int i = first; i < last; ++i) {
         const int a = e < 2 ? 0 : 1, b = e < 1 ? 1 : 2;
         const long long A = step[a], B = step[b], cells[4] = {i - A - B, i - A, i - B, i};
         const long long faces[4] = {i, i - B, i, i - A};  // two of a, two of b
+        Thick around = {0.0f, 1e30f, 0.0f, 0};
+        if (VARIES) for (int f = 0; f < 4; ++f) add(around, f < 2 ? a : b, faces[f]);
         float factor = 1.0f; bool wall = false, released = false, held = false;
         for (int c = 0; c < 4; ++c) { released = released || let_go(cells[c]); held = held || holds(cells[c]); }
         for (int f = 0; f < 4; ++f) {
@@ -57,6 +71,6 @@ for (int i = first; i < last; ++i) {
             const float length = d[axis][p] > (float)CLOSE ? (d[axis][p] + h[axis][q])/(d[axis][p] - d[axis][q]) : 1.0f;
             factor = !(h[axis][q] < INFINITY) ? 0.0f : (length*factor > 1.0f ? 1.0f/length : factor);
         }
-        edge[e][i] = wall && (released || !held) ? 0.0f : factor*scale*filled(cells, 4);
+        edge[e][i] = wall && (released || !held) ? 0.0f : factor*scale*mean(around)*filled(cells, 4);
     }
 }

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,12 @@ class Disk:
         return -(-size // self.block) * self.block
 
     def used(self) -> int:
-        return sum(self.rounded(path.stat().st_size) for path in self.folder.rglob("*") if path.is_file())
+        """Return the bytes taken; a file that another thread renames in between may be missed."""
+        sizes = []
+        for path in self.folder.rglob("*"):
+            with suppress(FileNotFoundError):
+                sizes.append(self.rounded(path.stat().st_size) if path.is_file() else 0)
+        return sum(sizes)
 
     def open(self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **options: Any) -> Any:
         if "opener" in options or isinstance(file, int) or "r" in mode.replace("r+", "") or not str(file).startswith(str(self.folder)):
@@ -96,7 +101,7 @@ def fill(scene: Path, folder: Path, sizes: list[int], *, code: int = errno.ENOSP
                 record = None
         if not disk.refused:
             assert record is not None
-            assert record.status == "finished"
+            assert record.status == "finished", record.reason
             break
         first = disk.refused[0].lstrip(".").removesuffix(".part").rstrip("0123456789").split("_")[0]
         where[first] = where.get(first, 0) + 1

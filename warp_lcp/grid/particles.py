@@ -95,6 +95,7 @@ class Particles:
         position: [m], shape (n, 3); z = 0 in 2-D.
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
+        kept: a number of each particle that it takes along, shape (n,); None: they have none.
         indexed: sort every step and know where each cell's particles begin, for transfers that gather; those that need it on CUDA are
             the default there.
 
@@ -112,19 +113,21 @@ class Particles:
     _spare: Column  # where the next reordered column goes
 
     def __init__(
-        self, grid: StaggeredGrid, position: np.ndarray, velocity: np.ndarray, *, affine: bool, indexed: bool | None = None
-    ) -> None:
+        self, grid: StaggeredGrid, position: np.ndarray, velocity: np.ndarray, *, affine: bool, kept: np.ndarray | None = None,
+        indexed: bool | None = None,
+    ) -> None:  # fmt: skip
         _check_shapes(position, velocity)
         self.grid, self.count, self._capacity = grid, 0, 0
         indexed = grid.device.is_cuda if indexed is None else indexed
         self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device) if indexed else None
         self._names = ["position", "velocity", *(f"affine_{c}" for c in range(grid.dimension if affine else 0))]
+        self._names += ["kept"] * (kept is not None)
         self._totals = Tally(kernels.TOTAL, grid.device, max(THREADS, CUDA_THREADS * grid.device.is_cuda))
         self._last: ParticleTotals | None = None
         self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
         self._grow(0)
-        self.append(position, velocity)
+        self.append(position, velocity, kept)
 
     @property
     def capacity(self) -> int:
@@ -144,14 +147,20 @@ class Particles:
     @property
     def affine(self) -> list[wp.array]:
         """Gradient of each component [1/s], wp.vec3, shape (count,) each; empty without `affine`."""
-        return [self._columns[name].view for name in self._names[2:]]
+        return [self._columns[name].view for name in self._names if name.startswith("affine")]
 
-    def append(self, position: np.ndarray, velocity: np.ndarray) -> None:
+    @property
+    def kept(self) -> wp.array | None:
+        """The number that each takes along, three times like a velocity: wp.vec3, shape (count,); None: they have none."""
+        return self._columns["kept"].view if "kept" in self._columns else None
+
+    def append(self, position: np.ndarray, velocity: np.ndarray, kept: np.ndarray | float | None = None) -> None:
         """Add particles behind the others, without a gradient; they are out of order until the next sort.
 
         Args:
             position: [m], shape (n, 3).
             velocity: [m/s], shape (n, 3).
+            kept: the number that each takes along, or one for all; for particles that have one, 1 unless given.
 
         Raises:
             ValueError: the shapes do not match.
@@ -163,6 +172,9 @@ class Particles:
         self._resize(before + len(position))
         for name, host in (("position", position), ("velocity", velocity)):
             self._columns[name].view[before:].assign(np.ascontiguousarray(host, dtype=np.float32))
+        if self.kept is not None:
+            numbers = np.broadcast_to(np.float32(1.0) if kept is None else np.asarray(kept, dtype=np.float32), len(position))
+            self.kept[before:].assign(np.ascontiguousarray(np.repeat(numbers[:, None], 3, axis=1)))
         for gradient in self.affine:
             gradient[before:].zero_()  # sorting may have left anything behind the particles in use
 

@@ -132,7 +132,7 @@ def make_spray(scene: ParticleScene, coverage: Coverage, placed: Sequence[Placed
     """Return what carries particles that are alone, if they need no grid: where one follows the material, and no surface is wrapped."""
     if not (coverage.active and scene.flies) or scene.output.surface or scene.output.volume:
         return None
-    return Spray(coverage.domain, placed, side_bits(scene.domain.open))
+    return Spray(coverage.domain, placed, side_bits(scene.domain.open), keeps=scene.kept(()) is not None)
 
 
 def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:
@@ -204,7 +204,9 @@ def make_particles(
     """
     position, owner, notes = seed_materials(scene, grid, boundary, folder, without)
     velocity = start_velocities(scene).astype(np.float32)[owner]
-    return Particles(grid, position, velocity, affine=scene.particles.transfer == "apic"), notes
+    kept = scene.kept(scene.materials()[1])
+    numbers = None if kept is None else np.array([*kept, 1.0], dtype=np.float32)[owner]
+    return Particles(grid, position, velocity, affine=scene.particles.transfer == "apic", kept=numbers), notes
 
 
 def start_velocities(scene: ParticleScene) -> np.ndarray:
@@ -220,6 +222,7 @@ def make_sources(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, 
     """
     if not scene.source:
         return None
+    kept = scene.kept(scene.source)
     sources = [
         Source(
             name=f"source[{number}] ({source.shape})",
@@ -227,6 +230,7 @@ def make_sources(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, 
             velocity=np.array(_vector(source.velocity)),
             start=source.begin,
             stop=np.inf if source.stop is None else source.stop,
+            kept=None if kept is None else kept[number],
         )
         for number, source in enumerate(scene.source)
     ]

@@ -16,7 +16,7 @@ from warp_lcp.material.particle_volume import VOLUME_BYTES
 from warp_lcp.scene.models import Model, model_lines, prices
 from warp_lcp.scene.presets import preset_values
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source
+from warp_lcp.scene.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source, SourceProperties
 from warp_lcp.scene.table import Complaint, Table
 from warp_lcp.settings import Count, CountOrZero, Part, Share
 
@@ -103,6 +103,10 @@ class ParticleScene(Scene):
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
 
+    def kept(self, materials: Sequence[MaterialProperties | SourceProperties]) -> list[float] | None:
+        """Return the number that the particles of each material or source take along; None: particles have none."""
+        return None
+
     def models(self) -> list[Model]:
         """Return the models that the scene turns on, and those that it asks for but cannot need. Subclasses add their own."""
         moving = [number for number, solid in enumerate(self.solid) if solid.moves]
@@ -185,6 +189,9 @@ class ParticleScene(Scene):
             found.append(Complaint(("particles", "narrow_band"), None, message))
         if self.output.forces and not self.carried_by_grid:
             found.append(Complaint(("output", "forces"), True, "is for liquids only"))
+        for number, source in enumerate(self.source if not self.carried_by_grid else []):
+            if source.viscosity is not None:
+                found.append(Complaint(("source", number, "viscosity"), source.viscosity, "is for liquids only"))
         return super().complaints() + found + self._reseed_complaints()
 
     def _reseed_complaints(self) -> list[Complaint]:
@@ -305,7 +312,7 @@ class ParticleScene(Scene):
         """Return about how much memory each part of a run takes at most on its device [bytes]; parts that it does not have are left out."""
         cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
         moving = any(solid.moves for solid in self.solid)
-        vectors = 3 + (self.dimension if settings.transfer == "apic" else 0)
+        vectors = 3 + (self.dimension if settings.transfer == "apic" else 0) + (self.kept(()) is not None)
         correction = CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut + EVEN_BYTES * self.keeps_volume
         parts = {
             "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),

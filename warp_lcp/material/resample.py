@@ -24,7 +24,8 @@ def resampled(
     neighbors. A uniform velocity is added, so that momentum is conserved but for the rounding of the particles' number.
 
     Args:
-        state: `position` [m], `velocity` [m/s] and, for APIC, `affine_0` ... [1/s]; float32, shape (n, 3), about in the order of the cells.
+        state: `position` [m], `velocity` [m/s], for APIC `affine_0` ... [1/s] and what particles take along, `kept`; float32, shape (n, 3),
+            about in the order of the cells.
         grid: the new grid.
         admits: tells which points [m], shape (n, 3), a particle may be at.
         spacing: of the old grid [m].
@@ -57,8 +58,8 @@ def resampled(
     placed = _placed(position[parent], offset, admits, margin, size - margin)
     moved = np.linalg.norm(placed - position[parent] - offset, axis=1) > grid.spacing * MARGIN
     velocity = state["velocity"].astype(np.float64)[parent]
-    arrays = {name: value[parent] for name, value in state.items() if name.startswith("affine_")}
-    for axis in range(dimension if arrays else 0):
+    arrays = {name: value[parent] for name, value in state.items() if name.startswith(("affine_", "kept"))}
+    for axis in range(dimension if "affine_0" in arrays else 0):
         velocity[:, axis] += (arrays[f"affine_{axis}"] * (placed - position[parent])).sum(axis=1)
     if len(parent):
         velocity += state["velocity"].mean(axis=0, dtype=np.float64) - velocity.mean(axis=0)

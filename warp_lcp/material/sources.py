@@ -33,6 +33,7 @@ class Source:
         velocity: of its material [m/s], shape (3,), not 0.
         start: when it starts to run [s].
         stop: when it no longer does [s].
+        kept: what its particles take along; None: nothing.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Source:
     velocity: np.ndarray
     start: float = 0.0
     stop: float = np.inf
+    kept: float | None = None
 
     def runs(self, time: float) -> bool:
         """Tell whether it runs from `time` [s] on."""
@@ -146,7 +148,7 @@ class Sources:
             source = self.sources[number]
             starts = before is None or source.start > before + NOW
             points = self._points(number, min(max(since, source.start), now) if starts else since, now, held, starts=starts)
-            particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape))
+            particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape), source.kept)
             emitted += len(points)
         return emitted
 

@@ -43,12 +43,15 @@ class Spray:
         solids: what it may meet.
         open_sides: of the domain, see `warp_lcp.grid.sides.side_bits`.
         active: whether any particle may fly.
+        keeps: whether particles take a number along.
 
     Attributes:
         particles: those that fly.
     """
 
-    def __init__(self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], open_sides: int, *, active: bool = True) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], open_sides: int, *, active: bool = True, keeps: bool = False
+    ) -> None:
         self.active, self._solids, self._open, self._extent, self._dimension = (
             active,
             tuple(solids),
@@ -57,7 +60,7 @@ class Spray:
             grid.dimension,
         )
         nothing = np.zeros((0, 3), dtype=np.float32)
-        self.particles = Particles(grid, nothing, nothing, affine=False, indexed=False)
+        self.particles = Particles(grid, nothing, nothing, affine=False, kept=nothing[:, 0] if keeps else None, indexed=False)
 
     def exchange(self, particles: Particles, totals: ParticleTotals, step: int, time: float, dt: float) -> ParticleTotals:
         """Take what has left the others, give back what comes near something, and return sums over those on the grid.
@@ -143,7 +146,8 @@ class Spray:
         """Move some particles from one set to the end of another."""
         if not which.any():
             return
-        target.append(source.position.numpy()[which], source.velocity.numpy()[which])
+        kept = None if source.kept is None else source.kept.numpy()[which, 0]
+        target.append(source.position.numpy()[which], source.velocity.numpy()[which], kept)
         marks: Any = source.marks
         marks.assign(which.astype(np.int32))
         source.remove(marks)

@@ -304,6 +304,14 @@ class MaterialProperties(Shape):
     velocity: Vector | None = Field(default=None, description="at the start [m/s]; at rest unless given")
 
 
+class LiquidProperties(MaterialProperties):
+    """What a liquid has besides."""
+
+    viscosity: float | None = Field(
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="its own [Pa s]; viscosity.value unless given"
+    )
+
+
 class SolidBox(SolidProperties, BoxTable):
     """A solid box."""
 
@@ -324,23 +332,23 @@ class SolidMesh(SolidProperties, MeshTable):
     """A solid inside a surface of triangles."""
 
 
-class LiquidBox(MaterialProperties, BoxTable):
+class LiquidBox(LiquidProperties, BoxTable):
     """A box of liquid."""
 
 
-class LiquidSphere(MaterialProperties, SphereTable):
+class LiquidSphere(LiquidProperties, SphereTable):
     """A ball of liquid."""
 
 
-class LiquidCapsule(MaterialProperties, CapsuleTable):
+class LiquidCapsule(LiquidProperties, CapsuleTable):
     """A capsule of liquid."""
 
 
-class LiquidPlane(MaterialProperties, PlaneTable):
+class LiquidPlane(LiquidProperties, PlaneTable):
     """A half space of liquid."""
 
 
-class LiquidMesh(MaterialProperties, MeshTable):
+class LiquidMesh(LiquidProperties, MeshTable):
     """Liquid inside a surface of triangles."""
 
 
@@ -361,6 +369,9 @@ class SourceProperties(Schedule, Shape):
     """What a source has besides its shape."""
 
     velocity: Vector = Field(description="of what comes out [m/s]")
+    viscosity: float | None = Field(
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="of the liquid that comes out [Pa s]; viscosity.value unless given"
+    )
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return what is wrong with the source in a scene of 2 or 3 dimensions."""
