@@ -36,7 +36,7 @@ class VectorLevel:
         volume, drag, diagonal, hold, norm, there: of the faces of each component: what weighs, what walls add, the sum; whether a wall
             holds it; the interpolation's normalization; and what that is to find.
         r: the residual, and what a sweep keeps.
-        span: where a row's unknowns begin and end.
+        span: where a row's unknowns begin and end, and its core, a run of cells with the equations of those around them.
     """
 
     def __init__(self, grid: StaggeredGrid, x: list[wp.array], b: list[wp.array]) -> None:
@@ -45,7 +45,7 @@ class VectorLevel:
         self.edges = {pair: grid.field() for pair in [(0, 1), (0, 2), (1, 2)][: 1 if grid.dimension == 2 else 3]}
         self.volume, self.drag, self.diagonal, self.hold, self.norm, self.r, self.there = (grid.faces() for _ in range(7))
         self.x, self.b = x, b
-        self.span = wp.zeros(2 * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
+        self.span = wp.zeros(4 * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
     def others(self, axis: int) -> list[int | None]:
         """Return the two other axes; None: there is none."""
@@ -70,11 +70,17 @@ class VectorLevel:
         dx, dy, dz = [*self.diagonal, None][:3]
         window.run(self.passes.span, whole=True, dx=dx, dy=dy, dz=dz, span=self.span)
 
-    def sweep(self, forth: bool, launch: Launch) -> None:
-        """Relax all components, the last one first if not forth."""
+    def smooth(self, forth: bool, launch: Launch) -> None:
+        """Relax all, and what lies before and behind the rows' cores, where errors last, before and after."""
+        for band in (True, False, True):
+            self.sweep(forth, launch, band=band)
+
+    def sweep(self, forth: bool, launch: Launch, *, band: bool = False) -> None:
+        """Relax all components, the last one first if not forth; in a band at surfaces and walls alone if asked."""
         for axis in range(self.dimension) if forth else reversed(range(self.dimension)):
             for color in (0, 1) if forth else (1, 0):
-                given = self._row(axis, self.x) | {"b": self.b[axis], "scratch": self.r[axis], "color": color, "order": int(not forth)}
+                given = self._row(axis, self.x) | {"b": self.b[axis], "scratch": self.r[axis], "color": color}
+                given |= {"order": int(not forth), "band": int(band)}
                 if self.grid.device.is_cuda:
                     for parity in (0, 1) if forth else (1, 0):
                         self.grid.domain.run(self.passes.sweep, launch=launch, only=parity, **given)
@@ -197,9 +203,9 @@ class VectorMultigrid:
             for forth in (True,) * SWEEPS + (False,) * SWEEPS:
                 level.sweep(forth, launch)
             return
-        level.sweep(True, launch)
+        level.smooth(True, launch)
         level.residual(launch)
         level.restrict(self.levels[number + 1], launch)
         self._cycle(number + 1, launch)
         level.prolong(self.levels[number + 1], launch)
-        level.sweep(False, launch)
+        level.smooth(False, launch)

@@ -18,6 +18,7 @@ F32, I8, U8 = wp.float32, wp.int8, wp.uint8
 CLOSE = 1e-3  # cells: a face within it of a wall, or behind it, has the wall's velocity
 THETA = 0.02  # cells: the shortest link to a wall
 ALIKE = 1.001  # viscosities at most as far apart are one
+CORE = 1e-3  # diagonals that differ by less of theirs are alike
 ALONG = 0.95  # of a cell that the distance changes by from face to face: the wall lies across the axis
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
 LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE}
@@ -83,9 +84,9 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
         cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
         add=made("add", _fields("u total more"), ""),
         sum=made("sum", _fields("u kept more"), ""),
-        span=made("span", _fields("dx dy dz"), "", whole=row, optional=("dz",)),
+        span=made("span", _fields("dx dy dz"), "", whole=row, optional=("dz",), constants={"ALIKE": CORE}),
         sweep=made(
-            "sweep", stencil | _fields("b scratch"), "axis color order only", constants={"DEPTH": deep}, whole=row,
+            "sweep", stencil | _fields("b scratch"), "axis color order only band", constants={"DEPTH": deep}, whole=row,
             optional=("z", "xc"),
         ),
         product=made("apply", stencil | _fields("out right"), "axis", constants={"DEPTH": deep, "RESIDUAL": False}, **spans),

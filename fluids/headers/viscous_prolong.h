@@ -1,7 +1,7 @@
 // Add the coarse correction, or (NORM) find the reciprocal of what the interpolation makes of 1 where there is something, 0 elsewhere.
 #include "viscous_levels.h"
 const int mx = given.coarse.shape[2], my = given.coarse.shape[1], mz = given.coarse.shape[0];
-const int* reach = span + 2*(k*(int)(s1/s2) + j);
+const int* reach = span + 4*(k*(int)(s1/s2) + j);
 const int low = first > reach[0] ? first : reach[0], high = last < reach[1] ? last : reach[1];
 if (NORM) for (int i = first; i < last; ++i) norm[i] = 0.0f;
 int z[2], y[2]; float wz[2], wy[2];

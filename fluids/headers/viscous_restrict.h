@@ -1,6 +1,6 @@
 // The transpose of the interpolation, a mean over the cells of the finer level.
 const int mx = given.fine.shape[2], my = given.fine.shape[1], mz = given.fine.shape[0];
-const int* reach = span + 2*(k*(int)(s1/s2) + j);
+const int* reach = span + 4*(k*(int)(s1/s2) + j);
 const int low = first > reach[0] ? first : reach[0], high = last < reach[1] ? last : reach[1];
 const auto weigh = [&](int other, int c) { return other == axis ? (c == 1 ? 1.0f : (c < 3 ? 0.5f : 0.0f)) : (c == 1 || c == 2 ? 0.75f : 0.25f); };
 const float share = planes == 2 ? 0.125f : 0.25f;

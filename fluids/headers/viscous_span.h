@@ -1,4 +1,19 @@
-// Where the unknowns of each row begin and end.
-int begin = (int)s2, end = 0;
-for (int i = first; i < last; ++i) if (dx[i] > 0.0f || dy[i] > 0.0f || (dz && dz[i] > 0.0f)) { begin = i < begin ? i : begin; end = i + 1; }
-span[2*(k*(int)(s1/s2) + j)] = begin; span[2*(k*(int)(s1/s2) + j) + 1] = end;
+// Where the unknowns of each row begin and end, and its core: the longest run of cells whose equations are those of the cells beside them.
+const float* fields[3] = {dx, dy, dz};
+const long long beside[3] = {1, s2, s1};
+int begin = (int)s2, end = 0, run = 0, length = 0, core = 0;
+for (int i = first; i < last; ++i) {
+    bool there = false, alike = true;
+    for (int a = 0; a < (dz ? 3 : 2); ++a) {
+        const float* d = fields[a] + i;
+        there = there || *d > 0.0f;
+        for (int b = 0; b < (dz ? 3 : 2); ++b) {
+            alike = alike && *d > 0.0f && fabsf(d[beside[b]] - *d) <= ALIKE*(*d) && fabsf(d[-beside[b]] - *d) <= ALIKE*(*d);
+        }
+    }
+    if (there) { begin = i < begin ? i : begin; end = i + 1; }
+    run = alike ? run + 1 : 0;
+    if (run > length) { length = run; core = i + 1; }
+}
+int* row = span + 4*(k*(int)(s1/s2) + j);
+row[0] = begin; row[1] = end; row[2] = length ? core - length : end; row[3] = length ? core : end;

@@ -10,5 +10,5 @@ const auto others = [&](long long i) {
     return DEPTH ? sum + pair(DEPTH ? xc : xb, DEPTH ? sc : sb, i) + mix(DEPTH ? z : y, DEPTH ? xc : xb, DEPTH ? sc : sb, i) : sum;
 };
 const auto around = [&](long long i) { return along(i) + pair(xb, sb, i) + others(i); };
-const int* reach = span + 2*(k*(int)(s1/s2) + j);
+const int* reach = span + 4*(k*(int)(s1/s2) + j);
 const int low = first > reach[0] ? first : reach[0], high = last < reach[1] ? last : reach[1];

@@ -1,7 +1,7 @@
-// Gauss-Seidel over the rows of one color: no two of them meet in the component. Even cells of a row go first, or odd ones; what other rows
-// and components add is found before, for all of a row together.
+// Gauss-Seidel over the rows of one color, or over what lies before and behind their cores: no two of them meet in the component. Even cells
+// of a row go first, or odd ones; what other rows and components add is found before, for all of a row together.
 #include "viscous_stencil.h"
-if (((j + k) & 1) == color) {
+const auto relax = [&](const int low, const int high) {
 #ifdef __CUDA_ARCH__
     for (int i = low + ((low + only) & 1); i < high; i += 2) x[i] = diagonal[i] > 0 ? (b[i] + around(i))/diagonal[i] : 0;
 #else
@@ -22,4 +22,8 @@ if (((j + k) & 1) == color) {
         }
     }
 #endif
+};
+if (((j + k) & 1) == color) {
+    relax(low, band && reach[2] < high ? reach[2] : high);
+    if (band) relax(reach[3] > low ? reach[3] : low, high);
 }
