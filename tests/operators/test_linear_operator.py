@@ -1,6 +1,7 @@
 """Operators by their products alone: functions, SciPy's LinearOperator, and what inherits from wl.Operator with only an `apply`."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,8 +61,9 @@ def test_methods_that_need_products_only_take_it(name, kind, symmetric):
     A, b = matrix(symmetric), np.random.default_rng(17).standard_normal(N)
     problem = wl.LCP(given(A, kind), b)
     assert takes(wl.METHODS[name], problem.A)
+    slow = {"max_iterations": 500} if name == "gradient-descent" else {}
     try:
-        result = wl.solve(problem, wl.METHODS[name](), stopping=STOPPING)
+        result = wl.solve(problem, wl.METHODS[name](), stopping=replace(STOPPING, **slow))
     except ValueError as refusal:  # symmetry is needed and not known, or products with the transpose, which are not to be had
         assert "symmetric" in str(refusal) or "transpose" in str(refusal)
         assert not problem.A.symmetric
