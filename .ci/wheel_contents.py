@@ -12,7 +12,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 LINKED = ("fluids", "granular", "benchmarks")
-SHIPPED = (".py", ".h", ".toml", ".typed")
+SHIPPED = (".py", ".h", ".toml", ".html", ".typed")
 
 
 def tracked() -> list[Path]:

@@ -68,11 +68,18 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
     if simulator == "granular":
         return both
     level_set: Tables = {"pressure": {}}
+    middle = [0.5, 0.1, 0.25][:dimension]
+    probes = [{"name": name, "position": middle, "quantity": name} for name in ("pressure", "velocity", "level")]
     liquid = {
         "separating walls": Offer({"domain": {"wall": "separating"}}),
         "ghost-fluid surface": Offer(level_set),
         "smoothing": Offer({"pressure": {"smoothing": 2}}, level_set),
         "unilateral pressure": Offer({"pressure": {"model": "unilateral"}}, level_set, spent="particle"),
+        "viscosity": Offer({"viscosity": {"value": 10.0}}),
+        "surface tension": Offer(level_set | {"surface_tension": {"coefficient": 0.072}}, level_set),
+        "drag along walls": Offer({"wall_drag": {"coefficient": 5e-3}}),
+        "forces on solids": Offer({"solid": [ball], "output": QUIET | {"forces": True}}, {"solid": [ball]}),
+        "probes": Offer({"probe": probes}),
         "automatic tolerance": Offer({"solver": {"tolerance": "auto"}}),
         "narrow band": Offer(level_set | {"particles": {"narrow_band": {"width": 4.0}}}, level_set),
         "FLIP": Offer({"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}, unit="particle"),

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from small_runs import ball, write_run
 from warp_lcp.cli import commands as cli
+from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.render.recording import Recording
 from warp_lcp.render.render import INSTALL
 from warp_lcp.render.viewer import Viewer
@@ -92,6 +93,22 @@ def test_without_a_display_the_command_says_so(pyvista, folder, monkeypatch):
     message = result.stderr.replace("\n", " ")
     assert "a window needs a display, and there is none" in message
     assert "--film film.mp4" in message
+
+
+def test_frames_that_come_are_shown_where_the_newest_was(viewer, folder):
+    def comes(number: int, seconds: float) -> None:
+        FrameFolder(folder).write(number, number / 20, [ball([0.5, 0.5, 0.5], 0.2)])
+        viewer.clock.now = seconds
+        viewer.tick()
+
+    comes(10, 1.1)
+    assert viewer.place == 0, "who looks at another frame goes on looking at it"
+    viewer.step(100)
+    assert viewer.place == 10
+    comes(11, 1.2)
+    assert viewer.place == 10, "it looks once a second"
+    comes(12, 2.2)
+    assert viewer.place == 12
 
 
 def test_wrong_input(pyvista, folder, tmp_path, monkeypatch):

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 import warp as wp
 
+from warp_lcp.cli.ending import FAILED, WRONG_INPUT, end, wrong_input
+from warp_lcp.cli.shown import looked_on, render, serve, view
 from warp_lcp.cli.solve_file import Outcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.render.film import check_rate
-from warp_lcp.render.recording import Color, RenderError, Show
-from warp_lcp.render.render import Looks, film_run, parse_size, render_run
-from warp_lcp.render.viewer import view_run
+from warp_lcp.render.viewer import check_window
 from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.run.check import check_memory, check_scene, start
 from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
 from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
 from warp_lcp.run.foretell import doubts, foretold
-from warp_lcp.run.interruption import Interrupted, Interruption
+from warp_lcp.run.interruption import Interruption
 from warp_lcp.run.launcher import default_folder, launcher_of
 from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.problem_folder import ProblemError
@@ -41,8 +37,6 @@ from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, loa
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
-FAILED = 1
-WRONG_INPUT = 2
 RANKED_SUITE = "scaling"  # what `bench --engine petsc` measures
 
 app = typer.Typer(
@@ -64,16 +58,6 @@ SetOption = Annotated[
     typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a key of the scene; may be repeated. Arrays: liquid.0.max=[1,1]."),
 ]
 
-RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]
-ShowOption = Annotated[
-    Show | None, typer.Option(help="What is drawn; the surface where the run wrote one, else particles.", show_default=False)
-]
-ColorOption = Annotated[
-    Color | None, typer.Option(help="What colors the particles, on one scale for the whole run; speed unless given.", show_default=False)
-]
-CameraOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; may be repeated.")
-]
 ThreadsOption = Annotated[
     int | None,
     typer.Option(
@@ -123,13 +107,15 @@ def run(
     record_problems: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write each step's pressure problem into DIR.", show_default=False)
     ] = None,
+    page: Annotated[bool, typer.Option("--serve", help="Show the run on a page in the browser while it lasts, as `serve` does.")] = False,
+    window: Annotated[bool, typer.Option("--view", help="Show the run in a window, as `view` does.")] = False,
     engine: EngineOption = Engine.SINGLE,
     threads: ThreadsOption = None,
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene into a folder that ParaView opens."""
     given = {"--out": out, "--device": device, "--frames": frames, "--resume": resume, "--force": force, "--force-memory": force_memory}
-    with _wrong_input(), launcher_of(engine) as launcher:
+    with wrong_input(), launcher_of(engine) as launcher:
         _use_threads(threads)
         if resume and force:
             raise OutputError("--resume continues a run and --force deletes it: choose one")
@@ -148,10 +134,13 @@ def run(
         def last(name: str) -> None:
             mark_ended(folder, "stopped", f"interrupted by {name} {BEFORE}")
 
+        if window:
+            check_window(folder)
         stop = Interruption(partial(say, console), at_once=at_once, last=last)
         with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile and launcher.is_root else None
-            record = launcher.run(request, observer=observer, stop=stop, profile=watch)
+            with looked_on(observer, folder, page=page and launcher.is_root, window=window and launcher.is_root) as observers:
+                record = launcher.run(request, observer=observers, stop=stop, profile=watch)
     if not launcher.is_root:
         raise typer.Exit(0 if record.status == "finished" else FAILED)
     if watch:
@@ -159,55 +148,8 @@ def run(
     _report(record, folder)
 
 
-@app.command()
-def render(
-    folder: RunArgument,
-    frame: Annotated[
-        list[int] | None, typer.Option(metavar="N", help="Draw frame N, counted from the end if negative; may be repeated.")
-    ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image; a sheet may be less high.")] = "1280x720",
-    out: Annotated[Path | None, typer.Option(help="The images' folder; DIR/images unless given.", show_default=False)] = None,
-    show: ShowOption = None,
-    color: ColorOption = None,
-    sheet: Annotated[bool, typer.Option("--sheet", help="Draw the frames, or six of them, side by side into sheet.png.")] = False,
-    film: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw all frames into FILE, an .mp4 or a .gif that repeats.", show_default=False)
-    ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames a second of the film; the scene's unless given.", show_default=False)] = None,
-    cut: Annotated[bool, typer.Option("--slice", help="Draw a section with Matplotlib, which needs no pyvista.")] = False,
-    at: Annotated[
-        float | None, typer.Option(metavar="Z", help="Where a 3-D run is cut, in meters; in its middle unless given.", show_default=False)
-    ] = None,
-    overrides: CameraOption = None,
-) -> None:
-    """Draw a run's frames as PNG images or as a film (needs the extra `render`)."""
-    images = []
-    devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
-    with _wrong_input(), Terminal(stderr=True).status("drawing") as status:
-        looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
-        if film is not None:
-            if frame or sheet or out:
-                raise RenderError("--film: shows all frames in one file; leave out --frame, --sheet and --out")
-            count = 0
-            for number in film_run(folder, film, looks=looks, rate=check_rate(fps)):
-                status.update(f"drew frame {number}")
-                count += 1
-            tell(f"{film}: {count} frames")
-            return
-        if fps is not None:
-            raise RenderError("--fps: is of a film; give --film")
-        for image in render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet):
-            images.append(image)
-            status.update(f"drew {image.name}")
-    tell(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
-
-
-@app.command()
-def view(folder: RunArgument, show: ShowOption = None, color: ColorOption = None, overrides: CameraOption = None) -> None:
-    """Show a run's frames in a window: Space plays, the arrow keys step, the mouse turns (needs a display and the extra `render`)."""
-    devices()
-    with _wrong_input():
-        view_run(folder, Looks(color=color, show=show, overrides=overrides or ()))
+for command in (render, view, serve):  # after `run`, in the list of commands
+    app.command()(command)
 
 
 @app.command()
@@ -219,7 +161,7 @@ def check(
     overrides: SetOption = None,
 ) -> None:
     """Say whether a scene is valid and fits into memory, what a run of it would do, and what it would say at its start."""
-    with _wrong_input():
+    with wrong_input():
         chosen = choose_device(device)
         loaded, lines = check_scene(scene, overrides or ())
         _print_pairs(lines)
@@ -234,7 +176,7 @@ def check(
         try:
             seconds, steps = step_seconds(loaded, device=chosen)
         except (StepFailed, SimulationFailed) as error:
-            _end(str(error), FAILED)
+            end(str(error), FAILED)
     _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
     if not force_memory:
         _print_pairs(foretold(loaded, beginning, seconds))
@@ -252,7 +194,7 @@ def tune_scene(
     overrides: SetOption = None,
 ) -> None:
     """Measure which settings of a scene are the fastest for an accuracy, on its first frames."""
-    with _wrong_input():
+    with wrong_input():
         chosen = choose_device(device)
         loaded = load_scene(scene, overrides or ())
         if out is not None and (out.is_dir() or not out.parent.is_dir()):
@@ -261,7 +203,7 @@ def tune_scene(
         try:
             tuning = tune(loaded, accuracy=accuracy, device=chosen, frames=frames, say=partial(say, Terminal(stderr=True)))
         except (StepFailed, SimulationFailed) as error:
-            _end(str(error), FAILED)
+            end(str(error), FAILED)
         if out is not None:
             try:
                 write_tuned(out, tuning, accuracy, chosen)
@@ -273,17 +215,17 @@ def tune_scene(
 @app.command()
 def scenes() -> None:
     """List the built-in scenes with what they show."""
-    with _wrong_input():
+    with wrong_input():
         _print_pairs([(name, load_scene(name).scene.description) for name in built_in_scenes()])
 
 
 @app.command()
 def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "fluids") -> None:
     """Print the JSON schema of scene files, for editors and other programs."""
-    with _wrong_input():
+    with wrong_input():
         installed = installed_simulators()
     if simulator not in installed:
-        _end(f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}", WRONG_INPUT)
+        end(f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}", WRONG_INPUT)
     tell(json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2))
 
 
@@ -314,7 +256,7 @@ def solve(
     options: dict[str, Any] = {
         "method": method, "tolerance": tolerance, "max_iterations": max_iterations, "max_seconds": max_seconds
     }  # fmt: skip
-    with _wrong_input(), launcher_of(engine) as launcher:
+    with wrong_input(), launcher_of(engine) as launcher:
         launcher.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
         chosen = launcher.choose_device(device)
         if out is not None and not out.parent.is_dir():
@@ -339,7 +281,7 @@ def solve(
     say(console, outcome.heading())
     console.print(outcome.table())
     if not outcome.result:
-        _end(outcome.ending(), FAILED)
+        end(outcome.ending(), FAILED)
     say(console, outcome.ending())
 
 
@@ -373,15 +315,15 @@ def bench(
     """Measure this machine, or compare two results; says how long a suite takes on two cores, and what it needs, before it begins."""
     installed = benchmarks()
     if suite not in installed:
-        _end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
-    with _wrong_input():
+        end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
+    with wrong_input():
         _use_threads(threads)
         chosen = device if engine is Engine.PETSC else choose_device(device)  # ranks choose for themselves
         if scene:
             load_scene(scene)
     shared = engine is Engine.PETSC
     if shared and suite != RANKED_SUITE:
-        _end(f"--engine petsc: the suite {suite} measures one process; use {RANKED_SUITE}", WRONG_INPUT)
+        end(f"--engine petsc: the suite {suite} measures one process; use {RANKED_SUITE}", WRONG_INPUT)
     try:
         if compare is not None:
             tell(installed[suite].compare(*compare))
@@ -393,9 +335,9 @@ def bench(
             device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, shared=shared, threads=threads, **asked
         )
     except ValueError as error:
-        _end(str(error), WRONG_INPUT)
+        end(str(error), WRONG_INPUT)
     except RuntimeError as error:
-        _end(str(error), FAILED)
+        end(str(error), FAILED)
     for file in files:
         tell(file)
 
@@ -405,12 +347,12 @@ def info() -> None:
     """Print versions, devices and simulators."""
     lines = list(versions().items())
     lines += [(f"device {alias}", text) for alias, text in devices().items()]
-    with _wrong_input():
+    with wrong_input():
         _use_threads(None)
         lines.append(("CPU threads", f"{get_threads()}; --threads or WARP_LCP_THREADS chooses"))
     lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
     _print_pairs(lines)
-    with _wrong_input():
+    with wrong_input():
         _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
 
 
@@ -435,20 +377,6 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
         tell(f"{word:<20}  {line}")
 
 
-@contextmanager
-def _wrong_input() -> Iterator[None]:
-    try:
-        yield
-    except InputError as error:
-        _end(str(error), WRONG_INPUT)
-    except OSError as error:
-        if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.ENOTDIR):
-            raise
-        _end(f"{error.filename}: {error.strerror}", WRONG_INPUT)
-    except Interrupted as error:
-        _end(f"stopped: interrupted by {error} before the run began", FAILED)
-
-
 def _report(record: RunRecord, folder: Path) -> None:
     """Say how a run ended."""
     taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
@@ -458,13 +386,8 @@ def _report(record: RunRecord, folder: Path) -> None:
     message = f"{record.status}: {record.reason}\n{taken}; frames 0 to {record.frames} are in {folder}"
     newest = max(folder.glob("checkpoints/step_*.npz"), key=lambda file: int(file.stem.removeprefix("step_")), default=None)
     if newest is None:
-        _end(f"{message}; there is no checkpoint yet", FAILED)
+        end(f"{message}; there is no checkpoint yet", FAILED)
     again = f"warp-lcp run {folder / 'scene.toml'} --out {folder} --device {record.device} --resume"
     if record.engine != Engine.SINGLE:
         again = f"mpiexec -n {record.ranks} {again} --engine {record.engine}"
-    _end(f"{message}\nlast checkpoint: {newest}\ncontinue with: {again}", FAILED)
-
-
-def _end(message: str, code: int) -> NoReturn:
-    tell(message, error=True)
-    raise typer.Exit(code)
+    end(f"{message}\nlast checkpoint: {newest}\ncontinue with: {again}", FAILED)

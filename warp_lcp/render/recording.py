@@ -143,7 +143,7 @@ class Recording:
         if self.show is Show.SURFACE and color not in (None, Color.PLAIN):
             raise RenderError(f"--color {color} is for particles, which --show surface leaves out; choose both or particles")
         self.color = Color.PLAIN if self.show is Show.SURFACE else color or Color.SPEED
-        self.numbers = self._shown_numbers()
+        self.look_again()
         if self.color is Color.PRESSURE and not set(self.numbers) <= set(self._numbers("grid")):
             raise RenderError(f"{folder}: --color pressure needs a frame of cells for each of particles; choose speed or plain")
 
@@ -225,8 +225,12 @@ class Recording:
         matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*.*vt[ui]")]
         return sorted({int(match["index"]) for match in matches if match and match["name"] == name})
 
-    def _shown_numbers(self) -> list[int]:
-        """Return the numbers of the frames that have all that is shown."""
+    def look_again(self) -> list[int]:
+        """Look which frames there are by now, and return the numbers of those that have all that is shown.
+
+        Raises:
+            RenderError: there is none.
+        """
         parts = ("surface", "particles") if self.show is Show.BOTH else ("surface",) if self.show is Show.SURFACE else ("particles",)
         found = {part: self._numbers(part) for part in parts}
         for part, numbers in found.items():
@@ -236,6 +240,7 @@ class Recording:
         numbers = sorted(set.intersection(*map(set, found.values())))
         if not numbers:
             raise RenderError(f"{self.folder}: holds no frame of both {' and '.join(parts)}")
+        self.numbers = numbers
         return numbers
 
     @np.errstate(invalid="ignore")  # what is no number is left out

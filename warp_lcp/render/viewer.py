@@ -14,10 +14,12 @@ from warp_lcp.render.page import INK
 from warp_lcp.render.recording import Recording, RenderError
 from warp_lcp.render.render import INSTALL, Looks
 from warp_lcp.render.solid_meshes import EDGE
+from warp_lcp.run.folder import read_record
 
 WINDOW = 1280, 720  # pixels at the start
 WITHOUT_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK falls back to
 TICK = 20  # milliseconds between two looks at the clock
+LOOK = 1.0  # seconds between two looks at the folder of a run at work
 KEYS = "Space: play   Left, Right: step   Home, End   q: quit"
 FOREVER = 2**31 - 1
 
@@ -38,6 +40,7 @@ class Viewer:
         self.picture = Picture(recording, plotter.window_size, plotter)
         self.place = 0  # among the recording's frames
         self.playing_since: tuple[float, int] | None = None  # the clock's time and the place then
+        self._looked = clock()
         self._slider: Any = None
         self._add_controls()
         self.go(0)
@@ -68,6 +71,8 @@ class Viewer:
 
     def tick(self, _: int = 0) -> None:
         """Show the frame that it is time for; frames that the machine is too slow for are left out."""
+        if self.clock() - self._looked >= LOOK:
+            self._look_again()
         if self.playing_since is None:
             return
         since, begin = self.playing_since
@@ -77,10 +82,20 @@ class Viewer:
         if place != self.place:
             self.go(place)
 
+    def _look_again(self) -> None:
+        """Take the frames that a run at work has written since, and show the newest if the one before is shown."""
+        last, self._looked = len(self.recording.numbers) - 1, self.clock()
+        newest = len(self.recording.look_again()) - 1
+        if newest > last:
+            if self._slider is not None:
+                self._slider.GetRepresentation().SetMaximumValue(newest)
+            if self.place == last and self.playing_since is None:
+                self.go(newest)
+
     def _add_controls(self) -> None:
-        last = len(self.recording.numbers) - 1
+        last = max(len(self.recording.numbers) - 1, 1)
         self.plotter.add_text(KEYS, position="upper_right", font_size=9, color=EDGE, name="keys", render=False)
-        if last == 0 or self.plotter.iren is None:
+        if self.plotter.iren is None:
             return
         self._slider = self.plotter.add_slider_widget(
             lambda value: None if round(value) == self.place else self.step(round(value) - self.place), rng=[0, last], value=0,
@@ -88,27 +103,40 @@ class Viewer:
         )  # fmt: skip
         for key, action in (
             ("space", self.play), ("Right", lambda: self.step(1)), ("Left", lambda: self.step(-1)),
-            ("Home", lambda: self.step(-last)), ("End", lambda: self.step(last)),
+            ("Home", lambda: self.step(-self.place)), ("End", lambda: self.step(len(self.recording.numbers))),
         ):  # fmt: skip
             self.plotter.add_key_event(key, action)
         self.plotter.add_timer_event(FOREVER, TICK, self.tick)
 
 
+def check_window(folder: Path) -> None:
+    """Refuse where no window can be opened.
+
+    Raises:
+        RenderError: pyvista or a display is missing.
+    """
+    try:
+        import pyvista  # noqa: F401
+    except ImportError as error:
+        raise RenderError(f"a window needs pyvista, which cannot be loaded ({error}): {INSTALL}") from error
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        raise RenderError(_no_display("DISPLAY is not set", folder))
+
+
 def view_run(folder: Path, looks: Looks | None = None) -> None:
-    """Show a run's frames in a window until it is closed.
+    """Show a run's frames in a window until it is closed, those too that come meanwhile; of a run at work it waits for the first.
 
     Raises:
         RenderError: pyvista or a display is missing, or there are no frames.
         SceneError: the run's scene cannot be read.
     """
     looks = looks or Looks()
-    try:
-        import pyvista
-    except ImportError as error:
-        raise RenderError(f"a window needs pyvista, which cannot be loaded ({error}): {INSTALL}") from error
+    while read_record(folder).get("status") == "running" and not any(folder.glob("frames/*")):
+        time.sleep(LOOK)
     recording = Recording(folder, looks.color, looks.show, looks.overrides)
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        raise RenderError(_no_display("DISPLAY is not set", folder))
+    check_window(folder)
+    import pyvista
+
     plotter = pyvista.Plotter(window_size=list(WINDOW), lighting="none", title=f"{recording.scene.scene.name}: {folder}")
     with closing(plotter):
         if plotter.off_screen or plotter.render_window.GetClassName() in WITHOUT_SCREEN:

@@ -1,0 +1,147 @@
+"""The page of a run, asked as a browser asks for it."""
+
+import json
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from small_runs import MINIMAL, ball, write_run
+from warp_lcp.cli import commands as cli
+from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.vtu import read_vtu
+from warp_lcp.render.live import LOOPBACK, LiveServer, live_server
+from warp_lcp.simulation import Points
+
+SOLID = "[[solid]]\nshape = 'sphere'\ncenter = [0.5, 0.5]\nradius = 0.2\n"
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[LiveServer]:
+    with live_server(folder, port=0) as server:
+        Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+def ask(server: LiveServer, path: str, host: str | None = None) -> tuple[int, bytes]:
+    connection = HTTPConnection(LOOPBACK, server.server_port, timeout=30)
+    connection.request("GET", path, headers={"Host": host or f"localhost:{server.server_port}"})
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer.status, body
+
+
+def arrays(body: bytes) -> dict[str, np.ndarray]:
+    """Return the arrays of a frame as the page reads them."""
+    begin = body.index(b"\n") + 1
+    assert begin % 4 == 0
+    found = {}
+    for name, length in json.loads(body[:begin])["arrays"].items():
+        found[name] = np.frombuffer(body, "<u4" if name.endswith("_corners") else "<f4", length, begin)
+        begin += 4 * length
+    assert begin == len(body)
+    return found
+
+
+def dots_at(*points: list[float]) -> Points:
+    return Points("particles", np.array(points, dtype=np.float32), {"velocity": np.full((len(points), 3), 2.0, dtype=np.float32)})
+
+
+def test_frames_reach_the_page_as_they_come(dots, tmp_path):
+    folder = write_run(tmp_path / "run", [], SOLID)
+    with serving(folder) as server:
+        state = json.loads(ask(server, "/run")[1])
+        assert state["frames"] == []
+        assert "holds no frames" in state["waits"]
+        FrameFolder(folder).write(0, 0.0, [dots_at([0.1, 0.2, 0.0], [0.3, 0.4, 0.0])])
+        assert json.loads(ask(server, "/run")[1])["frames"] == [0]
+        FrameFolder(folder).write(1, 0.05, [dots_at([0.1, 0.1, 0.0], [0.3, 0.3, 0.0])])
+        state = json.loads(ask(server, "/run")[1])
+        assert state["frames"] == [0, 1]
+        assert (state["name"], state["dimension"], state["size"], state["rate"]) == ("drops", 2, [1.0, 1.0, 0.0], 20.0)
+        status, body = ask(server, "/frame?number=1")
+    assert status == 200
+    assert json.loads(body[: body.index(b"\n")])["time"] == pytest.approx(0.05)
+    found = arrays(body)
+    np.testing.assert_array_equal(found["points"].reshape(-1, 3), read_vtu(folder / "frames" / "particles_000001.vtu").points)
+    np.testing.assert_allclose(found["values"], np.sqrt(12.0))
+    radius = np.linalg.norm(found["solids"].reshape(-1, 3)[:, :2] - 0.5, axis=1)
+    assert len(radius) > 100
+    assert abs(radius - 0.2).max() < 0.6 / 512 + 1e-5
+
+
+def test_surfaces_and_bodies_are_triangles(dots, tmp_path):
+    surface, body = ball([0.5, 0.5, 0.5], 0.2), ball([0.2, 0.5, 0.5], 0.1, "bodies", 0)
+    folder = write_run(tmp_path / "run", [[surface, body]], size=(1.0, 1.0, 1.0))
+    with serving(folder) as server:
+        found = arrays(ask(server, "/frame?number=0")[1])
+    np.testing.assert_array_equal(found["surface_corners"].reshape(-1, 3), surface.corners)
+    np.testing.assert_array_equal(found["bodies"].reshape(-1, 3), body.points)
+    assert len(found["points"]) == 0
+
+
+def test_the_log_comes_in_whole_rows_from_where_one_stopped(dots, tmp_path):
+    folder = write_run(tmp_path / "run", [])
+    with serving(folder) as server:
+        assert ask(server, "/log?from=0") == (200, b"")
+        (folder / "log.csv").write_bytes(b"step,time\n1,0.1\n2,0.")
+        assert ask(server, "/log?from=0")[1] == b"step,time\n1,0.1\n"
+        (folder / "log.csv").write_bytes(b"step,time\n1,0.1\n2,0.2\n")
+        assert ask(server, "/log?from=16")[1] == b"2,0.2\n"
+
+
+def test_nothing_else_is_told_and_to_nobody_else(dots, tmp_path):
+    folder = write_run(tmp_path / "run", [[dots_at([0.1, 0.2, 0.0])]])
+    with serving(folder) as server:
+        assert server.server_address[0] == LOOPBACK
+        assert ask(server, "/run", host="elsewhere.example")[0] == 403
+        for path in (
+            "/scene.toml",
+            "/../run/scene.toml",
+            "/frame",
+            "/frame?number=-1",
+            "/frame?number=7",
+            "/log?from=x",
+            "/frame?number=²",
+        ):
+            assert ask(server, path.replace("²", "%C2%B2"))[0] == 404, path
+        status, page = ask(server, "/")
+        assert status == 200
+        assert b"http://" not in page.replace(b"http://www.w3.org", b""), "the page loads nothing from elsewhere"
+        assert b"https://" not in page
+        taken = CliRunner().invoke(cli.app, ["serve", str(folder), "--port", str(server.server_port)])
+    assert taken.exit_code == cli.WRONG_INPUT
+    assert f"--port {server.server_port}: cannot be served on" in taken.stderr
+    missing = CliRunner().invoke(cli.app, ["serve", str(tmp_path / "nowhere")])
+    assert missing.exit_code == cli.WRONG_INPUT
+    assert "there is no such folder" in missing.stderr
+
+
+def test_a_run_is_served_and_shown_from_its_beginning(dots, tmp_path, monkeypatch):
+    scene, out = tmp_path / "scene.toml", tmp_path / "out"
+    scene.write_text(MINIMAL)
+    opened = []
+
+    def open_window(command: list[str], **_: object) -> None:
+        assert (out / "scene.toml").is_file()
+        opened.append(command[-2:])
+
+    monkeypatch.setattr(subprocess, "Popen", open_window)
+    monkeypatch.setenv("DISPLAY", ":0")
+    pytest.importorskip("pyvista", reason="a window needs pyvista, the extra `render`")
+    result = CliRunner().invoke(cli.app, ["run", str(scene), "--out", str(out), "--serve", "--view", "--device", "cpu"])
+    assert result.exit_code == 0, result.output
+    assert "page: http://127.0.0.1:" in result.output
+    assert opened == [["view", str(out)]]
+    monkeypatch.delenv("DISPLAY")
+    refused = CliRunner().invoke(cli.app, ["run", str(scene), "--out", str(tmp_path / "other"), "--view", "--device", "cpu"])
+    assert refused.exit_code == cli.WRONG_INPUT
+    assert not (tmp_path / "other").exists()

@@ -1,0 +1,213 @@
+"""A page on the loopback address that shows a run's frames as they come, with plots of its log. Needs nothing beside the core."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.motion import Pose
+from warp_lcp.render.recording import PALETTES, Recording, RenderError, Show
+from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
+from warp_lcp.run.folder import read_record
+from warp_lcp.scene.camera import viewpoint
+
+LOOPBACK = "127.0.0.1"
+PORT = 8765  # unless told
+HOSTS = {LOOPBACK, "localhost"}  # that a browser may have asked for: a name of somebody else's that leads here may not read the run
+MOST_POINTS = 300_000  # of a frame's particles; of more every second, third ... goes to the page
+SOLID_POINTS = {2: 512, 3: 96}  # along the longest side of the lattice whose points near a solid's surface are drawn
+SAFE = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:"
+
+
+@dataclass
+class Live:
+    """What a page asks of a run, which may still be at work or not have begun.
+
+    Args:
+        folder: of the run.
+        show: what of the material is shown; see `Recording`.
+    """
+
+    folder: Path
+    show: Show | None = None
+
+    def __post_init__(self) -> None:
+        self._lock = Lock()  # requests come on threads of their own
+
+    @cached_property
+    def _recording(self) -> Recording:
+        recording = Recording(self.folder, show=self.show)
+        late = self.show is None and getattr(recording.scene.output, "surface", False)  # a frame's surface comes after its particles
+        return Recording(self.folder, show=Show.SURFACE) if late else recording
+
+    def state(self) -> dict[str, Any]:
+        """Return what there is: the numbers of the frames and, once there is one, what the page needs to draw them."""
+        record = read_record(self.folder)
+        state: dict[str, Any] = {"status": record.get("status", "not begun"), "reason": record.get("reason", ""), "frames": []}
+        with self._lock:
+            try:
+                numbers = self._recording.look_again()
+            except RenderError as error:
+                return state | {"waits": str(error)}
+        scene = self._recording.scene
+        view = viewpoint(scene, 1.0)
+        return state | {
+            "frames": numbers, "name": scene.scene.name, "dimension": scene.dimension, "size": [*scene.domain.size, 0.0][:3],
+            "camera": {"position": list(view.position), "focus": list(view.focus), "up": list(view.up), "angle": view.angle},
+            "rate": scene.time.frames_per_second, "palette": PALETTES[scene.palette], "spacing": self._spacing,
+        }  # fmt: skip
+
+    def frame(self, number: int) -> bytes:
+        """Return a frame: a line of JSON, filled up with spaces to whole words, then its arrays, 32 bits a value, in the line's order.
+
+        Raises:
+            RenderError: there is no such frame, or it cannot be read.
+        """
+        with self._lock:
+            recording = self._recording
+            if number not in recording.look_again():
+                raise RenderError(f"there is no frame {number}")
+            frame = recording.frame(number)
+            solids = self._solid_points(frame.time)
+        few = slice(None, None, len(frame.points) // MOST_POINTS + 1)
+        arrays: dict[str, np.ndarray] = {"points": frame.points[few], "values": frame.values[few], "solids": solids}
+        for name, surface in (("surface", frame.surface), ("bodies", frame.bodies)):
+            if surface is not None:
+                arrays |= {name: surface.points, f"{name}_corners": surface.corners}
+        flat = {name: array.astype("<u4" if name.endswith("_corners") else "<f4").ravel() for name, array in arrays.items()}
+        head = json.dumps({"time": frame.time, "arrays": {name: len(array) for name, array in flat.items()}}).encode()
+        head += b" " * (-(len(head) + 1) % 4) + b"\n"
+        return head + b"".join(array.tobytes() for array in flat.values())
+
+    def log(self, begin: int) -> bytes:
+        """Return what the log holds from a byte on, whole lines."""
+        file = self.folder / "log.csv"
+        if not file.is_file():
+            return b""
+        with open(file, "rb") as opened:
+            opened.seek(begin)
+            rows = opened.read()
+        return rows[: rows.rfind(b"\n") + 1]
+
+    @cached_property
+    def _spacing(self) -> float:
+        return self._recording.particle_spacing()
+
+    @cached_property
+    def _solids(self) -> list[tuple[Any, Any]]:
+        scene = self._recording.scene
+        return [(solid.to_geometry(Path(), scene.dimension), solid.motion) for solid in prescribed_solids(scene)]
+
+    def _solid_points(self, time: float) -> np.ndarray:
+        """Return points [m] on the solids' surfaces at a time, shape (n, 3)."""
+        if not self._solids:
+            return np.zeros((0, 3))
+        scene = self._recording.scene
+        step = max(scene.domain.size) / SOLID_POINTS[scene.dimension]
+        axes = [np.arange(0.5 * step, side, step) for side in scene.domain.size]
+        lattice = np.stack(np.meshgrid(*axes, *[[0.0]] * (3 - len(axes))), axis=-1).reshape(-1, 3)
+        poses = [(geometry, motion.pose(time) if motion else Pose.identity()) for geometry, motion in self._solids]
+        distance = nearest_distance(poses, wp.array(lattice, dtype=wp.vec3, device="cpu"))
+        return np.asarray(lattice[np.abs(distance) < 0.6 * step])
+
+
+class Answers(BaseHTTPRequestHandler):
+    """Answers a page: itself, `/run`, `/frame?number=N` and `/log?from=BYTE`; nothing else of the machine can be asked for."""
+
+    server: LiveServer
+
+    def do_GET(self) -> None:
+        """Answer a request."""
+        asked = urlsplit(self.path)
+        if self.headers.get("Host", "").rpartition(":")[0] not in HOSTS:
+            return self._tell(HTTPStatus.FORBIDDEN, b"this page is for this machine alone")
+        live, words = self.server.live, parse_qs(asked.query)
+        try:
+            if asked.path == "/":
+                return self._tell(HTTPStatus.OK, self.server.page, "text/html; charset=utf-8")
+            if asked.path == "/run":
+                return self._tell(HTTPStatus.OK, json.dumps(live.state()).encode(), "application/json")
+            if asked.path == "/frame":
+                return self._tell(HTTPStatus.OK, live.frame(_number(words, "number")), "application/octet-stream")
+            if asked.path == "/log":
+                return self._tell(HTTPStatus.OK, live.log(_number(words, "from")), "text/csv; charset=utf-8")
+        except RenderError as error:
+            return self._tell(HTTPStatus.NOT_FOUND, str(error).encode())
+        return self._tell(HTTPStatus.NOT_FOUND, b"no such page")
+
+    def _tell(self, status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> None:
+        self.send_response(status)
+        for name, value in (
+            ("Content-Type", kind), ("Content-Length", str(len(body))), ("Cache-Control", "no-store"), ("Content-Security-Policy", SAFE),
+            ("X-Content-Type-Options", "nosniff"),
+        ):  # fmt: skip
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing of requests on the terminal, which is the run's."""
+
+
+class LiveServer(ThreadingHTTPServer):
+    """Serves the page of a run on the loopback address."""
+
+    daemon_threads = True
+
+    def __init__(self, live: Live, port: int) -> None:
+        self.live = live
+        self.page = files("warp_lcp.render").joinpath("live.html").read_bytes()
+        super().__init__((LOOPBACK, port), Answers)
+
+    @property
+    def address(self) -> str:
+        """Return what to open in a browser."""
+        return f"http://{LOOPBACK}:{self.server_port}/"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a browser that has gone away."""
+
+
+def live_server(folder: Path, *, port: int = PORT, show: Show | None = None) -> LiveServer:
+    """Return a server of a run's page, which answers once `serve_forever` runs.
+
+    Raises:
+        RenderError: the port is taken.
+    """
+    try:
+        return LiveServer(Live(folder, show), port)
+    except OSError as error:
+        raise RenderError(f"--port {port}: cannot be served on: {error.strerror}; 0 takes a free one") from error
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a run's page beside it, on the usual port if that is free; what the block gets is the address."""
+    try:
+        server = live_server(folder)
+    except RenderError:
+        server = live_server(folder, port=0)
+    with server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield server.address
+        server.shutdown()
+
+
+def _number(query: dict[str, list[str]], name: str) -> int:
+    text = query.get(name, [""])[0]
+    if not (text.isascii() and text.isdigit() and len(text) < 16):
+        raise RenderError(f"{name} must be a number")
+    return int(text)
