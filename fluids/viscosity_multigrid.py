@@ -1,7 +1,8 @@
 """Multigrid for the viscous equations: one symmetric cycle, the preconditioner of conjugate gradients.
 
 Coarse levels have equations of the same form with the means of what the finer one weighs; unknowns are carried linearly, beside air by
-those there are. Gauss-Seidel takes one component after the other, two colors of rows each, and back.
+those there are. A coarse level is a sum of squares, too: an unknown is drawn to faces in walls by no less than its links to them weigh.
+Gauss-Seidel takes one component after the other, two colors of rows each, and back.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from warp_lcp.rows.program import Launch, Program
 
 LEAST = 8  # cells of the longest side at which there is no coarser level
 SWEEPS = 4  # of the coarsest level, each forth and back
+MIXED = 0.5  # of the finer level's: twice that is at most `cell`, so that cells' squares outweigh their products in 3-D, too
 WALL = 0.5  # of the finer level's drag by walls, in units of its own links: half of what is near one lies in its row
 
 
@@ -110,7 +112,7 @@ class VectorLevel:
             window.run(self.passes.average, out=out, fine=of, planes=planes, faces=faces, scale=scale)
 
         mean(self.cell, fine.cell, 0, 0.25)
-        mean(self.mixed, fine.mixed, 0, 0.25)
+        mean(self.mixed, fine.mixed, 0, MIXED * 0.25)
         for (a, b), edge in self.edges.items():
             mean(edge, fine.edges[a, b], 1 << a | 1 << b, 0.25)
         for axis in axes:

@@ -7,10 +7,14 @@ for (int i = first; i < last; ++i) {
     there[i] = h[i] > 0.0f ? h[i] : 0.0f;
     const bool inside = i >= 1 && i <= nx && j >= 1 && j <= ny && (planes == 1 || (k >= 1 && k <= nz));
     if (!inside || at == 1 || h[i] >= 0.0f) continue;
-    const auto link = [&](long long q, float weight) { return h[q] < 0.0f ? weight : h[q]*weight; };
-    const auto side = [&](long long q, float weight) { return h[q] < 0.0f ? weight : 0.0f; };
-    float sum = volume[i] + drag[i] + link(i + sa, cell[i]) + link(i - sa, cell[i - sa]) + side(i + sb, xb[i + sb]) + side(i - sb, xb[i]);
-    if (planes == 2) sum += side(i + sc, xc[i + sc]) + side(i - sc, xc[i]);
+    float free = volume[i], wall = drag[i], least = 0.0f;
+    const auto link = [&](long long q, float weight, float held) {
+        if (h[q] < 0.0f) free += weight; else { wall += held*weight; least += weight; }
+    };
+    link(i + sa, cell[i], h[i + sa]); link(i - sa, cell[i - sa], h[i - sa]);
+    link(i + sb, xb[i + sb], 0.0f); link(i - sb, xb[i], 0.0f);
+    if (planes == 2) { link(i + sc, xc[i + sc], 0.0f); link(i - sc, xc[i], 0.0f); }
+    const float sum = free + (wall > least ? wall : least);
     diagonal[i] = sum;
     there[i] = sum > 0.0f ? 1.0f : 0.0f;
 }
