@@ -381,7 +381,7 @@ class LiquidSimulation(ParticleSimulation):
             return {}
         self.extend(window, projection.known, projection.kind, projection.contact)
         with self.watch.stage("viscosity", *self.velocity, projection.kind, projection.contact):
-            found = viscosity.solve(self.velocity, window, projection.kind, projection.contact, dt, speed)
+            found = viscosity.solve(self.velocity, window, projection.kind, projection.contact, self.kick_dt, speed)
         if not found.converged:
             self.restore_bodies()
             residual = f"relative residual of {found.relative_residual:.2e} (tolerance {viscosity.tolerance})"

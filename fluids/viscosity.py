@@ -137,7 +137,7 @@ class Viscosity:
             window: cells that hold all liquid, with two to spare.
             kind: int8 of AIR, FLUID, SOLID.
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
-            dt: time step [s].
+            dt: how long viscosity acts [s].
             speed: scale of the velocities [m/s].
         """
         box = replace(self._trail.through(window), near=None)
