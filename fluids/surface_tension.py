@@ -113,10 +113,11 @@ class SurfaceTension:
         Without it they grow from the particles' noise, for APIC damps next to nothing, and take the surface apart.
 
         Args:
-            particles: the liquid; `key` holds its cells (updated: gradients).
+            particles: the liquid (updated: gradients, and their numbers, as a narrow band may have added and taken some).
             dt: time step [s].
         """
         factor = math.exp(-CALM * dt * math.sqrt(self.coefficient / (self.density * self.grid.spacing**3)))
+        particles.number()
         for gradient in particles.affine:
             listed = [factor, -0.99 * REACH_OF_PHI, particles.key, self._phi.flatten(), gradient]
             wp.launch(kernels.calm_kernel, particles.count, listed, device=self.grid.device)

@@ -55,6 +55,8 @@ def _tables(rng: random.Random) -> Tables:
         velocity = [rng.uniform(-2.0, 2.0) for _ in range(dimension)]
         material.append(_box([0.3, 0.55, 0.1][:dimension], [0.6, 0.75, 0.5][:dimension]) | {"velocity": velocity})
     (_liquid if liquid else _sand)(rng, data, material, dimension)
+    if liquid:
+        _forces(rng, data, dimension)
     return data
 
 
@@ -69,10 +71,27 @@ def _liquid(rng: random.Random, data: Tables, material: list[Tables], dimension:
         material[0]["max"][:2] = [rng.uniform(0.7, 1.0), rng.uniform(0.5, 0.65)]
         if dimension == 2:
             data["domain"]["resolution"] = rng.choice([35, 40])
-    data["solver"] = {"method": rng.choice(LIQUID_METHODS), "max_iterations": 2000, "precision": rng.choice(["mixed", "single", "double"])}
+    data["solver"] = {"method": rng.choice(LIQUID_METHODS), "max_iterations": 20000, "precision": rng.choice(["mixed", "single", "double"])}
     if _half(rng, 0.2):
         data["solver"]["tolerance"] = "auto"
     data["time"]["cfl"] = rng.choice([0.4, 1.0, 2.0, 3.0])
+
+
+def _forces(rng: random.Random, data: Tables, dimension: int) -> None:
+    """Add what acts in and on liquid, and what is measured of it."""
+    if _half(rng, 0.4):
+        data["viscosity"] = {"value": 10.0 ** rng.uniform(-3.0, 4.0), "slip_length": rng.choice([0.0, 0.05])}
+        if _half(rng, 0.4):
+            data["liquid"][-1]["viscosity"] = 10.0 ** rng.uniform(-3.0, 4.0)
+        if _half(rng):
+            data["domain"]["wall"] = "sticky"
+    if _half(rng, 0.3):
+        data["surface_tension"] = {"coefficient": rng.choice([0.07, 2.0]), "contact_angle": rng.choice([60.0, 90.0, 120.0])}
+    if _half(rng, 0.3):
+        data["wall_drag"] = {"coefficient": rng.choice([0.005, 0.5])}
+    if _half(rng, 0.3):
+        data["output"]["forces"] = True
+        data["probe"] = [{"name": what, "position": [0.4, 0.2, 0.3][:dimension], "quantity": what} for what in ("pressure", "level")]
 
 
 def _sand(rng: random.Random, data: Tables, material: list[Tables], dimension: int) -> None:

@@ -38,6 +38,13 @@ def test_a_solid_that_moves_through_a_band():
     assert differences_by_step(LiquidScene.model_validate(IN_BAND | {"solid": [solid]}), 17, 4) == {}
 
 
+def test_a_band_whose_surface_pulls_itself_together():
+    """What acts on the particles' gradients knows the cells of those that the band has just added."""
+    column = [{"shape": "box", "min": [0.0, 0.0], "max": [0.75, 0.6]}]
+    tables = IN_BAND | {"surface_tension": {"coefficient": 0.07}, "liquid": column}
+    assert differences_by_step(LiquidScene.model_validate(tables), 13, 2) == {}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_scenes())
 def test_all_built_in_scenes(name):
