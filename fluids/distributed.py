@@ -10,7 +10,9 @@ differ by the rounding in the solver and in sums over all particles alone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,6 +22,7 @@ from warp_lcp.distributed.decomposition import Decomposition, balanced_processes
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
+from warp_lcp.distributed.sources import SharedSources
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.fluids.distributed_pressure import DistributedPressure
 from warp_lcp.fluids.distributed_state import Piece, piece_of, take_pieces
@@ -28,9 +31,10 @@ from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation, make_surface, pressure_settings
 from warp_lcp.fluids.surface import FreeSurface, WholeCellSurface
 from warp_lcp.grid.particles import Particles, ParticleTotals
+from warp_lcp.grid.sides import side_bits
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.particle_assembly import Parts, placed_solids, seed_materials, start_velocities
+from warp_lcp.material.particle_assembly import Parts, make_outlets, make_sources, placed_solids, seed_materials, start_velocities
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_state import signature
 from warp_lcp.scene.scene import Scene
@@ -79,23 +83,21 @@ class DistributedLiquid(LiquidSimulation):
     Args:
         scene: what to simulate.
         part: where this rank works.
-        boundary: the solids that meet it.
+        parts: the solids that meet it, and sources.
         particles: this rank's.
-        notes: facts for the start of a run.
+        more: solids, outlets and notes, as of the base class.
     """
 
     shared = True
     particles: SharedParticles
     projection: DistributedPressure
 
-    def __init__(
-        self, scene: LiquidScene, part: Subdomain, boundary: Boundary, particles: SharedParticles, *, notes: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, scene: LiquidScene, part: Subdomain, parts: Parts, particles: SharedParticles, **more: Any) -> None:
         """Allocate the fields and find the liquid's cells."""
         self.part = part
         self._dt = 0.0
+        super().__init__(scene, part.grid, parts, particles, **more)
         self._everyone = int(part.ranks.sum(particles.count))
-        super().__init__(scene, part.grid, Parts(boundary), particles, notes=notes)
 
     def _surface(self) -> FreeSurface:
         part = self.part
@@ -138,6 +140,8 @@ class DistributedLiquid(LiquidSimulation):
         refill = Refill(self.part)
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
             self.boundary.extend(window, self.velocity, self.weights, list(known), kind, contact, self.layers, join=refill)
+            if self.sources is not None:
+                self.sources.hold(self.velocity, [])
             self.part.fill(*self.velocity)
         cells = float(self.part.ranks.max(too_far(self.part, self.velocity, self._dt)))
         if cells > 0.0:
@@ -152,9 +156,29 @@ class DistributedLiquid(LiquidSimulation):
         super().bring_to_particles(window, kind, dt)
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many of all met a wall, and twice 0: no solid moves."""
+        """Return how many of all met a wall, were pushed by a solid, and are stuck inside one."""
         met, pushed, stuck = self.part.ranks.sum(np.array(super().met()))
         return int(met), int(pushed), int(stuck)
+
+    def _exchange(self, dt: float) -> dict[str, int]:
+        """Exchange this rank's particles with sources and outlets; return what all ranks have."""
+        mine = super()._exchange(dt)
+        total = dict(zip(mine, self.part.ranks.sum(np.array([*mine.values()])).tolist(), strict=True))
+        self._everyone += total["emitted"] - total["drained"] - total["departed"]
+        return total
+
+    def _meet_walls(self, window: Window, dt: float) -> Row:
+        """Collect what the projection has done to solids in this rank's box, and let walls drag there."""
+        row = super()._meet_walls(self.part.owned, dt)
+        if self.wall_drag is not None:
+            self.part.fill(*self.velocity)
+        return {name: float(self.part.ranks.sum(value)) for name, value in row.items()}
+
+    def _measure(self) -> None:
+        """Fill the rows of the tables by what all ranks have found."""
+        if self.forces is not None and self.scene.output.forces:
+            self.forces.impulses = self.part.ranks.sum(self.forces.impulses)
+        super()._measure()
 
     def checked_totals(self, when: str) -> ParticleTotals:
         """Return sums over all ranks' particles.
@@ -213,10 +237,12 @@ class DistributedLiquid(LiquidSimulation):
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
         names, own_signature = list(self.particles.arrays()), signature(self.scene, self.part.grid)
-        particles, cells, numbers = take_pieces(self.part, names, own_signature, pieces, self.boundary.base)
+        base = None if self.boundary.moves else self.boundary.base
+        particles, cells, numbers = take_pieces(self.part, names, own_signature, pieces, base)
         everyone = int(self.part.ranks.sum(len(particles["place"])))
-        if everyone != self._everyone:
+        if everyone != self._everyone and not (self.sources or self.outlets):
             raise ValueError(f"the pieces have {everyone} particles: this scene has {self._everyone}")
+        self._everyone = everyone
         self.particles.assign_with_places(particles, particles["place"])
         self._faces_know = False
         own = self.own_state()
@@ -224,6 +250,7 @@ class DistributedLiquid(LiquidSimulation):
             self.part.box_of(own[name])[...] = values
         self.restore_own(own | {name: numbers[name] for name in ("pressure_dt", "time_error")})
         self.time, self.step_count, self.last_dt = float(numbers["time"]), int(numbers["step_count"]), float(numbers["last_dt"])
+        self.boundary.place(self.time)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return this rank's part of the state, see `piece_state`."""
@@ -301,10 +328,16 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     if refused:
         raise ValueError("; ".join(refused))
     part = _part(scene, ranks, device)
-    cut_cells, separating = scene.domain.solids == "cut-cell", scene.domain.wall == "separating"
-    boundary, warnings = boundary_of_part(part, placed_solids(scene, folder), cut_cells=cut_cells, wall_separating=separating)
+    solids, domain = placed_solids(scene, folder), scene.domain
+    boundary, warnings = boundary_of_part(
+        part, solids, cut_cells=domain.solids == "cut-cell", wall_separating=domain.wall == "separating",
+        open_sides=side_bits(domain.open), sources=bool(scene.source),
+    )  # fmt: skip
     particles, notes = _particles(scene, part, boundary, folder)
-    return DistributedLiquid(scene, part, boundary, particles, notes=[*warnings, *notes])
+    sources = make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part))
+    outlets = make_outlets(scene, part.grid, folder)
+    parts, notes = Parts(boundary, sources), [*warnings, *notes]
+    return DistributedLiquid(scene, part, parts, particles, solids=solids, outlets=outlets, notes=notes)
 
 
 def _particles(scene: LiquidScene, part: Subdomain, boundary: Boundary, folder: Path) -> tuple[SharedParticles, list[str]]:
@@ -339,11 +372,8 @@ def refusals(scene: LiquidScene) -> list[str]:
     """Return the keys of a scene that ask for what runs on ranks have not."""
     output, particles = scene.output, scene.particles
     asked = {
-        **{f"solid[{n}].motion" if solid.motion else f"solid[{n}].mass": solid.moves for n, solid in enumerate(scene.solid)},
+        **{f"solid[{n}].mass": solid.is_body for n, solid in enumerate(scene.solid)},
         "viscosity": scene.viscosity,
-        "source": scene.source,
-        "drain": scene.drain,
-        "domain.open": scene.domain.open,
         "particles.narrow_band": particles.narrow_band,
         "particles.reseed": particles.reseed,
         "density_correction": scene.density_correction is not None and scene.correction is not None,
@@ -351,9 +381,7 @@ def refusals(scene: LiquidScene) -> list[str]:
         'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
         "output.surface": output.surface,
         "output.volume": output.volume,
-        "output.forces": output.forces,
         "probe": scene.probe,
-        "wall_drag": scene.drags,
     }
     return [key for key, wanted in asked.items() if wanted]
 

@@ -36,8 +36,8 @@ class DistributedPressure(PressureProjection):
     def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
         super().__init__(part.grid, boundary, solver, **settings)
         self.part, self._solved = part, part.owned
-        if self._phi is None:
-            self._shift = None  # the part's sides at cuts are open, the domain's are not
+        if self._phi is None and not part.ranks.any(bool(boundary.open_sides & ~part.cuts)):
+            self._shift = None  # sides at cuts are open, but not the domain's
         self._boxes: list[Any] = [
             None if f is None else self._box_like(f) for f in (self.kind, self._b, self._start, self._lower, self._shift)
         ]
@@ -65,10 +65,9 @@ class DistributedPressure(PressureProjection):
 
     def _make_problem(self) -> None:
         self._copy_to_box()
-        faces = {}
-        for axis, field in zip("xyz", self.boundary.open, strict=False):
-            face = faces[f"face_{axis}"] = self._box_like(field)
-            self._copy(field, face)
+        self._open = [self._box_like(field) for field in self.boundary.open]
+        self._copy_open()
+        faces = {f"face_{axis}": field for axis, field in zip("xyz", self._open, strict=False)}
         kind, _, _, lower, shift = self._boxes
         cells, decomposition = kind.numpy()[1:-1, 1:-1, 1:-1], self.part.decomposition
         self._operator = DistributedGridPoisson(decomposition, cells, shift=shift, device=self.grid.device, **faces)
@@ -77,6 +76,8 @@ class DistributedPressure(PressureProjection):
 
     def _update(self) -> None:
         self._copy_to_box()
+        if self.boundary.moves:
+            self._copy_open()
         self._operator.update(self._boxes[0])
 
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
@@ -88,6 +89,10 @@ class DistributedPressure(PressureProjection):
         for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), self._boxes, strict=True):
             if box is not None:
                 self._copy(field, box)
+
+    def _copy_open(self) -> None:
+        for field, box in zip(self.boundary.open, self._open, strict=True):
+            self._copy(field, box)
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure, that of the ghost layers from other ranks."""

@@ -65,7 +65,7 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
 
 
 def take_pieces(
-    part: Subdomain, particles: Sequence[str], signature: np.ndarray, pieces: Sequence[Piece], base: wp.array
+    part: Subdomain, particles: Sequence[str], signature: np.ndarray, pieces: Sequence[Piece], base: wp.array | None
 ) -> tuple[Piece, Piece, Piece]:
     """Take from pieces what lies in this rank's box; collective.
 
@@ -74,7 +74,7 @@ def take_pieces(
         particles: names of the particles' arrays, float32 of shape (n, 3).
         signature: numbers that tell this scene's state from another's.
         pieces: of all ranks of a run.
-        base: int8, SOLID in cells without liquid, of the part.
+        base: int8, SOLID in cells without liquid, of the part; None: solids move.
 
     Returns:
         By name: the particles with their `place`, the cells of this rank's box, shape (nz, ny, nx), and numbers that all pieces have alike.
@@ -101,7 +101,7 @@ def take_pieces(
             raise ValueError("the pieces do not cover the domain: some are missing, or twice there")
         if any(not np.isfinite(values).all() for values in (*own.values(), cells["pressure"])):
             raise ValueError("the pieces hold values that are not finite")
-        if not np.array_equal(cells["cells"] == wl.SOLID, part.box_of(base.numpy()) == wl.SOLID):
+        if base is not None and not np.array_equal(cells["cells"] == wl.SOLID, part.box_of(base.numpy()) == wl.SOLID):
             raise ValueError("the state's solids are not this scene's")
         return own, cells, numbers
 

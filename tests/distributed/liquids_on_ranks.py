@@ -21,6 +21,16 @@ BALL = {"shape": "sphere", "radius": 0.12, "center": [0.5, 0.2, 0.25]}
 FLAT = {"size": [1.0, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0], [0.5, 0.45])]}
 DEEP = {"size": [1.0, 0.5, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0, 0.0], [0.5, 0.45, 0.5])]}
 DROP = box([0.6, 0.3, 0.1], [0.8, 0.45, 0.3], velocity=[-1.0, 0.5, 0.7])
+BLADE = box([0.2, 0.1, 0.2], [0.7, 0.25, 0.26], motion={"kind": "rotation", "rate": 300.0, "axis": [0, 1, 0], "center": [0.45, 0, 0.23]})
+OPEN = {"size": FLAT["size"], "resolution": 32, "wall": "separating", "open": ["right"]}
+RIVER = {
+    "domain": OPEN,
+    "source": [box([0.0, 0.2], [0.1, 0.4], velocity=[1.5, 0.2], stop=0.08)],
+    "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.02)],
+    "solid": [box([0.6, 0.0], [0.7, 0.2], motion={"kind": "translation", "velocity": [-0.4, 0.1]})],
+    "wall_drag": {"coefficient": 0.1},
+    "output": {"forces": True},
+}
 SCENES = {
     "flat": FLAT,
     "flip": DEEP | {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}, "wall": "free-slip"},
@@ -28,6 +38,9 @@ SCENES = {
     "cut": DEEP | {"solid": [BALL], "liquid": [*DEEP["liquid"], DROP], "solver": {"precision": "double"}},
     "slivers": DEEP | {"solid": [BALL], "pressure": {"surface": "voxel"}},
     "voxel": DEEP | {"solid": [BALL], "solids": "voxel", "solver": {"tolerance": "auto"}},
+    "turning": DEEP | {"solid": [BLADE], "output": {"forces": True}},
+    "river": FLAT | RIVER,
+    "whole-cell river": FLAT | RIVER | {"solid": [], "domain": OPEN | {"solids": "voxel"}, "pressure": {"surface": "voxel"}},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 
@@ -42,7 +55,9 @@ def advance(simulation, steps=STEPS):
     rows = []
     for _ in range(steps):
         dt = min(simulation.stable_dt(), DT)
-        rows.append({"dt": dt, **simulation.step(dt)})
+        row = simulation.step(dt)
+        tables = {f"{table} {name}": value for table, found in simulation.measured.items() for name, value in found.items()}
+        rows.append({"dt": dt, **row, **tables})
     return rows
 
 
@@ -70,25 +85,30 @@ def run(ranks: Ranks, folder: Path) -> None:
             (folder / f"{name}_{ranks.size}.json").write_text(json.dumps(rows))
 
 
+RESUMED = ("cut", "river")
+
+
 def keep(ranks: Ranks, folder: Path) -> None:
     """Run in two halves, and keep the pieces of the state between."""
-    simulation = start(ranks, "cut")
-    first = advance(simulation, 5)
-    np.savez(folder / f"piece_{ranks.rank}.npz", **simulation.piece_state())
-    rows = first + advance(simulation, 5)
-    if ranks.is_root:
-        (folder / "whole.json").write_text(json.dumps(rows))
+    for name in RESUMED:
+        simulation = start(ranks, name)
+        first = advance(simulation, 5)
+        np.savez(folder / f"{name}_piece_{ranks.rank}.npz", **simulation.piece_state())
+        rows = first + advance(simulation, 5)
+        if ranks.is_root:
+            (folder / f"{name}_whole.json").write_text(json.dumps(rows))
     ranks.comm.Barrier()  # all pieces are there
 
 
 def go_on(ranks: Ranks, folder: Path) -> None:
     """Go on from pieces."""
-    pieces = [dict(np.load(file)) for file in sorted(folder.glob("piece_*.npz"))]
-    simulation = start(ranks, "cut")
-    simulation.restore_pieces(pieces)
-    rows = advance(simulation, 5)
-    if ranks.is_root:
-        (folder / f"rest_{ranks.size}.json").write_text(json.dumps(rows))
+    for name in reversed(RESUMED):
+        pieces = [dict(np.load(file)) for file in sorted(folder.glob(f"{name}_piece_*.npz"))]
+        simulation = start(ranks, name)
+        simulation.restore_pieces(pieces)
+        rows = advance(simulation, 5)
+        if ranks.is_root:
+            (folder / f"{name}_rest_{ranks.size}.json").write_text(json.dumps(rows))
     with pytest.raises(ValueError, match="do not cover the domain"):
         simulation.restore_pieces(pieces[1:])
     with pytest.raises(ValueError, match="differ from this scene's"):

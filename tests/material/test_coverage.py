@@ -23,6 +23,7 @@ DOMAIN = StaggeredGrid((200, 96, 64), 0.1, 3, "cpu")
 THROWN = {**small_liquids.box([0.2, 1.0], [0.5, 1.3]), "velocity": [3.0, 1.0]}
 BALL = {"shape": "sphere", "center": [1.2, 0.6], "radius": 0.2}
 SWAY = {"motion": {"kind": "sinusoid", "amplitude": [0.1, 0.0], "period": 0.5}}
+TURN = {"motion": {"kind": "rotation", "rate": 400.0, "center": [0.8, 1.0]}}
 SOURCE = {"source": [small_liquids.box([0.9, 1.0], [1.0, 1.1], velocity=[2.0, 0.0], stop=0.1)]}
 LIQUIDS: dict[str, dict[str, Any]] = {
     "apic": {},
@@ -35,7 +36,11 @@ LIQUIDS: dict[str, dict[str, Any]] = {
     "solid": {"solid": [BALL]},
     "voxel solid": {"solid": [BALL], "solids": "voxel"},
     "moving solid": {"solid": [BALL | SWAY]},
+    "turning solid": {"solid": [small_liquids.box([0.55, 0.95], [1.05, 1.05], **TURN)]},
     "body": {"solid": [BALL | {"density": 300.0}]},
+    "viscous": {"viscosity": {"value": 30.0}, "solid": [BALL], "domain": {"wall": "sticky"}},
+    "surface tension": {"surface_tension": {"coefficient": 0.5}, "solid": [BALL]},
+    "wall drag": {"wall_drag": {"coefficient": 0.5}, "solid": [BALL]},
     "source": SOURCE,
     "drain": {"drain": [small_liquids.box([0.8, 0.5], [1.2, 1.0])]},
 }
@@ -53,7 +58,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 def made(name: str, *, follow: bool) -> ParticleSimulation:
     tables: dict[str, Any] = {"liquid" if name in LIQUIDS else "sand": [THROWN]} | (LIQUIDS | SANDS)[name]
     short = {key: tables.pop(key) for key in ("solids",) if key in tables}
-    data = {"time": {"duration": 10.0}, "domain": {"size": [3.0, 1.5], "resolution": 60, "follow": follow, **short}} | tables
+    domain = {"size": [3.0, 1.5], "resolution": 60, "follow": follow} | short | tables.pop("domain", {})
+    data = {"time": {"duration": 10.0}, "domain": domain} | tables
     if name in LIQUIDS:
         return small_liquids.create(LiquidScene.model_validate({"scene": {"simulator": "fluids"}} | data))
     return small_sands.create(SandScene.model_validate({"scene": {"simulator": "granular"}} | data))

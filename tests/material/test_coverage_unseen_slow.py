@@ -56,6 +56,13 @@ def drawn(seed: int) -> dict[str, Any]:
         data["pressure"] = pressures[draw.integers(len(pressures))]
         samplings = [{}, {}, {"transfer": "flip"}, {"transfer": "pic"}, {"reseed": {"every": 2}}, {"narrow_band": {"width": 3}}]
         data["particles"] = samplings[draw.integers(len(samplings))]
+        models = [{}, {"viscosity": {"value": 10.0 ** draw.uniform(-3.0, 4.0)}}, {"wall_drag": {"coefficient": 0.2}}]
+        data |= models[draw.integers(len(models))]
+        if draw.random() < 0.3 and data["pressure"] in ({}, {"smoothing": 2}):
+            data["surface_tension"] = {"coefficient": float(draw.choice([0.07, 2.0]))}
+    if "motion" in (data.get("solid") or [{}])[0] and draw.random() < 0.5:
+        turn = {"kind": "rotation", "rate": float(draw.uniform(-400.0, 400.0)), "center": [0.5 * side for side in size]}
+        data["solid"][0]["motion"] = turn | ({} if flat else {"axis": vector(1.0)})
     return data
 
 

@@ -35,6 +35,7 @@ MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those o
 REACH = 1  # cells from a box within which particles touch its faces and cells
 ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
 ENDLESS = 1e30  # a coordinate beyond all
+NEW = 1 << 62  # places from which on particles have come since the last sort
 COUNT, DATA = 7101, 7102  # tags of messages
 
 
@@ -154,6 +155,20 @@ class SharedParticles(Particles):
             wp.launch(kernels.offset_kernel, self.grid.size + 1, [self.key, self.count, self.offsets], device=self.grid.device)
         elif self.offsets is not None:
             self.offsets.zero_()
+
+    def append(self, position: np.ndarray, velocity: np.ndarray, kept: np.ndarray | float | None = None) -> None:
+        """Add particles behind the others, those of other ranks too; see the base class."""
+        super().append(position, velocity, kept)
+        first = max(NEW, 1 + int(self.place.max(initial=0)))
+        self.place = np.concatenate([self.place, first + np.arange(len(position))])
+
+    def remove(self, marks: wp.array) -> int:
+        """Remove particles of this rank; see the base class."""
+        stays = marks.numpy()[: self.count] == 0
+        removed = super().remove(marks)
+        if removed:
+            self.place = self.place[stays]
+        return removed
 
     def drop_ghosts(self) -> None:
         """Keep this rank's own particles alone."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 import warp_lcp as wl
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
@@ -11,8 +13,28 @@ from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_n
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 
 
+class CutBoundaryOfPart(CutBoundary):
+    """Solids that cut the cells of a rank's part; `place` is collective where some move.
+
+    Args:
+        part: of the grid.
+        cut: the solids.
+    """
+
+    def __init__(self, part: Subdomain, cut: CutCells) -> None:
+        self._part = part
+        super().__init__(part.grid, cut)
+        part.fill(*self.placed())
+
+    def place(self, time: float) -> None:
+        """Put the solids where they are at `time` [s]."""
+        super().place(time)
+        if self.moves:
+            self._part.fill(*self.placed())
+
+
 def boundary_of_part(
-    part: Subdomain, solids: Sequence[PlacedSolid], *, cut_cells: bool, wall_separating: bool
+    part: Subdomain, solids: Sequence[PlacedSolid], *, cut_cells: bool, wall_separating: bool, open_sides: int = 0, sources: bool = False
 ) -> tuple[Boundary, list[str]]:
     """Return the solids that meet a rank's part, and the domain's walls where it has them; collective.
 
@@ -21,9 +43,11 @@ def boundary_of_part(
 
     Args:
         part: of the grid.
-        solids: in the order of their numbers; none moves.
+        solids: in the order of their numbers.
         cut_cells: whether solids cut through cells.
         wall_separating: whether the domain's wall separates.
+        open_sides: of the domain, see `warp_lcp.grid.sides`.
+        sources: whether cells turn SOLID, and faces move, as those of sources do.
 
     Returns:
         The boundary and notes for the start of a run, the same on all ranks.
@@ -31,19 +55,19 @@ def boundary_of_part(
     Raises:
         ValueError: a solid lies wholly outside the domain, or no open cell is left; on all ranks.
     """
-    grid, ranks = part.grid, part.ranks
+    grid, ranks, ends = part.grid, part.ranks, part.cuts | open_sides
     if cut_cells:
-        cut = CutCells(grid, solids, wall_separating=wall_separating, open_sides=part.cuts, remarks=False)
+        cut = CutCells(grid, solids, wall_separating=wall_separating, open_sides=ends, remarks=False)
         if ranks.any(not cut.whole_cells):
-            boundary: Boundary = CutBoundary(grid, cut)
-            part.fill(*boundary.placed())
+            boundary: Boundary = CutBoundaryOfPart(part, cut)
             _check_open(part, boundary)
             return boundary, list(cut.notes)
     notes = start_notes(solids, grid)
-    voxels = voxelize(grid, solids, wall_separating=wall_separating, open_sides=part.cuts, remarks=False)
+    voxels = voxelize(grid, solids, wall_separating=wall_separating, open_sides=ends, remarks=False)
     notes += small_notes((solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing)
     part.fill(voxels.index)
-    boundary = WholeCells(grid, voxels, open_sides=part.cuts)
+    still = np.zeros((1 + len(solids), 3)) if sources else None
+    boundary = WholeCells(grid, voxels, still, open_sides=ends)
     part.fill(*boundary.placed())
     _check_open(part, boundary)
     return boundary, notes

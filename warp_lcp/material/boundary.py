@@ -64,7 +64,7 @@ class Boundary(Protocol):
         """Continue the projected velocity into air and walls, see `warp_lcp.material.wall`; `join` as there."""
 
     def placed(self) -> list[wp.array]:
-        """Return the fields of solids that stand still: beyond its cuts a part of a grid takes them from the other parts."""
+        """Return the fields of solids where they are: beyond its cuts a part of a grid takes them from the other parts."""
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Move particles, then the solids to `time`."""
@@ -147,7 +147,7 @@ class WholeCells:
         extend_velocity(window, velocity, weights, known, kind, contact, s.index, s.separating, self.velocity, layers, join=join)
 
     def placed(self) -> list[wp.array]:
-        """Return the fields of solids that stand still."""
+        """Return the fields of solids where they are."""
         return [self.base, self.touch, self.capacity, self._room]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
@@ -225,8 +225,9 @@ class CutBoundary:
         extend_velocity_cut(window, velocity, weights, known, kind, contact, self.cut, self._scratch, layers, join=join)
 
     def placed(self) -> list[wp.array]:
-        """Return the fields of solids that stand still."""
-        return [self.base, self.touch, self.cut.distance, *self.open, *self.cut.wall, *([] if self.capacity is None else [self.capacity])]
+        """Return the fields of solids where they are."""
+        capacity = [] if self.capacity is None else [self.capacity]
+        return [self.base, self.touch, self.cut.distance, *self.cut.nearest, *self.open, *self.cut.wall, *capacity]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Move particles, then the solids to `time`."""

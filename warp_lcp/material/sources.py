@@ -77,10 +77,12 @@ class Sources:
         self.grid, self.boundary, self.sources = grid, boundary, tuple(sources)
         self.per_axis, self.jitter, self.random_seed = per_axis, jitter, random_seed
         owner = _owners(grid, boundary, self.sources)
-        cells = np.argwhere(owner >= 0)  # (k, j, i) from 0
+        self._cells = cells = np.argwhere(owner >= 0)  # (k, j, i) from 0
         self._slots = np.zeros(grid.shape, dtype=np.int32)
         self._slots[tuple((cells + 1).T)] = np.arange(1, len(cells) + 1)
         self._owner = owner[tuple(cells.T)].astype(np.int32)
+        self._check_cells(np.bincount(self._owner, minlength=len(self.sources)))
+        self._emits = np.ones(1 + len(cells), dtype=bool)  # by slot
         self._boxes = [self._box(cells[self._owner == number]) for number in range(len(self.sources))]
         device = grid.device
         self._fields = [
@@ -91,7 +93,9 @@ class Sources:
         velocities = np.array([source.velocity for source in self.sources], dtype=np.float32)
         self._velocities = wp.array(velocities, dtype=wp.vec3, device=device)
         self._counts = wp.zeros(len(cells), dtype=wp.int32, device=device)
-        self._window: Window = grid.window((cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1)
+        self._window: Window | None = None
+        if len(cells):
+            self._window = grid.window((cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1)
         self._moving_walls = boundary.velocity if not boundary.open else []
 
     def top_speed(self, time: float, span: float) -> float:
@@ -108,7 +112,8 @@ class Sources:
         """
         self._fields[2].assign(np.array([source.runs(time) for source in self.sources], dtype=np.uint8))
         self._impose(velocity, supply=True, walls=self._moving_walls, known=[])
-        self._window.launch(kernels.occupy_kernel, [*self._fields, 0, kind])
+        if self._window is not None:
+            self._window.launch(kernels.occupy_kernel, [*self._fields, 0, kind])
 
     def hold(self, velocity: Faces, known: Faces, shown: wp.array | None = None) -> None:
         """Give the faces of the sources that `supply` found running their velocity again.
@@ -119,7 +124,7 @@ class Sources:
             shown: int8 (updated): the sources' cells become FLUID.
         """
         self._impose(velocity, supply=False, walls=[], known=known)
-        if shown is not None:
+        if shown is not None and self._window is not None:
             self._window.launch(kernels.occupy_kernel, [*self._fields, 1, shown])
 
     def emit(self, particles: Particles, before: float | None, now: float) -> int:
@@ -134,23 +139,34 @@ class Sources:
         running = [number for number, source in enumerate(self.sources) if source.start <= now + NOW and source.stop > since + NOW]
         if not running:
             return 0
-        self._counts.zero_()
-        numbers = [1.0 / self.grid.spacing, wp.vec3i(*self.grid.counts), wp.vec3i(*self.grid.origin)]
-        wp.launch(
-            kernels.occupants_kernel,
-            particles.count,
-            [*numbers, self._fields[0], particles.position, self._counts],
-            device=self.grid.device,
-        )
-        held = self._counts.numpy() / self.per_axis**self.grid.dimension
+        held = self._occupants(particles) / self.per_axis**self.grid.dimension
         emitted = 0
         for number in running:
             source = self.sources[number]
+            if self._boxes[number] is None:
+                continue
             starts = before is None or source.start > before + NOW
             points = self._points(number, min(max(since, source.start), now) if starts else since, now, held, starts=starts)
             particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape), source.kept)
             emitted += len(points)
         return emitted
+
+    def _check_cells(self, counts: np.ndarray) -> None:
+        """Refuse sources without an open cell, given how many each has."""
+        for source, count in zip(self.sources, counts, strict=True):
+            if count == 0:
+                raise ValueError(
+                    f"{source.name} holds no open cell's center: it is too small for cells of {self.grid.spacing:.4g} m, or lies in "
+                    "solids, outside the domain or in an earlier source"
+                )
+
+    def _occupants(self, particles: Particles) -> np.ndarray:
+        """Return how many particles each cell holds."""
+        self._counts.zero_()
+        numbers = [1.0 / self.grid.spacing, wp.vec3i(*self.grid.counts), wp.vec3i(*self.grid.origin)]
+        inputs = [*numbers, self._fields[0], particles.position, self._counts]
+        wp.launch(kernels.occupants_kernel, particles.count, inputs, device=self.grid.device)
+        return np.asarray(self._counts.numpy())
 
     def _points(self, number: int, since: float, now: float, held: np.ndarray, *, starts: bool) -> np.ndarray:
         """Return where the points are [m] that a source's lattice has brought in since a time [s].
@@ -160,9 +176,9 @@ class Sources:
         until = min(now, self.sources[number].stop)
         lattice, jitter = self._lattice(number, since, until)
         filled, slot, entries = self._entries(number, *(self._at(number, lattice, jitter, time) for time in (since, until)))
-        new = np.where(held[np.maximum(slot, 1) - 1] < JAMMED, entries, 0)
+        new = np.where(self._emits[slot] & (held[np.maximum(slot, 1) - 1] < JAMMED), entries, 0)
         if starts:
-            new += (filled > 0) & (held[np.maximum(filled, 1) - 1] < FILLED)
+            new += (filled > 0) & self._emits[filled] & (held[np.maximum(filled, 1) - 1] < FILLED)
         lattice, jitter = np.repeat(lattice, new, axis=0), np.repeat(jitter, new, axis=0)
         points = self._at(number, lattice, jitter, now).astype(np.float32)
         dx, axes = self.grid.spacing, slice(self.grid.dimension)
@@ -173,8 +189,9 @@ class Sources:
     def _lattice(self, number: int, since: float, until: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers of the points that may lie in a source's cells between two times, shape (n, 3), and their displacements."""
         distance, dimension = self.grid.spacing / self.per_axis, self.grid.dimension
-        ways = self._way(number, since), self._way(number, until)
-        lows, highs = (self._boxes[number][0] - np.maximum(*ways)) / distance, (self._boxes[number][1] - np.minimum(*ways)) / distance
+        ways, box = (self._way(number, since), self._way(number, until)), self._boxes[number]
+        assert box is not None, "a source without cells here emits nothing"
+        lows, highs = (box[0] - np.maximum(*ways)) / distance, (box[1] - np.minimum(*ways)) / distance
         ranges = [np.arange(np.floor(low) - 1, np.ceil(high) + 1) for low, high in zip(lows, highs, strict=True)]
         if dimension == 2:
             ranges[2] = np.zeros(1)
@@ -223,13 +240,17 @@ class Sources:
             slot, entries, here = np.where(comes, there, slot), entries + comes, there
         return filled, slot, entries
 
-    def _box(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low and the high corner [m] of cells (k, j, i)."""
+    def _box(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the low and the high corner [m] of cells (k, j, i); None: there are none."""
+        if not len(cells):
+            return None
         low, high = (corner[::-1] + np.array(self.grid.origin) for corner in (cells.min(axis=0), cells.max(axis=0) + 1))
         return low * self.grid.spacing, high * self.grid.spacing
 
     def _impose(self, velocity: Faces, *, supply: bool, walls: Faces, known: Faces) -> None:
         for axis, field in enumerate(velocity):
+            if self._window is None:
+                continue
             given = [field, walls[axis] if walls else None, known[axis] if known else None]
             self._window.launch(kernels.impose_kernel, [axis, int(supply), *self._fields, self._velocities, *given])
 
@@ -246,11 +267,6 @@ def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) 
     for number, source in enumerate(sources):
         mine = free & (owner < 0)
         mine[mine] = source.contains(centers[mine])
-        if not mine.any():
-            raise ValueError(
-                f"{source.name} holds no open cell's center: it is too small for cells of {grid.spacing:.4g} m, or lies in solids, outside "
-                "the domain or in an earlier source"
-            )
         owner[mine] = number
     return owner.reshape(nz, ny, nx)
 

@@ -145,7 +145,8 @@ _NEAREST = {"owner": _I16, "next_near": _F32, "next_owner": _I16}
 _ABSENT: dict[str, Any] = {"headers": HEADERS, "constants": _CONSTANTS, "optional": (*_COMPONENTS, *_NEAREST)}
 CONSTRAIN = cell_pass(
     "warp_lcp.material.cut_wall.constrain", "open result distance", _MARKS | _COMPONENTS | _NEAREST | {"kind": _I8, "contact": wp.uint8},
-    numbers=_AXIS | {"dx": _F32}, whole={"turn": wp.mat33, "shift": wp.vec3, "separating": wp.uint8}, **_ABSENT,
+    numbers=_AXIS | {"dx": _F32, "before_x": int, "before_y": int, "before_z": int},
+    whole={"turn": wp.mat33, "shift": wp.vec3, "separating": wp.uint8}, **_ABSENT,
 )  # fmt: skip
 TAKE = cell_pass("warp_lcp.material.cut_wall.take", "open result field", _MARKS, numbers=_AXIS, **_ABSENT)
 
@@ -173,6 +174,7 @@ def extend_velocity_cut(
     }
     fields |= dict(zip(_NEAREST, cut.nearest or [None] * 3, strict=True)) | {"kind": kind, "contact": contact, "distance": cut.distance}
     fields |= {"turn": cut.turn, "shift": cut.shift, "separating": cut.separating, "dx": cut.grid.spacing}
+    fields |= dict(zip(("before_x", "before_y", "before_z"), cut.grid.origin, strict=True))
     faces = [{"known": m, "open": o, "result": r} for m, o, r in zip(known, cut.open, scratch, strict=True)]
     planes = len(velocity) - 1
     for axis, face in enumerate(faces):

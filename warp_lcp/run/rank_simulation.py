@@ -13,6 +13,7 @@ from warp_lcp.run.log import Value
 from warp_lcp.simulation import (
     Cells,
     DistributedSimulation,
+    Measured,
     NoStopwatch,
     Part,
     Profiled,
@@ -52,6 +53,15 @@ class RankSimulation:
         self._watch = watch
         if isinstance(self._simulation, Profiled):
             self._simulation.watch = watch
+
+    @property
+    def measured(self) -> Mapping[str, Mapping[str, Value]]:
+        """The last step's row of each table."""
+        return self._simulation.measured if isinstance(self._simulation, Measured) else {}
+
+    def tables(self) -> Mapping[str, tuple[str, ...]]:
+        """Return the columns of each table."""
+        return self._simulation.tables() if isinstance(self._simulation, Measured) else {}
 
     def stable_dt(self) -> float:
         """Return the largest time step [s] that all ranks allow."""

@@ -66,13 +66,13 @@ auto constrain = [&](int i) {
     s *= share;
     if (s < -(float)DEPTH || !(size > 0.1f)) return;  // within a thin plate the normal means nothing
     for (int d = 0; d < 3; ++d) n[d] *= share/size;
-    float center[3];
+    float center[3]; const int before[3] = {before_x, before_y, before_z};
     for (int d = 0; d < 3; ++d) center[d] = (float)at[d] + (d == axis ? 0.0f : 0.5f);
     auto of_wall = [&](int d) {  // its velocity at the center; on the domain's faces that of a solid that covers them
         if (!moving[0]) return 0.0f;
         if (number == 0) return d == axis ? moving[axis][e] : 0.0f;
         float v = shift[3*number + d];
-        for (int c = 0; c <= planes; ++c) v += turn[9*number + 3*d + c]*(center[c] - 1.0f)*dx;
+        for (int c = 0; c <= planes; ++c) v += turn[9*number + 3*d + c]*(center[c] + (float)before[c] - 1.0f)*dx;
         return v;
     };
     float relative = n[axis]*(own - of_wall(axis));
