@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
 from warp_lcp.distributed.decomposition import Decomposition, balanced_processes, pool
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
@@ -25,7 +26,7 @@ from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.sources import SharedSources
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.fluids.distributed_pressure import DistributedPressure
-from warp_lcp.fluids.distributed_state import Piece, piece_of, take_pieces
+from warp_lcp.fluids.distributed_state import CELLS, Piece, piece_of, take_pieces
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation, make_surface, pressure_settings
@@ -36,7 +37,9 @@ from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_assembly import Parts, make_outlets, make_sources, placed_solids, seed_materials, start_velocities
 from warp_lcp.material.particle_log import Row
+from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_state import signature
+from warp_lcp.material.sources import Outlets
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
@@ -107,6 +110,10 @@ class DistributedLiquid(LiquidSimulation):
         solver = wl.METHODS[self.scene.solver.method](precision=self.scene.solver.precision)
         return DistributedPressure(self.part, self.boundary, solver, **pressure_settings(self.scene, self.surface, self.weights))
 
+    def _rearrangement(self) -> Rearrangement:
+        crowding, correction = partial(SharedCrowding, self.part), partial(SharedDensityCorrection, self.part)
+        return Rearrangement(self.scene, self.grid, self.boundary, crowding=crowding, correction=correction)
+
     def _flights(self) -> None:
         """Bodies reach across the cuts between ranks, where none of them knows the whole of one."""
 
@@ -167,6 +174,11 @@ class DistributedLiquid(LiquidSimulation):
         self._everyone += total["emitted"] - total["drained"] - total["departed"]
         return total
 
+    def _remove_departed(self, outlets: Outlets) -> int:
+        gone = int(self.part.ranks.sum(super()._remove_departed(outlets)))
+        self._everyone -= gone
+        return gone
+
     def _meet_walls(self, window: Window, dt: float) -> Row:
         """Collect what the projection has done to solids in this rank's box, and let walls drag there."""
         row = super()._meet_walls(self.part.owned, dt)
@@ -216,10 +228,11 @@ class DistributedLiquid(LiquidSimulation):
         Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's;
         `time`, `step_count`, `last_dt`, `pressure_dt`, `signature` as of `state`, `time_error` (2,), the same on all ranks; particles:
         `position`, `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; of the box, shape (nz, ny, nx):
-        `pressure` float64, `cells` int8, `contact` uint8.
+        `pressure` float64, `cells` int8, `contact` uint8, and once particles were moved apart `density_correction` float64.
         """
         box, own = self.part.box, self.own_state()
-        fields = {name: np.ascontiguousarray(self.part.box_of(own[name])) for name in ("pressure", "cells", "contact")}
+        fields = {name: own[name] for name in CELLS} | self.rearrangement.state()
+        fields = {name: np.ascontiguousarray(self.part.box_of(field)) for name, field in fields.items()}
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
         where = {"box": np.array([box.low, box.high]), "counts": np.array(self.part.decomposition.counts)}
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
@@ -245,9 +258,11 @@ class DistributedLiquid(LiquidSimulation):
         self._everyone = everyone
         self.particles.assign_with_places(particles, particles["place"])
         self._faces_know = False
-        own = self.own_state()
+        self.rearrangement.expect(cells)
+        own, moved = self.own_state(), self.rearrangement.state()
         for name, values in cells.items():
-            self.part.box_of(own[name])[...] = values
+            self.part.box_of((own | moved)[name])[...] = values
+        self.rearrangement.restore(moved)
         self.restore_own(own | {name: numbers[name] for name in ("pressure_dt", "time_error")})
         self.time, self.step_count, self.last_dt = float(numbers["time"]), int(numbers["step_count"]), float(numbers["last_dt"])
         self.boundary.place(self.time)
@@ -376,7 +391,6 @@ def refusals(scene: LiquidScene) -> list[str]:
         "viscosity": scene.viscosity,
         "particles.narrow_band": particles.narrow_band,
         "particles.reseed": particles.reseed,
-        "density_correction": scene.density_correction is not None and scene.correction is not None,
         "surface_tension": scene.surface_tension,
         'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
         "output.surface": output.surface,

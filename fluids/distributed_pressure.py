@@ -39,7 +39,7 @@ class DistributedPressure(PressureProjection):
         if self._phi is None and not part.ranks.any(bool(boundary.open_sides & ~part.cuts)):
             self._shift = None  # sides at cuts are open, but not the domain's
         self._boxes: list[Any] = [
-            None if f is None else self._box_like(f) for f in (self.kind, self._b, self._start, self._lower, self._shift)
+            None if f is None else self.part.box_like(f) for f in (self.kind, self._b, self._start, self._lower, self._shift)
         ]
         _, self._rhs, self._guess, _, _ = self._boxes
         if settings["tolerance"] == "auto":
@@ -65,7 +65,7 @@ class DistributedPressure(PressureProjection):
 
     def _make_problem(self) -> None:
         self._copy_to_box()
-        self._open = [self._box_like(field) for field in self.boundary.open]
+        self._open = [self.part.box_like(field) for field in self.boundary.open]
         self._copy_open()
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self._open, strict=False)}
         kind, _, _, lower, shift = self._boxes
@@ -88,11 +88,11 @@ class DistributedPressure(PressureProjection):
     def _copy_to_box(self) -> None:
         for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), self._boxes, strict=True):
             if box is not None:
-                self._copy(field, box)
+                self.part.copy_to_box(field, box)
 
     def _copy_open(self) -> None:
         for field, box in zip(self.boundary.open, self._open, strict=True):
-            self._copy(field, box)
+            self.part.copy_to_box(field, box)
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure, that of the ghost layers from other ranks."""
@@ -110,14 +110,3 @@ class DistributedPressure(PressureProjection):
         """Return the sum of what all ranks have found released, and the largest outflow of others."""
         every = self.part.ranks.gather(np.array(super()._found()))
         return float(every[:, 0].sum()), float(every[:, 1].max())
-
-    def _box_like(self, field: wp.array) -> wp.array:
-        """Return a field of the box with a ring: memory of the field itself where boxes are layers of planes, else one of zeros."""
-        view = self.part.stored_box_of(field)
-        return view if view.is_contiguous else wp.zeros(view.shape, dtype=field.dtype, device=self.grid.device)
-
-    def _copy(self, field: wp.array, box: wp.array) -> None:
-        """Give a field of the box what one of the part holds, if it does not share its memory."""
-        view = self.part.stored_box_of(field)
-        if view.ptr != box.ptr:
-            wp.copy(box, view)

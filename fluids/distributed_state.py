@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,10 +11,12 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.material.particle_rearrangement import STATE
 
 Piece = Mapping[str, np.ndarray]  # what one rank has of a simulation's state
 
 CELLS = {"pressure": np.float64, "cells": np.int8, "contact": np.uint8}
+LATER = {STATE: np.float64}  # there once particles have been moved apart
 NUMBERS = ("time", "step_count", "last_dt", "pressure_dt", "time_error", "signature", "counts")
 
 
@@ -27,7 +30,7 @@ def piece_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     if missing:
         raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
     counts = np.asarray(state["signature"][:3], dtype=np.int64)
-    cells = {name: np.ascontiguousarray(state[name][1:-1, 1:-1, 1:-1]) for name in CELLS}
+    cells = {name: np.ascontiguousarray(state[name][1:-1, 1:-1, 1:-1]) for name in _cells([state])}
     place = np.arange(len(state["position"]), dtype=np.int64)
     return {**state, **cells, "counts": counts, "box": np.array([np.zeros(3, dtype=np.int64), counts]), "place": place}
 
@@ -42,13 +45,16 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
     Raises:
         ValueError: the pieces do not cover the domain, or lack something.
     """
-    missing = sorted({name for piece in pieces for name in (*like, "place", "box") if name not in piece})
+    missing = sorted({name for piece in pieces for name in (*like, "place", "box") if name not in (*piece, *LATER)})
     if missing or not pieces:
         raise ValueError(f"the pieces lack {', '.join(missing) or 'everything'}: they do not belong to this scene")
     order = np.argsort(np.concatenate([piece["place"] for piece in pieces]), kind="stable")
-    whole, covered = {}, 0
+    whole, covered, fields = {}, 0, _cells(pieces)
+    like = {name: values for name, values in like.items() if name not in LATER} | {
+        name: np.zeros(like["pressure"].shape, dtype) for name, dtype in LATER.items() if name in fields
+    }
     for name, values in like.items():
-        if name in CELLS:
+        if name in fields:
             whole[name] = np.array(values)
         elif values.ndim == 2:
             whole[name] = np.concatenate([piece[name] for piece in pieces])[order]
@@ -57,7 +63,7 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
     for piece in pieces:
         low, high = piece["box"] + 1  # a ring of cells lies around the domain
         covered += int(np.prod(high - low))
-        for name in CELLS:
+        for name in fields:
             whole[name][tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))] = piece[name]
     if covered != np.prod(pieces[0]["counts"]):
         raise ValueError("the pieces do not cover the domain: some are missing, or twice there")
@@ -84,7 +90,7 @@ def take_pieces(
     """
     with part.decomposition.collective.led():
         numbers = _numbers(pieces, [*particles, "place", *CELLS, "box"], signature)
-        cells = {name: np.zeros(part.box.counts[::-1], dtype=dtype) for name, dtype in CELLS.items()}
+        cells = {name: np.zeros(part.box.counts[::-1], dtype=dtype) for name, dtype in _cells(pieces).items()}
         own: Piece = {name: np.empty((0, 3), dtype=np.float32) for name in particles} | {"place": np.empty(0, dtype=np.int64)}
         covered, found = 0, [own]
         for piece in pieces:
@@ -104,6 +110,11 @@ def take_pieces(
         if base is not None and not np.array_equal(cells["cells"] == wl.SOLID, part.box_of(base.numpy()) == wl.SOLID):
             raise ValueError("the state's solids are not this scene's")
         return own, cells, numbers
+
+
+def _cells(pieces: Sequence[Piece]) -> dict[str, Any]:
+    """Return the names and types of what pieces have in cells."""
+    return CELLS | {name: dtype for name, dtype in LATER.items() if all(name in piece for piece in pieces)}
 
 
 def _numbers(pieces: Sequence[Piece], others: Sequence[str], signature: np.ndarray) -> dict[str, np.ndarray]:

@@ -29,6 +29,7 @@ RIVER = {
     "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.02)],
     "solid": [box([0.6, 0.0], [0.7, 0.2], motion={"kind": "translation", "velocity": [-0.4, 0.1]})],
     "wall_drag": {"coefficient": 0.1},
+    "solver": {"precision": "double"},
     "output": {"forces": True},
 }
 SCENES = {
@@ -41,6 +42,7 @@ SCENES = {
     "turning": DEEP | {"solid": [BLADE], "output": {"forces": True}},
     "river": FLAT | RIVER,
     "whole-cell river": FLAT | RIVER | {"solid": [], "domain": OPEN | {"solids": "voxel"}, "pressure": {"surface": "voxel"}},
+    "crowded": DEEP | {"density_correction": {"every": 2}, "solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 
@@ -85,7 +87,7 @@ def run(ranks: Ranks, folder: Path) -> None:
             (folder / f"{name}_{ranks.size}.json").write_text(json.dumps(rows))
 
 
-RESUMED = ("cut", "river")
+RESUMED = ("cut", "river", "crowded")
 
 
 def keep(ranks: Ranks, folder: Path) -> None:

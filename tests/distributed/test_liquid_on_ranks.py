@@ -46,9 +46,9 @@ def same(rows, expected, rel):
 
 
 def single(model_) -> LiquidSimulation:
-    """Return a simulation in one process that does what ranks do: nothing parts crowds, or gives bodies in flight their momenta back."""
+    """Return a simulation in one process that does what ranks do: nothing gives bodies in flight their momenta back."""
     simulation = create(model_)
-    simulation.flights = simulation.rearrangement.crowding = None
+    simulation.flights = None
     return simulation
 
 
@@ -57,7 +57,7 @@ def alone(model_, **options):
     return distributed.create(model_, Ranks(Seat(0, 1)), device="cpu", folder=Path(), **options)
 
 
-@pytest.mark.parametrize("name", ["flat", "cut", "voxel", "turning", "river", "whole-cell river"])
+@pytest.mark.parametrize("name", ["flat", "cut", "voxel", "turning", "river", "whole-cell river", "crowded"])
 def test_one_rank_is_one_process_bit_for_bit(name):
     one, shared = single(model(name)), alone(model(name))
     assert advance(shared, 6) == advance(one, 6)
@@ -185,7 +185,6 @@ def test_pieces_of_something_else_are_refused(change, message):
 @pytest.mark.parametrize(
     ("tables", "key"),
     [
-        (FLAT | {"density_correction": {}}, "density_correction"),
         (FLAT | {"particles": {"reseed": {}}}, "particles.reseed"),
         (FLAT | {"particles": {"narrow_band": {}}}, "particles.narrow_band"),
         (FLAT | {"pressure": {"model": "unilateral"}}, 'pressure.model = "unilateral"'),

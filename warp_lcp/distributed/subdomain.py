@@ -115,6 +115,17 @@ class Subdomain:
         low, high = self.owned.low, self.owned.high
         return field[low[0] - 1 : high[0] + 1, low[1] - 1 : high[1] + 1, low[2] - 1 : high[2] + 1]
 
+    def box_like(self, field: wp.array) -> wp.array:
+        """Return a field of the box with a ring: memory of the field itself where boxes are layers of planes, else one of zeros."""
+        view = self.stored_box_of(field)
+        return view if view.is_contiguous else wp.zeros(view.shape, dtype=field.dtype, device=self.grid.device)
+
+    def copy_to_box(self, field: wp.array, box: wp.array) -> None:
+        """Give a field of the box what one of the part holds, if it does not share its memory."""
+        view = self.stored_box_of(field)
+        if view.ptr != box.ptr:
+            wp.copy(box, view)
+
     def owners(self, cells: np.ndarray) -> np.ndarray:
         """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""
         place = [np.searchsorted(np.cumsum(part)[:-1], cells[:, axis], side="right") for axis, part in enumerate(self.decomposition.parts)]

@@ -72,7 +72,7 @@ class Crowding:
         self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
         self._crowd = WindowTally(CROWD, grid)
         self._density: wp.array | None = None
-        self._trail = Trail(grid.domain)
+        self._trail, self._counted = Trail(grid.domain), grid.domain
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:
         """Look at the material as it is; `found` then tells.
@@ -84,14 +84,22 @@ class Crowding:
         """
         if density is None:
             density = self._density = self.grid.field() if self._density is None else self._density
-            particle_density(self.grid, particles, window, self.particles_a_cell, density)
+            self._find(density, particles, window)
         b = self.boundary
         filled = {"base": b.base, "density": density, "capacity": b.capacity}
         self._crowd.take(self._trail.through(window), **filled, most=self.max_density)
 
+    def _find(self, density: wp.array, particles: Particles, window: Window) -> None:
+        """Find the particles' density."""
+        particle_density(self.grid, particles, window, self.particles_a_cell, density)
+
+    def _read(self) -> list[float]:
+        """Return what is beyond what cells may hold, what there is, and the largest density."""
+        return self._crowd.read(self._counted)
+
     def found(self) -> tuple[float, float]:
         """Return which share of the material is beyond what cells may hold, and the largest density, that at rest being 1."""
-        above, held, densest = self._crowd.read(self.grid.domain)
+        above, held, densest = self._read()
         return above / held if held > 0.0 else 0.0, densest
 
 
@@ -171,6 +179,7 @@ class DensityCorrection:
             self._lower = grid.field(wp.float64)
         self._shift = wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device) if boundary.open or even else None
         self._problem: wl.LCP | None = None  # built when there is material: an empty problem is refused
+        self._solved = grid.domain  # the cells of the problem
 
     def apply(
         self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None, share: float = 1.0
@@ -184,9 +193,7 @@ class DensityCorrection:
             contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`; None: they do not.
             share: of the displacement that particles go.
         """
-        if particles.offsets is not None:
-            particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
-        particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
+        self._find_density(particles, window)
         if fill is not None:
             fill(window, self.density)
         over_full, most = self._prepare(contact)
@@ -197,14 +204,26 @@ class DensityCorrection:
         if result.status in (wl.SolveStatus.INFEASIBLE, wl.SolveStatus.NON_FINITE):  # a closed room is too full: there is no way out
             self.x.zero_()
             return Correction(result, over_full, most)
-        convert(result.x.flatten(), self.x.flatten())
+        self._take(result.x)
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None
             fields = {"x": self.x, "kind": self._kind, "open": open_, "density": self.density, "capacity": self.boundary.capacity}
             self.grid.domain.run(self._displace, **fields, axis=axis, most=longest, dx=share * self.grid.spacing, d=field)
-        self.boundary.displace(self.displacement, particles.position)
+        self._displace_particles(particles)
         return Correction(result, over_full, most)
+
+    def _find_density(self, particles: Particles, window: Window) -> None:
+        if particles.offsets is not None:
+            particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
+        particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
+
+    def _displace_particles(self, particles: Particles) -> None:
+        self.boundary.displace(self.displacement, particles.position)
+
+    def _take(self, x: wp.array) -> None:
+        """Take the solution of the problem."""
+        convert(x.flatten(), self.x.flatten())
 
     def _prepare(self, contact: wp.array | None) -> tuple[int, float]:
         """Set up the problem; return how many cells are over-full, and the largest density."""
@@ -217,22 +236,32 @@ class DensityCorrection:
             "capacity": b.capacity,
             "inside": self._inside,
         }
-        domain, lacking = self.grid.domain, 0.0
-        self._over.take(domain, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
+        lacking = 0.0
+        self._over.take(self._solved, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
         if self._inside is not None:
             numbers: dict[str, Any] = {"least": min(most, 2.0 - most), "planes": self.grid.planes - 1}
-            self._lacking.take(domain, **fields, **numbers, lower=self._lower)
+            self._join()
+            self._lacking.take(self._solved, **fields, **numbers, lower=self._lower)
             (lacking,) = self._lacking.read()
         full, densest = self._over.read()
-        return int(full + lacking), densest
+        return self._counts(full + lacking, densest)
+
+    def _join(self) -> None:
+        """Take what else is known of the cells that are inside, before those deep inside are told by them."""
+
+    def _counts(self, full: float, densest: float) -> tuple[int, float]:
+        return int(full), densest
 
     def _solve(self, over_full: int) -> wl.SolveResult:
         if self._problem is None:
-            faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
-            cells = self.grid.interior(self._kind.numpy())
-            self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-            self._problem = wl.LCP(self._operator, self._b, 0.0 if self._lower is None else self._lower, np.inf)
+            self._problem = self._make_problem()
             self._work = self.solver.init(self._problem)
-        self._operator.update(self._kind)
+        self._operator.update(self._cells)
         criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations)
-        return wl.solve(self._problem, self.solver, stopping=criteria, x0=self.x, workspace=self._work)
+        return wl.solve(self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work)
+
+    def _make_problem(self) -> wl.LCP:
+        faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
+        self._cells, self._guess = self._kind, self.x
+        self._operator = wl.GridPoisson(self.grid.interior(self._kind.numpy()), shift=self._shift, device=self.grid.device, **faces)
+        return wl.LCP(self._operator, self._b, 0.0 if self._lower is None else self._lower, np.inf)

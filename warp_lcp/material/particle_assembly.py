@@ -303,8 +303,10 @@ def make_reseeding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
     return Reseeding(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
 
 
-def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> DensityCorrection:
-    """Return what moves the particles of a scene apart.
+def make_density_correction(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., DensityCorrection] = DensityCorrection
+) -> DensityCorrection:
+    """Return what moves the particles of a scene apart, made by what takes the arguments of `DensityCorrection`.
 
     Raises:
         ValueError: the scene has none.
@@ -313,27 +315,29 @@ def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary:
     if settings is None:
         raise ValueError("density_correction.every = 0: must be at least 1")
     solver = wl.ProjectedMultigrid(precision=scene.solver.precision)
-    return DensityCorrection(
+    return make(
         grid, boundary, solver, particles_a_cell=scene.particles.per_axis**grid.dimension,
         max_density=settings.largest(scene.particles.per_axis), every=settings.every, gain=scene.correction_gain, even=scene.keeps_volume,
         tolerance=settings.tolerance,
     )  # fmt: skip
 
 
-def make_crowding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, shared: bool = False) -> Crowding | None:
+def make_crowding(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., Crowding] = Crowding
+) -> Crowding | None:
     """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are.
 
     Args:
         scene: the scene.
         grid: its grid.
         boundary: its solids.
-        shared: whether others have parts of it, which would have to agree.
+        make: takes the arguments of `Crowding`.
     """
     settings = scene.correction
-    if scene.density_correction is not None or settings is None or shared:
+    if scene.density_correction is not None or settings is None:
         return None
     count = scene.particles.per_axis
-    return Crowding(grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count))
+    return make(grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count))
 
 
 def _body(solid: SolidProperties, geometry: Geometry, name: str, friction: float, dimension: int) -> RigidBody:

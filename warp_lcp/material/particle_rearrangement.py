@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import warp as wp
@@ -12,7 +12,7 @@ from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.density_correction import DensityCorrection
+from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.particle_assembly import make_crowding, make_density_correction, make_reseeding
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.simulation import Stopwatch
@@ -35,7 +35,8 @@ class Rearrangement:
         scene: what asks for it.
         grid: its grid.
         boundary: its solids.
-        shared: whether others have parts of the grid.
+        crowding: makes what tells when to act.
+        correction: makes what moves apart.
 
     Attributes:
         reseeding: what evens out; None: the scene does not ask for it.
@@ -43,10 +44,13 @@ class Rearrangement:
         correction: what moves apart; None: it has not acted yet, or never does.
     """
 
-    def __init__(self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, shared: bool = False) -> None:
+    def __init__(
+        self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, crowding: Callable[..., Crowding] = Crowding,
+        correction: Callable[..., DensityCorrection] = DensityCorrection,
+    ) -> None:  # fmt: skip
         """Make what the scene asks for."""
-        self._scene, self._grid, self._boundary, self._shared = scene, grid, boundary, shared
-        self.reseeding, self.crowding = make_reseeding(scene, grid, boundary), make_crowding(scene, grid, boundary, shared=shared)
+        self._scene, self._grid, self._boundary, self._make = scene, grid, boundary, correction
+        self.reseeding, self.crowding = make_reseeding(scene, grid, boundary), make_crowding(scene, grid, boundary, crowding)
         self.correction: DensityCorrection | None = None
         settings = scene.correction
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
@@ -121,7 +125,7 @@ class Rearrangement:
         return min(1.0, dt / self._pace) if self.crowding is not None and self._pace > 0.0 else 1.0
 
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the log's columns that `apply` fills, on ranks too, where none does: a log goes on on any number of them."""
+        """Return the names of the log's columns that `apply` fills."""
         evens = ("reseeded",) if self.reseeding is not None else ()
         return (*evens, *CORRECTION_COLUMNS) if self._scene.correction is not None else evens
 
@@ -129,8 +133,8 @@ class Rearrangement:
         """Return why nothing keeps the particles apart where the scene leaves that to the program."""
         if self._scene.density_correction is not None or self.crowding is not None:
             return []
-        where = "on a periodic axis" if self._scene.endless else "on several processes" if self._shared else ""
-        return [f"particles that crowd are not moved apart {where}: there is no density correction"] if where else []
+        none = "particles that crowd are not moved apart on a periodic axis: there is no density correction"
+        return [none] if self._scene.endless else []
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the solution that the next correction starts from, if there was one."""
@@ -147,4 +151,4 @@ class Rearrangement:
             self.correction.x.assign(state[STATE])
 
     def _made(self) -> DensityCorrection:
-        return make_density_correction(self._scene, self._grid, self._boundary)
+        return make_density_correction(self._scene, self._grid, self._boundary, self._make)

@@ -119,9 +119,12 @@ class ParticleSimulation(ParticleFrames):
         if not (self.shared or self.band is not None or scene.endless):  # without an interior, and ends where the grid does
             self.vicinity = Vicinity(grid, self.vicinity)
         self.flights = self._flights()
-        self.rearrangement = Rearrangement(scene, grid, self.boundary, shared=self.shared)
+        self.rearrangement = self._rearrangement()
         self.surface_mesh = make_surface_mesh(scene, grid, self.boundary)
         self.particle_volume = make_particle_volume(scene, grid, self.boundary)
+
+    def _rearrangement(self) -> Rearrangement:
+        return Rearrangement(self.scene, self.grid, self.boundary)
 
     def _flights(self) -> Flights | None:
         s = self.scene
@@ -321,7 +324,7 @@ class ParticleSimulation(ParticleFrames):
             window, contact = self.window(after), self.known_contact()
             rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, dt, self.watch, fill, contact)
             if self.outlets is not None:  # the density correction may push particles out through open sides
-                exchanged["departed"] += self.outlets.remove_departed(self.particles)
+                exchanged["departed"] += self._remove_departed(self.outlets)
             after = self.checked_totals("after the density correction of")
         self.particles.totals_stay(True)
         self.time += dt
@@ -502,6 +505,10 @@ class ParticleSimulation(ParticleFrames):
                     drained, departed = drained + swallowed, departed + gone
             emitted = self.sources.emit(self.particles, *span) if self.sources is not None else 0
         return {"emitted": emitted, "drained": drained, "departed": departed}
+
+    def _remove_departed(self, outlets: Outlets) -> int:
+        """Remove the particles that have crossed an open side, and return how many."""
+        return outlets.remove_departed(self.particles)
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
         moved = Moved(self.particle_mass, self.gravity, self._velocity_before, dt, self.kick_dt)

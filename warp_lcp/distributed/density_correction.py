@@ -1,0 +1,114 @@
+"""Particles of several ranks that crowd: they are told by all, and moved apart by one LCP of all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
+from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import Trail, Window
+from warp_lcp.material.density_correction import Crowding, DensityCorrection
+from warp_lcp.rows.vectors import convert
+
+UNSORTED = 1  # a step in which particles are not sorted: ghosts come, and each goes to its rank
+
+
+class SharedCrowding(Crowding):
+    """How much of the material of all ranks is in over-full cells; `measure` and `found` are collective.
+
+    Args:
+        part: where this rank works.
+        settings: as of `Crowding`, the part's grid among them.
+    """
+
+    def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
+        super().__init__(*settings, **more)
+        self.part, self._counted, self._trail = part, part.owned, Trail(part.owned)
+        self._known: tuple[float, float] | None = None
+
+    def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:
+        """Look at the material as it is."""
+        super().measure(density, particles, window)
+        self._known = None
+
+    def _find(self, density: wp.array, particles: Particles, window: Window) -> None:
+        assert isinstance(particles, SharedParticles), "particles of ranks"
+        particles.arrange(UNSORTED)
+        super()._find(density, particles, window)
+        particles.drop_ghosts()
+        self.part.fill(density)
+
+    def found(self) -> tuple[float, float]:
+        """Return which share of the material is beyond what cells may hold, and the largest density."""
+        if self._known is None:
+            self._known = super().found()
+        return self._known
+
+    def _read(self) -> list[float]:
+        above, held, densest = super()._read()
+        return [*self.part.ranks.sum(np.array([above, held])).tolist(), self.part.ranks.max(densest)]
+
+
+class SharedDensityCorrection(DensityCorrection):
+    """What moves particles of several ranks apart; `apply` is collective.
+
+    Args:
+        part: where this rank works.
+        settings: as of `DensityCorrection`, the part's grid among them.
+    """
+
+    def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
+        super().__init__(*settings, **more)
+        self.part, self._solved = part, part.owned
+        self._boxes: list[Any] = [None if f is None else part.box_like(f) for f in self._fields]
+        self._cells, self._rhs, self._guess, _, _ = self._boxes
+
+    @property
+    def _fields(self) -> list[Any]:
+        return [self._kind, self._b, self.x, self._lower, self._shift]
+
+    def _find_density(self, particles: Particles, window: Window) -> None:
+        assert isinstance(particles, SharedParticles), "particles of ranks"
+        particles.arrange(UNSORTED)
+        super()._find_density(particles, window)
+        particles.drop_ghosts()
+        self.part.fill(self.density)
+
+    def _join(self) -> None:
+        self.part.fill(self._inside)
+
+    def _counts(self, full: float, densest: float) -> tuple[int, float]:
+        return int(self.part.ranks.sum(full)), float(self.part.ranks.max(densest))
+
+    def _make_problem(self) -> wl.LCP:
+        faces = {}
+        for axis, field in zip("xyz", self.boundary.open, strict=False):
+            face = faces[f"face_{axis}"] = self.part.box_like(field)
+            self.part.copy_to_box(field, face)
+        *_, lower, shift = self._boxes
+        cells = self._cells.numpy()[1:-1, 1:-1, 1:-1]
+        self._operator = DistributedGridPoisson(self.part.decomposition, cells, shift=shift, device=self.grid.device, **faces)
+        self._faces = faces
+        return wl.LCP(self._operator, self._rhs, 0.0 if lower is None else lower, np.inf)
+
+    def _solve(self, over_full: int) -> wl.SolveResult:
+        for field, box in zip(self._fields, self._boxes, strict=True):
+            if box is not None:
+                self.part.copy_to_box(field, box)
+        if self.boundary.moves and self._problem is not None:
+            for field, face in zip(self.boundary.open, self._faces.values(), strict=True):
+                self.part.copy_to_box(field, face)
+        return super()._solve(over_full)
+
+    def _take(self, x: wp.array) -> None:
+        if x.dtype is not wp.float64:
+            convert(x.flatten(), self._guess.flatten())
+            x = self._guess
+        wp.copy(self.part.box_of(self.x), x.reshape(self._rhs.shape)[1:-1, 1:-1, 1:-1])
+        self.part.fill(self.x, self._kind)
