@@ -62,7 +62,7 @@ def export_run(folder: Path, file: Path, *, show: Show | None = None, first: int
             with replacing(file) as temporary:
                 whole.replace(temporary)
     except (OSError, Tf.ErrorException) as error:
-        why = error.strerror if isinstance(error, OSError) else str(error).strip().splitlines()[-1].strip()
+        why = error.strerror if isinstance(error, OSError) else error.args[0].commentary  # of the first thing that went wrong
         raise RenderError(f"{file}: cannot be written: {why}") from error
 
 
