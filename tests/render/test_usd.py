@@ -220,6 +220,15 @@ def test_solids_stand_and_move(dots, tmp_path):
     assert prim(stage, "solid_2").GetAttribute("orientation").Get() == "leftHanded"
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_usd_s_own_validators_find_nothing(falls, tmp_path, dimension):
+    validation = pytest.importorskip("pxr.UsdValidation", reason="of a later usd-core")
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    stage = exported(falls[dimension], tmp_path / "fall.usdc", show=Show.BOTH)
+    assert len(validators) > 10
+    assert [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)] == []
+
+
 @pytest.mark.parametrize("name", ["run.usdc", "run.usda", "run.USD"])
 def test_kinds_of_files(dots, tmp_path, name):
     folder = write_run(tmp_path / "run", [[ball([0.2 + 0.1 * number, 0.5, 0.5], 0.1)] for number in range(4)], size=ROOM)
