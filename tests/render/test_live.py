@@ -51,6 +51,17 @@ def arrays(body: bytes) -> dict[str, np.ndarray]:
     return found
 
 
+def test_solids_that_move_are_where_they_are(dots, tmp_path):
+    motion = "motion = { kind = 'translation', velocity = [4.0, 0.0] }\n"
+    folder = write_run(tmp_path / "run", [[dots_at([0.1, 0.1, 0.0])]] * 3, SOLID.replace("[0.5, 0.5]", "[0.3, 0.5]") + motion)
+    with serving(folder) as server:
+        for number in range(3):
+            status, body = ask(server, f"/frame?number={number}")
+            assert status == 200
+            points = arrays(body)["solids"].reshape(-1, 3)
+            np.testing.assert_allclose(points.mean(axis=0), [0.3 + 4.0 * number / 20, 0.5, 0.0], atol=0.01)
+
+
 def dots_at(*points: list[float]) -> Points:
     return Points("particles", np.array(points, dtype=np.float32), {"velocity": np.full((len(points), 3), 2.0, dtype=np.float32)})
 

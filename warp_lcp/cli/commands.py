@@ -1,4 +1,4 @@
-"""The command line: `warp-lcp run | render | view | check | tune | scenes | schema | solve | bench | info`."""
+"""The command line: `warp-lcp run | render | view | serve | export | check | tune | scenes | schema | solve | bench | info`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 import warp as wp
 
 from warp_lcp.cli.ending import FAILED, WRONG_INPUT, end, wrong_input
-from warp_lcp.cli.shown import looked_on, render, serve, view
+from warp_lcp.cli.shown import export, looked_on, render, serve, view
 from warp_lcp.cli.solve_file import Outcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks
@@ -148,7 +148,7 @@ def run(
     _report(record, folder)
 
 
-for command in (render, view, serve):  # after `run`, in the list of commands
+for command in (render, view, serve, export):  # after `run`, in the list of commands
     app.command()(command)
 
 

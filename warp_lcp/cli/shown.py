@@ -1,4 +1,4 @@
-"""The commands that show what a run writes: `render`, `view`, `serve`, and the last two while it is at work."""
+"""The commands that show what a run writes: `render`, `view`, `serve`, the last two while it is at work too; and `export`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from warp_lcp.render.film import check_rate
 from warp_lcp.render.live import PORT, live_server, served
 from warp_lcp.render.recording import Color, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
+from warp_lcp.render.usd import export_run
 from warp_lcp.render.viewer import view_run
 from warp_lcp.run.devices import devices
 from warp_lcp.run.progress import Observer
@@ -23,7 +24,7 @@ from warp_lcp.run.terminal import Terminal, tell
 
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]
 ShowOption = Annotated[
-    Show | None, typer.Option(help="What is drawn; the surface where the run wrote one, else particles.", show_default=False)
+    Show | None, typer.Option(help="What is shown; the surface where the run wrote one, else particles.", show_default=False)
 ]
 ColorOption = Annotated[
     Color | None, typer.Option(help="What colors the particles, on one scale for the whole run; speed unless given.", show_default=False)
@@ -97,6 +98,23 @@ def serve(
         tell(f"{folder}: {server.address}  (Ctrl-C ends)")
         with suppress(KeyboardInterrupt):
             server.serve_forever()
+
+
+def export(
+    folder: RunArgument,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="A .usdc, .usda (text) or .usd file.", show_default=False)],
+    show: ShowOption = None,
+    first: Annotated[int | None, typer.Option(metavar="N", help="The first frame; the run's unless given.", show_default=False)] = None,
+    last: Annotated[int | None, typer.Option(metavar="N", help="The last frame; the run's unless given.", show_default=False)] = None,
+) -> None:
+    """Write a run's frames into one USD file, for Blender, Houdini and Maya (needs the extra `usd`)."""
+    devices()
+    count = 0
+    with wrong_input(), Terminal(stderr=True).status("writing") as status:
+        for number in export_run(folder, out, show=show, first=first, last=last):
+            status.update(f"wrote frame {number}")
+            count += 1
+    tell(f"{out}: {count} frames")
 
 
 class _Begun:

@@ -109,7 +109,10 @@ class Live:
     @cached_property
     def _solids(self) -> list[tuple[Any, Any]]:
         scene = self._recording.scene
-        return [(solid.to_geometry(Path(), scene.dimension), solid.motion) for solid in prescribed_solids(scene)]
+        return [
+            (solid.to_geometry(Path(), scene.dimension), solid.motion.to_motion(scene.dimension) if solid.motion else None)
+            for solid in prescribed_solids(scene)
+        ]
 
     def _solid_points(self, time: float) -> np.ndarray:
         """Return points [m] on the solids' surfaces at a time, shape (n, 3)."""

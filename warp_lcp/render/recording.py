@@ -17,7 +17,7 @@ from warp_lcp.frames.vti import read_vti
 from warp_lcp.frames.vtu import read_vtu
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
-from warp_lcp.simulation import Cells, InputError, Surface
+from warp_lcp.simulation import Cells, InputError, Points, Surface
 
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
@@ -168,9 +168,27 @@ class Recording:
             RenderError: a file cannot be read, or lacks a field.
         """
         points, values = (np.zeros((0, 3)), np.zeros(0)) if self.show is Show.SURFACE else self.read(number)
-        surface = self._surface("surface", number) if self.show is not Show.PARTICLES else None
+        surface = self.surface(number) if self.show is not Show.PARTICLES else None
         filled = self._cells(number) if self.cells and self._file("grid", number).is_file() else None
         return Frame(self.scene.time.frame_time(number), points, values, surface, self.bodies(number), filled)
+
+    def surface(self, number: int) -> Surface:
+        """Return the surface of the material in a frame.
+
+        Raises:
+            RenderError: the file cannot be read.
+        """
+        return self._surface("surface", number)
+
+    def particles(self, number: int) -> Points:
+        """Return the particles of a frame, those at finite positions, with their fields.
+
+        Raises:
+            RenderError: the file cannot be read.
+        """
+        mesh = _read(self._file("particles", number))
+        finite = np.isfinite(mesh.points).all(axis=1)
+        return Points("particles", mesh.points[finite], {name: values[finite] for name, values in mesh.fields.items()})
 
     def bodies(self, number: int) -> Surface | None:
         """Return the surfaces of the rigid bodies in a frame; None if the run has none.
@@ -187,17 +205,17 @@ class Recording:
         Raises:
             RenderError: a file cannot be read, or lacks the field that colors the particles.
         """
-        mesh = _read(self._file("particles", number))
-        points = np.asarray(mesh.points, dtype=np.float64)
+        particles = self.particles(number)
+        points = np.asarray(particles.points, dtype=np.float64)
         if self.color is Color.PRESSURE:
             values = self._pressure(number, points)
         elif self.color in LABELS:
-            values = self._field(mesh.fields, self.color)
+            values = self._field(particles.fields, self.color)
         elif self.color is Color.SPEED:
-            values = np.linalg.norm(self._field(mesh.fields, "velocity", 3), axis=1)
+            values = np.linalg.norm(self._field(particles.fields, "velocity", 3), axis=1)
         else:
             values = np.zeros(len(points))
-        finite = np.isfinite(points).all(axis=1) & np.isfinite(values)
+        finite = np.isfinite(values)
         return points[finite], values[finite]
 
     @cached_property
@@ -215,7 +233,7 @@ class Recording:
 
     def particle_spacing(self) -> float:
         """Return how far apart neighbors are at the start [m], from the number of particles in the cells that hold some."""
-        points = self.read(self.numbers[0])[0] if self.show is not Show.SURFACE else np.zeros((0, 3))
+        points = self.particles(self.numbers[0]).points if self.show is not Show.SURFACE else np.zeros((0, 3))
         if not len(points):
             return self.scene.spacing
         cells = np.unique(np.floor(points / self.scene.spacing), axis=0)

@@ -1,0 +1,269 @@
+"""A run's frames as one USD file, which Blender, Houdini and Maya read. Needs the extra `usd`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from warp_lcp.files.atomic import make_folder, replacing
+from warp_lcp.render.actors import BODY_COLORS, SURFACES
+from warp_lcp.render.recording import Recording, RenderError, Show
+from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
+from warp_lcp.rigid.outline import body_surface
+from warp_lcp.scene.shapes import PlaneTable
+from warp_lcp.simulation import Surface
+
+INSTALL = "pip install 'warp-lcp[usd]'"
+TEXT = ".usda"
+SUFFIXES = (".usdc", TEXT, ".usd")
+LINE_WIDTH = 0.1  # of outlines in 2-D, in cells
+DISPLAY_GAMMA = 2.2  # colors of USD are linear
+
+
+def export_run(folder: Path, file: Path, *, show: Show | None = None, first: int | None = None, last: int | None = None) -> Iterator[int]:
+    """Write frames of a run into a USD file, one after the other; yield the number of each when it is written.
+
+    A time code is the number of a frame; y is up, lengths are in meters, velocities in meters per second. The file appears when whole.
+
+    Args:
+        folder: of the run.
+        file: `.usdc` and `.usd` are binary, `.usda` is text.
+        show: what of the material is written; see `Recording`.
+        first: the number of the first frame; that of the run's unless given.
+        last: the number of the last frame.
+
+    Raises:
+        RenderError: USD is missing, there are no such frames, or the file cannot be written.
+        SceneError: the run's scene cannot be read.
+    """
+    suffix = usd_suffix(file)
+    try:
+        from pxr import Tf, Usd, UsdGeom  # noqa: F401
+    except ImportError as error:
+        raise RenderError(f"export needs USD, which cannot be loaded ({error}): {INSTALL}") from error
+    recording = Recording(folder, show=show)
+    numbers = [number for number in recording.numbers if (first is None or first <= number) and (last is None or number <= last)]
+    if not numbers:
+        asked = " ".join(f"--{name} {number}" for name, number in (("first", first), ("last", last)) if number is not None)
+        raise RenderError(f"{asked}: there are no such frames; the run has {recording.numbers[0]} to {recording.numbers[-1]}")
+    try:
+        make_folder(file.parent)
+        with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as scratch:
+            stage = Stage(Path(scratch) / "frames.usdc", recording, numbers)
+            for number in numbers:
+                stage.add(number)
+                yield number
+            whole = stage.saved_as(suffix)
+            with replacing(file) as temporary:
+                whole.replace(temporary)
+    except (OSError, Tf.ErrorException) as error:
+        why = error.strerror if isinstance(error, OSError) else error.args[0].commentary  # of the first thing that went wrong
+        raise RenderError(f"{file}: cannot be written: {why}") from error
+
+
+def usd_suffix(file: Path) -> str:
+    """Return the suffix of a USD file.
+
+    Raises:
+        RenderError: it is none of USD's, or the file is a folder.
+    """
+    suffix = file.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise RenderError(f"--out {file}: must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    if file.is_dir():
+        raise RenderError(f"--out {file}: is a folder; name a file")
+    return suffix
+
+
+class Stage:
+    """A stage that grows by frames; what has been added is on the disk, so that one frame at a time is in memory.
+
+    Args:
+        crate: the file, `.usdc`, which is not there yet.
+        recording: of the run.
+        numbers: of the frames that are to be added.
+    """
+
+    def __init__(self, crate: Path, recording: Recording, numbers: Sequence[int]) -> None:
+        """Write what all frames share."""
+        from pxr import Tf, Usd, UsdGeom
+
+        scene = recording.scene
+        self._crate, self._recording, self._dimension = crate, recording, scene.dimension
+        self._time, self._rate, self._always = scene.time, scene.time.frames_per_second, Usd.TimeCode.Default()
+        self._stage = stage = Usd.Stage.CreateNew(str(crate))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(self._rate)
+        stage.SetFramesPerSecond(self._rate)
+        stage.SetStartTimeCode(self._code(numbers[0]))
+        stage.SetEndTimeCode(self._code(numbers[-1]))
+        self._root = f"/{Tf.MakeValidIdentifier(scene.scene.name)}"
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, self._root).GetPrim())
+        color = SURFACES[scene.palette]["color"]
+        self._line_width = LINE_WIDTH * scene.spacing if self._dimension == 2 else 0.0
+        self._spacing = recording.particle_spacing()
+        self._surface = self._shape("surface", color) if recording.show is not Show.PARTICLES else None
+        if self._surface is not None and self._dimension == 3:
+            self._surface.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        self._particles = self._points(color) if recording.show is not Show.SURFACE else None
+        self._moving = self._solids()
+        self._bodies: dict[int, tuple[np.ndarray, Any]] = {}
+
+    def add(self, number: int) -> None:
+        """Add a frame.
+
+        Raises:
+            RenderError: it cannot be read.
+        """
+        code = self._code(number)
+        if self._surface is not None:
+            surface = self._recording.surface(number)
+            self._set_shape(self._surface, surface.points, surface.corners, code, surface.fields.get("velocity"))
+            if self._dimension == 3:
+                self._surface.GetNormalsAttr().Set(_vectors(vertex_normals(surface)), code)
+        if self._particles is not None:
+            particles = self._recording.particles(number)
+            _set_points(self._particles, particles.points, code, particles.fields.get("velocity"), self._spacing)
+        if (bodies := self._recording.bodies(number)) is not None:
+            self._set_bodies(bodies, code)
+        for motion, place in self._moving:
+            pose = motion.pose(self._time.frame_time(number))
+            place.Set(_matrix(pose.rotation, pose.translation), code)
+        self._stage.Save()
+
+    def saved_as(self, suffix: str) -> Path:
+        """Close the stage; return its file, another one with text if the suffix is that of text."""
+        file = self._crate
+        if suffix == TEXT:
+            file = file.with_suffix(suffix)
+            self._stage.GetRootLayer().Export(str(file))
+        self._stage = None
+        return file
+
+    def _code(self, number: int) -> float:
+        """Return the time code of a frame: its number, a little less at the end of a run that ends between two frames."""
+        return round(self._time.frame_time(number) * self._rate, 6)
+
+    def _solids(self) -> list[tuple[Any, Any]]:
+        """Write the solids whose places the scene tells; return the motions of those that move, with what places them."""
+        moving = []
+        for number, solid in enumerate(prescribed_solids(self._recording.scene)):
+            if isinstance(solid, PlaneTable):  # has no surface that ends
+                continue
+            outline = body_surface(solid.to_geometry(Path(), self._dimension), self._dimension)
+            shape = self._shape(f"solid_{number}", SOLID)
+            self._set_shape(shape, outline.points, outline.corners, self._always)
+            if solid.invert:  # a container is seen from within
+                shape.CreateOrientationAttr("leftHanded")
+            if solid.motion:
+                moving.append((solid.motion.to_motion(self._dimension), shape.AddTransformOp()))
+        return moving
+
+    def _set_bodies(self, bodies: Surface, code: float) -> None:
+        """Place rigid bodies, each of which has its shape once, about its middle."""
+        of_point = np.asarray(bodies.fields["body"]).ravel()
+        for body in np.unique(of_point):
+            own = of_point == body
+            middle = bodies.points[own].mean(axis=0)
+            points = bodies.points[own] - middle
+            if body not in self._bodies:
+                shape = self._shape(f"body_{body}", BODY_COLORS[body % len(BODY_COLORS)])
+                corners = bodies.corners[own[bodies.corners[:, 0]]]
+                self._set_shape(shape, points, (np.cumsum(own) - 1)[corners], self._always)
+                self._bodies[body] = points, shape.AddTransformOp()
+            at_first, place = self._bodies[body]
+            place.Set(_matrix(Rotation.align_vectors(points, at_first)[0].as_matrix(), middle), code)
+
+    def _shape(self, name: str, color: str) -> Any:
+        """Define what has triangles, in 2-D segments, each a curve."""
+        from pxr import UsdGeom
+
+        path = f"{self._root}/{name}"
+        if self._dimension == 3:
+            shape = UsdGeom.Mesh.Define(self._stage, path)
+            shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        else:
+            shape = UsdGeom.BasisCurves.Define(self._stage, path)
+            shape.CreateTypeAttr(UsdGeom.Tokens.linear)
+            _set_width(shape, self._line_width)
+        shape.CreateDisplayColorAttr(_color(color))
+        return shape
+
+    def _points(self, color: str) -> Any:
+        """Define the particles."""
+        from pxr import UsdGeom
+
+        points = UsdGeom.Points.Define(self._stage, f"{self._root}/particles")
+        _set_width(points, self._spacing)
+        points.CreateDisplayColorAttr(_color(color))
+        return points
+
+    def _set_shape(self, shape: Any, points: np.ndarray, corners: np.ndarray, when: Any, velocity: np.ndarray | None = None) -> None:
+        counts = _integers(np.full(len(corners), corners.shape[1]))
+        if self._dimension == 3:
+            shape.GetFaceVertexCountsAttr().Set(counts, when)
+            shape.GetFaceVertexIndicesAttr().Set(_integers(corners.ravel()), when)
+        else:
+            ends = corners.ravel()
+            points, velocity = points[ends], None if velocity is None else velocity[ends]
+            shape.GetCurveVertexCountsAttr().Set(counts, when)
+        _set_points(shape, points, when, velocity, self._line_width)
+
+
+def vertex_normals(surface: Surface) -> np.ndarray:
+    """Return unit normals of a surface of triangles at its points, shape (n, 3): means of those around, weighed by area."""
+    a, b, c = np.moveaxis(surface.points[surface.corners], 1, 0)
+    twice_area = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    sums = [np.bincount(surface.corners.ravel(), weights=of, minlength=len(surface.points)) for of in twice_area.T]
+    normals = np.stack(sums, axis=-1)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny))
+
+
+def _set_points(prim: Any, points: np.ndarray, when: Any, velocity: np.ndarray | None, width: float) -> None:
+    """Give a prim its points [m], their velocities [m/s] and the box around them, at a time code."""
+    prim.GetPointsAttr().Set(_vectors(points), when)
+    if velocity is not None:
+        prim.GetVelocitiesAttr().Set(_vectors(velocity), when)
+    extent = [points.min(axis=0) - 0.5 * width, points.max(axis=0) + 0.5 * width] if len(points) else np.zeros((2, 3))
+    prim.GetExtentAttr().Set(_vectors(np.asarray(extent)), when)
+
+
+def _set_width(prim: Any, width: float) -> None:
+    """Give all points of curves or of a cloud one width [m]."""
+    from pxr import UsdGeom
+
+    prim.CreateWidthsAttr([width])
+    prim.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+
+
+def _vectors(values: np.ndarray) -> Any:
+    from pxr import Vt
+
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(np.nan_to_num(values), dtype=np.float32))
+
+
+def _integers(values: np.ndarray) -> Any:
+    from pxr import Vt
+
+    return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32))
+
+
+def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Any:
+    """Return a change of place as USD has it, for rows."""
+    from pxr import Gf
+
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[3, :3] = rotation.T, translation
+    return Gf.Matrix4d(matrix.tolist())
+
+
+def _color(code: str) -> Any:
+    """Return a color such as #4aa9ee as USD has it."""
+    parts = [int(code[place : place + 2], 16) / 255 for place in (1, 3, 5)]
+    return _vectors(np.array([parts]) ** DISPLAY_GAMMA)
