@@ -26,6 +26,7 @@ from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.sources import SharedSources
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.fluids.distributed_pressure import DistributedPressure
+from warp_lcp.fluids.distributed_probes import SharedProbes
 from warp_lcp.fluids.distributed_state import CELLS, Piece, piece_of, take_pieces
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
@@ -100,6 +101,7 @@ class DistributedLiquid(LiquidSimulation):
         self.part = part
         self._dt = 0.0
         super().__init__(scene, part.grid, parts, particles, **more)
+        self.probes = SharedProbes(part, scene.probe, self.gravity, part.dimension) if scene.probe else None
         self._everyone = int(part.ranks.sum(particles.count))
 
     def _surface(self) -> FreeSurface:
@@ -395,7 +397,6 @@ def refusals(scene: LiquidScene) -> list[str]:
         'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
         "output.surface": output.surface,
         "output.volume": output.volume,
-        "probe": scene.probe,
     }
     return [key for key, wanted in asked.items() if wanted]
 

@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_lcp.fluids.tables import Probe
 from warp_lcp.grid.cell_kernel import F32, F64, I8, interpolated
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.particle_log import Row
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
@@ -16,7 +17,8 @@ if typing.TYPE_CHECKING:
 
 _FLUID, _SOLID = wp.constant(wp.int8(FLUID)), wp.constant(wp.int8(SOLID))
 STEP = wp.constant(0.25)  # cells between two looks for the surface
-VALUES = 5  # of a probe: pressure over density, velocity, level
+VALUES = 6  # of a probe: pressure over density, velocity, level, and whether that is where the search ended, in liquid
+FAR = 1e9  # cells: farther than any grid
 
 options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.probes"}
 
@@ -58,11 +60,12 @@ def depth_of(x: wp.vec3, planes: int, shape: wp.vec3i, kind: I8, phi: F32):
 @typing.no_type_check
 def probe_kernel(
     points: wp.array(dtype=wp.vec3), counts: wp.vec3i, planes: int, kind: I8, x: F64, phi: F32, u: F32, v: F32, w: F32,
-    kick: wp.vec3, up: wp.vec3, values: wp.array2d(dtype=wp.float64),
+    kick: wp.vec3, up: wp.vec3, reach: wp.array(dtype=wp.vec2), values: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
     """Find x [m/s], velocity [m/s] and level [cells] at points in array coordinates, in which cell i reaches from i to i + 1.
 
-    `kick` [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points against it and has length 1.
+    `kick` [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points against it and has length 1. The surface is
+    looked for between two distances from the point, `reach` [cells].
     """
     t = wp.tid()
     shape = counts + wp.vec3i(2, 2, 2)
@@ -72,7 +75,7 @@ def probe_kernel(
     for axis in range(planes + 1):
         inside = inside and p[axis] >= 1.0 and p[axis] <= float(counts[axis]) + 1.0
         cell[axis] = wp.clamp(int(p[axis]), 1, counts[axis])
-    for n in range(5):
+    for n in range(6):
         values[t, n] = wp.float64(0.0)
     c = p - wp.vec3(0.5, 0.5, 0.5)
     wet = bool(False)
@@ -99,20 +102,22 @@ def probe_kernel(
         values[t, 2] = wp.float64(interpolated(v, planes, c[0], p[1], c[2]))
         if planes == 2:
             values[t, 3] = wp.float64(interpolated(w, planes, c[0], c[1], p[2]))
-    if inside:
-        room = float(1.0e9)  # to the grid's end
+    if reach[t][0] < reach[t][1]:
+        room = reach[t][1]  # or to the grid's end
         for axis in range(planes + 1):
             if up[axis] != 0.0:
                 end = wp.where(up[axis] > 0.0, float(counts[axis]) + 1.0, 1.0)
                 room = wp.min(room, (end - p[axis]) / up[axis])
-        deep, total = depth_of(c, planes, shape, kind, phi)
-        level = float(0.0)
+        level = reach[t][0]
+        deep, total = depth_of(c + level * up, planes, shape, kind, phi)
         looking = bool(deep > 0.0)
         while looking:
             way = wp.min(STEP, room - level)
             last = deep
             deep, total = depth_of(c + (level + way) * up, planes, shape, kind, phi)
             looking = total > 0.0 and way > 0.0
+            if way <= 0.0:
+                values[t, 5] = wp.float64(1.0)
             if looking:
                 if deep <= 0.0:
                     level += way * last / (last - deep)
@@ -151,17 +156,24 @@ class Probes:
         found, scale = self._measure(simulation), simulation.scene.physics.density * simulation.grid.spacing / simulation.kick_dt
         row: Row = {}
         for probe, values in zip(self.probes, found, strict=True):
-            shown = {"pressure": values[:1] * scale, "velocity": values[1:4], "level": values[4:] * simulation.grid.spacing}
+            shown = {"pressure": values[:1] * scale, "velocity": values[1:4], "level": values[4:5] * simulation.grid.spacing}
             row |= dict(zip(probe.columns(self.dimension), shown[probe.quantity].tolist(), strict=False))
         return row
+
+    def _reach(self, grid: StaggeredGrid) -> np.ndarray:
+        """Return between which distances from each probe the surface is looked for [cells], shape (probes, 2)."""
+        cells = grid.to_grid(self._points)[:, : grid.dimension] - grid.origin[: grid.dimension]
+        inside = np.all((cells >= 1.0) & (cells <= np.array(grid.counts[: grid.dimension]) + 1.0), axis=1, keepdims=True)
+        return np.where(inside, [0.0, FAR], 0.0)
 
     def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
         """Return x [m/s], velocity [m/s] and level [cells] of each probe."""
         grid, projection, velocity = simulation.grid, simulation.projection, [*simulation.velocity, None][:3]
         points = wp.array((grid.to_grid(self._points) - grid.origin).astype(np.float32), dtype=wp.vec3, device=grid.device)
+        reach = wp.array(self._reach(grid).astype(np.float32), dtype=wp.vec2, device=grid.device)
         values = wp.zeros((len(self.probes), VALUES), dtype=wp.float64, device=grid.device)
         fields = [projection.kind, projection.pressure, simulation.surface.phi, *velocity]
         kick = wp.vec3(*(self.gravity * simulation.kick_dt))
-        inputs = [points, wp.vec3i(*grid.counts), grid.planes, *fields, kick, wp.vec3(*self._up), values]
+        inputs = [points, wp.vec3i(*grid.counts), grid.planes, *fields, kick, wp.vec3(*self._up), reach, values]
         wp.launch(probe_kernel, len(self.probes), inputs, device=grid.device)
         return np.asarray(values.numpy())

@@ -23,6 +23,12 @@ DEEP = {"size": [1.0, 0.5, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0, 0.0
 DROP = box([0.6, 0.3, 0.1], [0.8, 0.45, 0.3], velocity=[-1.0, 0.5, 0.7])
 BLADE = box([0.2, 0.1, 0.2], [0.7, 0.25, 0.26], motion={"kind": "rotation", "rate": 300.0, "axis": [0, 1, 0], "center": [0.45, 0, 0.23]})
 OPEN = {"size": FLAT["size"], "resolution": 32, "wall": "separating", "open": ["right"]}
+PROBES = [
+    {"name": f"{what}_{n}", "position": place, "quantity": what}
+    for n, place in enumerate(([0.3, 0.1, 0.2], [0.26, 0.01, 0.4], [0.9, 0.05, 0.1], [0.51, 0.3, 0.25]))
+    for what in ("pressure", "velocity", "level")
+]
+TILTED = {"physics": {"gravity": [3.0, -8.0, 2.0]}}
 RIVER = {
     "domain": OPEN,
     "source": [box([0.0, 0.2], [0.1, 0.4], velocity=[1.5, 0.2], stop=0.08)],
@@ -42,6 +48,8 @@ SCENES = {
     "turning": DEEP | {"solid": [BLADE], "output": {"forces": True}},
     "river": FLAT | RIVER,
     "whole-cell river": FLAT | RIVER | {"solid": [], "domain": OPEN | {"solids": "voxel"}, "pressure": {"surface": "voxel"}},
+    "probes": DEEP | {"probe": PROBES, "solid": [BALL]},
+    "probes, tilted": DEEP | TILTED | {"probe": PROBES, "pressure": {"surface": "voxel"}},
     "crowded": DEEP | {"density_correction": {"every": 2}, "solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }

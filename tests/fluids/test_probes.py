@@ -12,7 +12,6 @@ from pydantic import ValidationError
 from small_liquids import GRAVITY, advance, box, create, scene
 from small_runs import run_into
 from warp_lcp.fluids import LiquidScene, LiquidSimulation
-from warp_lcp.fluids.distributed import refusals
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import Measured, SimulationFailed
 
@@ -212,8 +211,3 @@ def test_wrong_probes_are_refused(wrong: dict[str, Any], said: str) -> None:
     physics = {"gravity": wrong.pop("gravity", [0.0, -9.81])}
     with pytest.raises(ValidationError, match=said):
         tank(2, [probe("b", [0.1, 0.1]), probe("a", [0.1, 0.1]) | wrong], physics=physics)
-
-
-def test_ranks_have_none() -> None:
-    model = scene(size=[0.8, 0.8], resolution=20, liquid=[box([0, 0], [0.8, 0.4])], probe=[probe("a", [0.1, 0.1])], output={"forces": True})
-    assert {"probe", "output.forces"} <= set(refusals(model))
