@@ -18,8 +18,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
 from warp_lcp.distributed.decomposition import Decomposition, balanced_processes, pool
+from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
