@@ -28,13 +28,14 @@ from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.fluids.distributed_pressure import DistributedPressure
 from warp_lcp.fluids.distributed_probes import SharedProbes
 from warp_lcp.fluids.distributed_state import CELLS, Piece, piece_of, take_pieces
+from warp_lcp.fluids.distributed_tension import SharedSurfaceTension
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
-from warp_lcp.fluids.simulator import LiquidSimulation, make_surface, pressure_settings
+from warp_lcp.fluids.simulator import LiquidSimulation, make_surface, make_tension, pressure_settings
 from warp_lcp.fluids.surface import FreeSurface, WholeCellSurface
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.sides import side_bits
-from warp_lcp.grid.staggered import Window
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_assembly import Parts, make_outlets, make_sources, placed_solids, seed_materials, start_velocities
 from warp_lcp.material.particle_log import Row
@@ -103,6 +104,13 @@ class DistributedLiquid(LiquidSimulation):
         super().__init__(scene, part.grid, parts, particles, **more)
         self.probes = SharedProbes(part, scene.probe, self.gravity, part.dimension) if scene.probe else None
         self._everyone = int(part.ranks.sum(particles.count))
+
+    def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
+        """Allocate what belongs to the part."""
+        super().lay(grid, parts)
+        if self.tension is not None:
+            self.tension = make_tension(self.scene, grid, self.boundary, self.surface, partial(SharedSurfaceTension, self.part))
+            self.projection.jump = None if self.tension is None else self.tension.jump
 
     def _surface(self) -> FreeSurface:
         part = self.part
@@ -393,7 +401,6 @@ def refusals(scene: LiquidScene) -> list[str]:
         "viscosity": scene.viscosity,
         "particles.narrow_band": particles.narrow_band,
         "particles.reseed": particles.reseed,
-        "surface_tension": scene.surface_tension,
         'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
         "output.surface": output.surface,
         "output.volume": output.volume,

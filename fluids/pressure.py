@@ -55,7 +55,7 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
         return RowPass(f"{module}.{name}", path, F64, box=box, numbers=numbers, constants=CONSTANTS | flags, optional=optional, **more)
 
     liquid, faces = {"u": F32, "v": F32, "w": F32, "touch": U8}, {"x": F64, "field": F32, "known": I8}
-    problem = {"previous": F64, "b": F64, "lower": F64, "start": F64, "shift": F32}
+    problem = {"previous": F64, "b": F64, "lower": F64, "start": F64, "shift": F32, "jump": F32}
     return SimpleNamespace(
         prepare=made("prepare", liquid | problem, {"ratio": F64}),
         subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
@@ -106,7 +106,8 @@ class PressureProjection:
         y_i = b_i + sum over faces of (a_f / theta_f) (x_i - x_neighbor),   b_i = sum of s_f [a_f u*_f + (1 - a_f) u_s,f],   x = 0 in AIR,
 
     is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is not open on a separating wall have
-    0 <= x complementary to y >= 0, the others y = 0. Whole cells have a = 0 or 1, a surface on the cells' faces theta = 1: without
+    0 <= x complementary to y >= 0, the others y = 0 (beside a surface whose tension pulls its `jump` takes the place of 0: no air gets
+    between liquid and wall against it). Whole cells have a = 0 or 1, a surface on the cells' faces theta = 1: without
     solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal. Beyond an open side of
     the domain lies AIR that the operator does not have: its faces add a_f / theta_f.
 
@@ -186,6 +187,7 @@ class PressureProjection:
         if self._problem is None:
             return False
         problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
+        problem["jump"] = self.jump
         self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, ratio=self._ratio)
         self._update()
         return True

@@ -70,13 +70,15 @@ def make_surface(
     return WholeCellSurface(grid, boundary, particles_a_cell=count, fill=fill)
 
 
-def make_tension(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface) -> SurfaceTension | None:
-    """Return the surface tension of a scene; None: it has none, or no surface."""
+def make_tension(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, make: Callable[..., SurfaceTension] = SurfaceTension
+) -> SurfaceTension | None:
+    """Return the surface tension of a scene, made by what takes the arguments of `SurfaceTension`; None: it has none, or no surface."""
     given = scene.surface_tension
     if given is None or surface.phi is None:
         return None
     settings = {"coefficient": given.coefficient, "contact_angle": given.contact_angle, "density": scene.physics.density}
-    return SurfaceTension(grid, boundary, surface.phi, **settings)
+    return make(grid, boundary, surface.phi, **settings)
 
 
 def pressure_settings(scene: LiquidScene, surface: FreeSurface, weights: list[wp.array]) -> dict[str, Any]:
@@ -220,9 +222,7 @@ class LiquidSimulation(ParticleSimulation):
             p, fields = self.particles, (self.viscosity.relative, self.weights)  # which stay what they are
             particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets)
         self._find_surface(window)
-        viscous: Row = {}
-        if self.viscosity is not None:
-            viscous = self._rub(self.viscosity, window, dt, speed)
+        viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
         projected = self._project(window, dt, speed)
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):

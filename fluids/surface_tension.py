@@ -64,7 +64,7 @@ class SurfaceTension:
         self.jump, self._fields = grid.field(), [grid.field() for _ in range(3)]
         self._passes = kernels.push_pass(bool(boundary.open))
         self._energy = WindowTally(self._passes.energy, grid)
-        self._blocked = grid.field(wp.int8)
+        self._blocked, self._counted = grid.field(wp.int8), grid.domain
         self._find_walls()
 
     def longest_step(self) -> float:
@@ -101,9 +101,11 @@ class SurfaceTension:
         self._shares = {"once": once, "twice": twice, "planes": planes, **_profile(passes)}
         (bend,) = (field for field in self._fields if field is not once and field is not twice)
         window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=float(grid.dimension - 1))  # a radius of one cell
+        self._join(bend)
         self._continue(bend, 0, 0.0)  # the nearest point of the surface may lie in a wall
         scale = kick_dt * self.coefficient / (self.density * grid.spacing**2)
         window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=scale)
+        self._join(self.jump)
         for axis, field in enumerate(velocity):
             window.run(self._passes.push, **self._faces(kind), planes=planes, jump=self.jump, field=field, axis=axis)
 
@@ -124,14 +126,19 @@ class SurfaceTension:
 
     def measure(self, window: Window, kind: wp.array) -> None:
         """Find the energy, for `energy` to tell."""
-        box = window.common(self.grid.domain)
-        assert box is not None, "a window has cells of the domain"
-        self._energy.take(box, **self._faces(kind), **self._shares)
+        box = window.common(self._counted)
+        self._measured = box is not None
+        if box is not None:
+            self._energy.take(box, **self._faces(kind), **self._shares)
 
     def energy(self) -> float:
         """Return the energy of surface and wet walls when it was last measured [J; J/m in 2-D]: sigma (area - cos(angle) wet area)."""
-        area, wetted = self._energy.read()
+        area, wetted = self._areas()
         return self.coefficient * (area - self._cosine * wetted) * self.grid.spacing ** (self.grid.dimension - 1)
+
+    def _areas(self) -> list[float]:
+        """Return the areas of surface and wet walls, in faces of cells."""
+        return self._energy.read() if self._measured else [0.0, 0.0]
 
     def _faces(self, kind: wp.array) -> dict[str, Any]:
         open_faces = {f"open_{axis}": field for axis, field in zip("xyz", [*self.boundary.open, None, None, None], strict=False)}
@@ -143,9 +150,14 @@ class SurfaceTension:
         for done in range(1, passes + 1):
             out = free[done % 2]
             window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
+            if done % 2 == 0 or done == passes:  # a pass looks a cell far, and what goes on into walls three
+                self._join(out)
             self._continue(out, before + done, self._cosine)
             source = out
         return source
+
+    def _join(self, field: wp.array) -> None:
+        """Take what others know of a field, before it is looked at beside a cell."""
 
     def _continue(self, field: wp.array, passes: int, cosine: float) -> None:
         """Continue a share into walls, after so many passes; with a cosine of 0 whatever a field has."""

@@ -8,6 +8,23 @@ SIMD8 for (int i = first; i < last; ++i) {
     if (BOUNDED) lower[i] = fluid ? bound : -INFINITY;
     start[i] = fluid ? (x < bound ? bound : x) : 0.0;
 }
+// Where the surface itself pulls, with a pressure below that of the air, no air gets to the wall before the pressure is below that.
+if (BOUNDED && jump) {
+    const long long steps[6] = {-1, 1, -s2, s2, -sz, sz};
+    for (int i = first; i < last; ++i) {
+        if (!(lower[i] == 0.0)) continue;
+        double least = 0.0;
+        for (int n = 0; n < 2*planes + 2; ++n) {
+            const long long air = i + steps[n];
+            if (kind[air] != AIR) continue;
+            const float pull = jump[i] < jump[air] ? jump[i] : jump[air];
+            least = pull < least ? pull : least;
+        }
+        const double x = previous[i]*ratio;
+        lower[i] = least;
+        start[i] = x < least ? least : x;
+    }
+}
 // What the diagonal of a FLUID cell has more than the operator knows: air nearer than a cell away, and the air beyond open sides.
 if (shift) {
     const int nx = given.kind.shape[2] - 2, ny = given.kind.shape[1] - 2, nz = given.kind.shape[0] - 2;

@@ -50,6 +50,7 @@ SCENES = {
     "whole-cell river": FLAT | RIVER | {"solid": [], "domain": OPEN | {"solids": "voxel"}, "pressure": {"surface": "voxel"}},
     "probes": DEEP | {"probe": PROBES, "solid": [BALL]},
     "probes, tilted": DEEP | TILTED | {"probe": PROBES, "pressure": {"surface": "voxel"}},
+    "drops": DEEP | {"surface_tension": {"coefficient": 5.0, "contact_angle": 60.0}, "solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "crowded": DEEP | {"density_correction": {"every": 2}, "solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }

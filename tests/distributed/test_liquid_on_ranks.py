@@ -58,7 +58,7 @@ def alone(model_, **options):
     return distributed.create(model_, Ranks(Seat(0, 1)), device="cpu", folder=Path(), **options)
 
 
-@pytest.mark.parametrize("name", ["flat", "cut", "voxel", "turning", "river", "whole-cell river", "crowded"])
+@pytest.mark.parametrize("name", ["flat", "cut", "voxel", "turning", "river", "whole-cell river", "drops", "crowded"])
 def test_one_rank_is_one_process_bit_for_bit(name):
     one, shared = single(model(name)), alone(model(name))
     assert advance(shared, 6) == advance(one, 6)
@@ -193,7 +193,6 @@ def test_pieces_of_something_else_are_refused(change, message):
         (DEEP | {"output": {"volume": True}}, "output.volume"),
         (FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], mass=10.0)]}, r"solid\[0\].mass"),
         (FLAT | {"viscosity": {"value": 1.0}}, "viscosity"),
-        (FLAT | {"surface_tension": {"coefficient": 0.07}}, "surface_tension"),
     ],
 )
 def test_what_ranks_have_not_is_refused_by_name(tables, key):

@@ -11,7 +11,6 @@ from scipy.optimize import curve_fit
 import warp_lcp as wl
 from small_liquids import advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.fluids.distributed import refusals
 from warp_lcp.fluids.surface_tension import MOST_PASSES, SurfaceTension, wall_cells
 
 SIGMA, RHO, RADIUS = 0.072, 1000.0, 0.01  # of water [N/m, kg/m^3], and of drops [m]
@@ -312,9 +311,19 @@ def test_what_cannot_be_is_refused(tables: dict[str, Any], message: str) -> None
         scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])], **tables)
 
 
-def test_several_ranks_refuse_it() -> None:
-    model = scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])], surface_tension=WATER)
-    assert "surface_tension" in refusals(model)
+@pytest.mark.parametrize("angle", [20.0, 60.0, 100.0, 150.0])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_splash_is_no_faster_where_walls_let_go(dimension: int, angle: float) -> None:
+    """What the surface pulls with beside a wall that lets go is borne by the liquid there, however near to its center the surface lies."""
+    low, high = [0.1, 0.2, 0.3][:dimension], [0.5, 0.4, 0.5][:dimension]
+    drop = [box([0.6, 0.3, 0.1][:dimension], [0.8, 0.45, 0.3][:dimension], velocity=[-1.0, 0.5, 0.7][:dimension])]
+    ball = [{"shape": "sphere", "center": [0.5, 0.15, 0.25][:dimension], "radius": 0.12}]
+    tables = {"surface_tension": {"coefficient": 5.0, "contact_angle": angle}, "solid": ball, "liquid": [box(low, high), *drop]}
+    fastest = {}
+    for wall in ("separating", "free-slip"):
+        simulation = create(scene(size=[1.0, 0.5, 0.5][:dimension], resolution={2: 40, 3: 24}[dimension], wall=wall, **tables))
+        fastest[wall] = max(row["max_speed"] for row in advance(simulation, 0.15, 0.01))
+    assert fastest["separating"] < 1.2 * fastest["free-slip"]
 
 
 def test_a_full_box_has_no_surface() -> None:
