@@ -28,6 +28,7 @@ PROBES = [
     for n, place in enumerate(([0.3, 0.1, 0.2], [0.26, 0.01, 0.4], [0.9, 0.05, 0.1], [0.51, 0.3, 0.25]))
     for what in ("pressure", "velocity", "level")
 ]
+CAPILLARY = {"surface_tension": {"coefficient": 5.0, "contact_angle": 60.0}, "solver": {"precision": "double"}}
 TILTED = {"physics": {"gravity": [3.0, -8.0, 2.0]}}
 RIVER = {
     "domain": OPEN,
@@ -50,7 +51,7 @@ SCENES = {
     "whole-cell river": FLAT | RIVER | {"solid": [], "domain": OPEN | {"solids": "voxel"}, "pressure": {"surface": "voxel"}},
     "probes": DEEP | {"probe": PROBES, "solid": [BALL]},
     "probes, tilted": DEEP | TILTED | {"probe": PROBES, "pressure": {"surface": "voxel"}},
-    "drops": DEEP | {"surface_tension": {"coefficient": 5.0, "contact_angle": 60.0}, "solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
+    "drops": DEEP | CAPILLARY | {"solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "crowded": DEEP | {"density_correction": {"every": 2}, "solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -128,8 +129,9 @@ class Bounds:
         return not self.in_place or bool(self._other_values()) == (self.code is not self._memory)
 
     def _other_values(self) -> float:
-        """Return how many finite values other than 0 the last coding has met."""
-        return float(self._others.reading.numpy()[0])
+        """Return how many finite values other than 0 the last coding has met, on all ranks."""
+        found, across = float(self._others.reading.numpy()[0]), self.layout.across
+        return found if across is None else float(across.sum(found))
 
     def as_field(self, side: int) -> wp.array[Any]:
         """Return a stored float64 field of the lower (0) or the upper bound (1)."""
@@ -151,17 +153,22 @@ class Bounds:
         return field
 
     def _code_from_host(self, sides: tuple[Array, Array]) -> bool:
-        """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
-        code, values = self.layout.host_zeros(wp.uint8), list(self.values)
+        """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN.
+
+        Where ranks share the problem all code, or none.
+        """
+        code, values, across = self.layout.host_zeros(wp.uint8), list(self.values), self.layout.across
         for side in (0, 1):
             host = real_array(sides[side], NAMES[side])
             if not self.varying[side]:
                 code += np.uint8(BITS[side] * bool(np.isfinite(values[side])))
                 continue
-            if not self.layout.fits(host) or host.dtype.kind not in "fiu":
-                return False
-            value = float(host.max() if side == 0 else host.min())
-            if value == -INFINITE[side] or np.isnan(value) or not self._code_rows(side, host, value, code):
+            takes = self.layout.fits(host) and host.dtype.kind in "fiu"
+            value = float(host.max() if side == 0 else host.min()) if takes else math.nan
+            if across is not None:
+                value = float(across.max(value) if side == 0 else across.min(value))
+            coded = not (value == -INFINITE[side] or np.isnan(value)) and self._code_rows(side, host, value, code)
+            if not coded if across is None else across.any(not coded):
                 return False
             values[side] = value
         self.values = values
