@@ -54,6 +54,7 @@ def test_kernels(tmp_path):
     assert {"rate", "bandwidth", "of_copy", "over Warp, one thread a cell"} <= product["figures"].keys()
 
 
+@pytest.mark.slow
 def test_solvers(tmp_path):
     records = measured(tmp_path, "solvers", "--size", 16)
     case = records["16^3 unit walls ProjectedMultigrid"]["figures"]
