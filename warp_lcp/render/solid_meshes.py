@@ -199,5 +199,5 @@ def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:
         for end, sign in ((0.0, 1.0), (size[axis], -1.0)):
             if mesh.n_points and (sign * (mesh.points[:, axis] - end)).min() < -1e-6 * size[axis]:
                 normal, origin = sign * np.eye(3)[axis], end * np.eye(3)[axis]
-                mesh = mesh.clip_closed_surface(normal=normal, origin=origin) if closed else mesh.clip(-normal, origin)
+                mesh = mesh.clip_closed_surface(normal=normal, origin=origin) if closed else mesh.clip(-normal, origin=origin)
     return mesh
