@@ -345,7 +345,12 @@ def test_containers_do_not_hide_what_is_in_them(pyvista, make_run):
 def test_liquid_is_lit_from_above_and_drops_are_not():
     block = np.stack(np.meshgrid(*[np.arange(0.025, 1.0, 0.05)] * 3), axis=-1).reshape(-1, 3)
     drop = np.array([[3.0, 3.0, 3.0]])
-    light = shaded(np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1, "water").mean(axis=1)
+    colors, outer = shaded(np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1, "water")
+    light = colors.mean(axis=1)
+    depth = (0.5 - np.abs(block - 0.5)).min(axis=1)  # only what lies deep inside need not be drawn
+    assert outer[-1]
+    assert outer[:-1][depth < 0.1].all()
+    assert not outer[:-1][depth > 0.3].any()
     middle = (np.abs(block[:, [0, 2]] - 0.5) < 0.1).all(axis=1)
     top, bottom, core = (light[:-1][middle & (np.abs(block[:, 1] - y) < 0.03)].mean() for y in (0.975, 0.025, 0.525))
     assert top > bottom + 20

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from warp_lcp.run.progress import WINDOW, Bar, Lines, describe, time_left
+from warp_lcp.run.progress import WINDOW, Bar, Count, Lines, describe, time_left
 
 ROW = {"step": 3, "time": 0.5, "dt": 0.01, "solve_iterations": 5, "solve_residual": 2.5e-5, "volume": None}
 
@@ -72,3 +72,30 @@ def test_bar_shows_the_step():
     assert "a [note]" in stream.getvalue()
     assert "50%" in stream.getvalue()
     assert "5 iterations" in stream.getvalue()
+
+
+def test_a_count_has_a_line_now_and_then():
+    stream, now = io.StringIO(), 0.0
+    with Count(Console(file=stream, width=200), "drawing", "images", lambda: now) as told:
+        told(0, 12)
+        for done in range(1, 13):
+            now += 2.0
+            told(done, 12)
+    told_of = [3, 6, 9]  # each 5 s later than the one before, and not the end, which has words of its own
+    lines = [f"drawing: {done} of 12 images  0:00:{2 * (12 - done):02d} left" for done in told_of]
+    assert stream.getvalue().splitlines() == lines
+    quiet = io.StringIO()
+    with Count(Console(file=quiet, quiet=True), "drawing", "images", lambda: now) as told:
+        told(0, 2)
+        now += 60.0
+        told(1, 2)
+    assert quiet.getvalue() == ""
+
+
+def test_a_count_changes_in_place_on_a_terminal():
+    stream = io.StringIO()
+    with Count(Console(file=stream, width=200, force_terminal=True), "drawing", "images") as told:
+        told(0, 4)
+        told(2, 4)
+    assert "drawing" in stream.getvalue()
+    assert "\x1b[2K" in stream.getvalue()  # the line is erased

@@ -19,7 +19,7 @@ from warp_lcp.render.render import Looks, film_run, parse_size, render_run
 from warp_lcp.render.usd import export_run
 from warp_lcp.render.viewer import view_run
 from warp_lcp.run.devices import devices
-from warp_lcp.run.progress import Observer
+from warp_lcp.run.progress import Count, Observer
 from warp_lcp.run.terminal import Terminal, tell
 
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]
@@ -55,24 +55,18 @@ def render(
     overrides: CameraOption = None,
 ) -> None:
     """Draw a run's frames as PNG images or as a film (needs the extra `render`)."""
-    images = []
     devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
-    with wrong_input(), Terminal(stderr=True).status("drawing") as status:
+    with wrong_input(), Count(Terminal(stderr=True), "drawing", "images") as told:
         looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
         if film is not None:
             if frame or sheet or out:
                 raise RenderError("--film: shows all frames in one file; leave out --frame, --sheet and --out")
-            count = 0
-            for number in film_run(folder, film, looks=looks, rate=check_rate(fps)):
-                status.update(f"drew frame {number}")
-                count += 1
+            count = len(list(film_run(folder, film, looks=looks, rate=check_rate(fps), told=told)))
             tell(f"{film}: {count} frames")
             return
         if fps is not None:
             raise RenderError("--fps: is of a film; give --film")
-        for image in render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet):
-            images.append(image)
-            status.update(f"drew {image.name}")
+        images = list(render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet, told=told))
     tell(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
 
 
@@ -109,11 +103,8 @@ def export(
 ) -> None:
     """Write a run's frames into one USD file, for Blender, Houdini and Maya (needs the extra `usd`)."""
     devices()
-    count = 0
-    with wrong_input(), Terminal(stderr=True).status("writing") as status:
-        for number in export_run(folder, out, show=show, first=first, last=last):
-            status.update(f"wrote frame {number}")
-            count += 1
+    with wrong_input(), Count(Terminal(stderr=True), "writing", "frames") as told:
+        count = len(list(export_run(folder, out, show=show, first=first, last=last, told=told)))
     tell(f"{out}: {count} frames")
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from warp_lcp.render.sunlight import LIGHT
 from warp_lcp.scene.camera import THREE_QUARTERS
 from warp_lcp.simulation import Surface
 
@@ -25,10 +26,10 @@ SURFACES: dict[str, dict[str, Any]] = {  # in 3-D, by `Scene.palette`
 FILLS = {"water": ["#1254a2", "#78c4ee"], "sand": ["#aa7c46", "#deb87a"]}  # in 2-D, at the domain's bottom and at its top
 OUTLINES = {"water": "#0c3e80", "sand": "#78522a"}
 
-LIGHT = np.array([0.25, 0.9, 0.45]) / np.linalg.norm([0.25, 0.9, 0.45])  # from the domain to the light
 SHADES = {"water": np.array([1.4, 1.0, 0.7]), "sand": np.array([1.1, 1.3, 1.5])}  # shadows of water are blue, of sand brown
 SHEENS = {"water": 0.35, "sand": 0.0}  # how bright the lamp's mirror image is: sand has none
 GLINT = (LIGHT + THREE_QUARTERS) / np.linalg.norm(LIGHT + THREE_QUARTERS)  # the normal that mirrors the light into the camera
+HIDDEN_SLOPE, HIDDEN_DENSITY = 0.6, 6.0  # of the density in particles a cell: flatter and denser is deeper inside than two cells
 SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
 
 Drawn = tuple[Any, dict[str, Any]]  # a mesh of pyvista's, and how its plotter is to draw it
@@ -142,7 +143,7 @@ def is_round(points: np.ndarray, corners: np.ndarray) -> bool:
     return len(own) > BOX_POINTS and bool(np.ptp(distance) < ROUND * distance.max())
 
 
-def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, palette: str) -> np.ndarray:
+def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, palette: str) -> tuple[np.ndarray, np.ndarray]:
     """Light particles as the smooth surface of the liquid that they make up, whose normals point down the gradient of their density.
 
     Particles inside the liquid, and single drops, keep their color.
@@ -154,7 +155,7 @@ def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, palette: str)
         palette: of the material, a key of SHADES.
 
     Returns:
-        Colors as `colors`.
+        Colors as `colors`, and which particles are not hidden deep inside by the others, shape (n,).
     """
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     spacing = max(spacing, (float(np.prod(extent + 6 * spacing)) / SHADING_CELLS) ** (1 / 3))
@@ -170,4 +171,5 @@ def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, palette: str)
     light = 0.72 + 0.22 * facing + 0.14 * np.maximum(facing, 0.0)
     glint = SHEENS[palette] * np.maximum(normal @ GLINT, 0.0)[:, None] ** 40
     lit = np.clip(colors * (1.0 - flatness * SHADES[palette] * (1.0 - light)), 0.0, 255.0)
-    return cast(np.ndarray, lit + flatness * glint * (255.0 - lit))
+    outer = (steepness[:, 0] > HIDDEN_SLOPE) | (map_coordinates(density, at.T - 0.5, order=1) < HIDDEN_DENSITY)
+    return lit + flatness * glint * (255.0 - lit), outer

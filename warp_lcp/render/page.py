@@ -68,9 +68,10 @@ class Page:
         width, height = self.tile
         clock = self.recording.scene.time
         digits = 2 if clock.frames_per_second <= 100 else 3
-        for place, number in enumerate(numbers):
-            left, top = place % self.columns * width, self.line + place // self.columns * (height + self.caption)
-            figure.figimage(self.painter.draw(self.recording.frame(number)), left, self.size[1] - top - self.caption - height)
+        corners = [
+            (place % self.columns * width, self.line + place // self.columns * (height + self.caption)) for place in range(len(numbers))
+        ]
+        for number, (left, top) in zip(numbers, corners, strict=True):
             time = f"t = {clock.frame_time(number):.{digits}f} s"
             if self.caption:
                 self._write(figure, time, left + width / 2, top + self.caption / 2, "center")
@@ -80,7 +81,11 @@ class Page:
             self._write(figure, self.recording.scene.scene.name, 0.5 * self.line, 0.55 * self.line, "left")
         self._draw_legend(figure)
         canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3]
+        image = np.array(canvas.buffer_rgba())[..., :3]
+        for number, (left, top) in zip(numbers, corners, strict=True):  # Matplotlib would take as long as drawing them does
+            picture = image[top + self.caption : top + self.caption + height, left : left + width]
+            picture[:] = self.painter.draw(self.recording.frame(number))
+        return image
 
     def _tile(self, columns: int, pictures: int) -> tuple[int, int]:
         """Return the width and height of a picture when so many stand side by side."""

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.render.actors import LIGHT, Actors, Drawn, body_meshes, shaded, surface_meshes
-from warp_lcp.render.recording import Frame, Recording, Show
-from warp_lcp.render.solid_meshes import FlatSolids, RoomSolids, prescribed_solids
+from warp_lcp.render.actors import SHADES, Actors, Drawn, body_meshes, shaded, surface_meshes
+from warp_lcp.render.grains import grains
+from warp_lcp.render.recording import Color, Frame, Recording, Show
+from warp_lcp.render.solid_meshes import FlatSolids, RoomSolids, apart, prescribed_solids
+from warp_lcp.render.sunlight import LIGHT, SHADE, Sunlight, scattered
 from warp_lcp.scene.camera import viewpoint
 
 SAMPLES = 2  # per pixel and direction: images are drawn larger and averaged down, since splats have no other anti-aliasing
 SMALL = 0.25  # radius of particles that a surface is shown around, over their spacing
-BACKDROP = "#c9d5df"  # at the bottom, fading into white, below water, which white behind it would hide
+BACKDROPS = {"water": "#c9d5df", "other": "#e3e2df"}  # of rooms at the bottom, fading into white, which would hide water
 
 DISC = """//VTK::Color::Impl
 float distance2 = dot(offsetVCVSOutput.xy, offsetVCVSOutput.xy);
 if (distance2 > 1.0) discard;
 """
 BALL = DISC + "ambientColor *= 0.8 + 0.2 * sqrt(1.0 - distance2);\ndiffuseColor *= 0.8 + 0.2 * sqrt(1.0 - distance2);\n"
+GRAIN = (  # lit from above and before: where the lamp is, seen as cameras look unless told otherwise
+    DISC
+    + """vec3 normal = vec3(offsetVCVSOutput.xy, sqrt(1.0 - distance2));
+float light = 0.62 + 0.42 * max(dot(normal, vec3(0.0, 0.6, 0.8)), 0.0);
+ambientColor *= light;
+diffuseColor *= light;
+"""
+)
 
 
 class Picture:
@@ -39,12 +50,14 @@ class Picture:
         self.recording = recording
         self.flat = scene.dimension == 2
         share = SMALL if recording.show is Show.BOTH else 0.6 if self.flat else 0.8
-        self.radius = share * recording.particle_spacing()
+        self.spacing = recording.particle_spacing()
+        self.radius = share * self.spacing
+        self.grainy = scene.palette == "sand" and recording.show is Show.PARTICLES and recording.color in (Color.SPEED, Color.PLAIN)
         self.samples = 1 if plotter else SAMPLES
         self.plotter = plotter or pyvista.Plotter(off_screen=True, window_size=[SAMPLES * side for side in size], lighting="none")
         self.plotter.render_window.SetMultiSamples(0 if plotter is None else 8)  # 0 is three times as fast in software; SAMPLES smooths too
-        backdrop = recording.show is not Show.PARTICLES and scene.palette == "water" and not self.flat
-        self.plotter.set_background(BACKDROP if backdrop else "white", top="white")
+        water = recording.show is not Show.PARTICLES and scene.palette == "water"
+        self.plotter.set_background("white" if self.flat else BACKDROPS["water"] if water else BACKDROPS["other"], top="white")
         for position, kind, intensity in [(LIGHT, "scene light", 0.45), (np.array([0.0, 0.0, 1.0]), "headlight", 0.25)]:
             light = pyvista.Light(position=tuple(position), focal_point=(0, 0, 0), light_type=kind, intensity=intensity)
             self.plotter.add_light(light)
@@ -59,14 +72,26 @@ class Picture:
     def place(self, frame: Frame) -> None:
         """Exchange what is not there any more for what is there in a frame."""
         moving = [(solid, motion.pose(frame.time)) for solid, motion in self._moving]
-        self.actors.exchange("moving", self._solids.meshes(moving))
-        for actor in self.actors.exchange("particles", self._particles(frame)):
-            actor.mapper.SetSplatShaderCode(DISC if self.flat else BALL)
-            actor.mapper.scale_factor = self.radius
         size, width = self.scene.domain.size, self.samples
-        surface = [] if frame.surface is None else surface_meshes(frame.surface, self.scene.palette, size, width)
+        solids = self._solids.meshes(moving)
+        self.actors.exchange("moving", solids)
+        shown = frame.surface
+        if shown is not None and self._wet:
+            poses = [(geometry, motion.pose(frame.time) if motion else Pose.identity()) for geometry, motion in self._wet]
+            shown = apart(shown, poses, self.scene.spacing)
+        surface = [] if shown is None else surface_meshes(shown, self.scene.palette, size, width)
         self.actors.exchange("surface", surface)
-        self.actors.exchange("bodies", body_meshes(frame.bodies, self.bodies_at_first, 1.5 * width))
+        bodies = body_meshes(frame.bodies, self.bodies_at_first, 1.5 * width)
+        self.actors.exchange("bodies", bodies)
+        sun = None
+        if not self.flat:
+            surface_points = [mesh.points for mesh, _ in surface]
+            sun = Sunlight([self._shading, frame.points, *surface_points, self._casters([*solids, *bodies])], self.spacing)
+            self.actors.exchange("floor", [sun.floor(size)])
+        particles, radius = self._particles(frame, sun)
+        for actor in self.actors.exchange("particles", particles):
+            actor.mapper.SetSplatShaderCode(DISC if self.flat else GRAIN if self.grainy else BALL)
+            actor.mapper.scale_factor = radius
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return an image of a frame."""
@@ -87,16 +112,33 @@ class Picture:
         kind: Any = FlatSolids if self.flat else RoomSolids
         self._solids = kind(self.scene.domain.size, 2 * self.samples)
         standing = [(self._solids.prepared(solid), Pose.identity()) for solid in solids if not solid.motion]
-        self.actors.exchange("standing", [*self._solids.domain(), *self._solids.meshes(standing)])
+        meshes = self._solids.meshes(standing)
+        self.actors.exchange("standing", [*self._solids.domain(), *meshes])
+        self._shading = np.zeros((0, 3)) if self.flat else self._casters(meshes)
+        hidden = [] if self.flat or self.scene.palette != "water" else [solid for solid in solids if not solid.invert]
+        self._wet = [(solid.to_geometry(Path(), 3), solid.motion.to_motion(3) if solid.motion else None) for solid in hidden]
         self._moving = [(self._solids.prepared(solid), solid.motion.to_motion(self.scene.dimension)) for solid in solids if solid.motion]
 
-    def _particles(self, frame: Frame) -> list[Drawn]:
-        """Return particles as discs or balls, lit as the surface of the material that they make up."""
+    def _casters(self, meshes: list[Drawn]) -> np.ndarray:
+        """Return points [m] on what casts shadows: not on lines, and not on containers, through which one sees."""
+        return np.concatenate(
+            [np.zeros((0, 3)), *(scattered(mesh, self.spacing) for mesh, looks in meshes if not {"opacity", "line_width"} & looks.keys())]
+        )
+
+    def _particles(self, frame: Frame, sun: Sunlight | None) -> tuple[list[Drawn], float]:
+        """Return particles as discs or balls, sand as grains, lit as the surface that they make up, and their radius [m]."""
         import pyvista
 
-        if not len(frame.points):
-            return []
+        points, radius = frame.points, self.radius
+        if not len(points):
+            return [], radius
         colors = self.recording.scale.colors(frame.values)
-        lit = colors if self.flat else shaded(frame.points, colors, self.scene.spacing, self.scene.palette)
+        if sun is not None:
+            colors, outer = shaded(points, colors, self.scene.spacing, self.scene.palette)
+            points, colors = points[outer], colors[outer]
+            if self.grainy:
+                colors *= 1.0 - SHADE * SHADES[self.scene.palette] * (1.0 - sun.reaches(points)[:, None])
+        if self.grainy:
+            points, colors, radius = grains(points, colors, self.spacing, self.scene.domain.size)
         looks = {"style": "points_gaussian", "emissive": False, "render_points_as_spheres": True, "lighting": False}
-        return [(pyvista.PolyData(frame.points), {"scalars": lit.astype(np.uint8), "rgb": True, **looks})]
+        return [(pyvista.PolyData(points), {"scalars": colors.astype(np.uint8), "rgb": True, **looks})], radius

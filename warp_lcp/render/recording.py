@@ -26,7 +26,7 @@ SUFFIXES = (".vti", ".pvti", ".pvtu", ".vtu")  # of a frame's files; at most one
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 PALETTES = {  # of speeds, by `Scene.palette`
     "water": ("#0e3e8a", "#166abe", "#3aa0e0", "#82d0f0", "#cef0fa"),
-    "sand": ("#b08250", "#ca9e68", "#e0bc86", "#f2daac", "#fef6e2"),
+    "sand": ("#a8743e", "#bd8a50", "#d2a468", "#e4be82", "#f2d8a4"),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,9 +16,11 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.render.actors import Drawn
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import BoxTable, CapsuleTable, MeshTable, PlaneTable, Shape, SphereTable
+from warp_lcp.simulation import Surface
 
 OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
-FLAT_SOLID, SOLID, EDGE, FLOOR = "#bfc3c8", "#cdd1d5", "#6b7075", "#f1f2f3"
+TOUCHING = 0.75
+FLAT_SOLID, SOLID, EDGE = "#bfc3c8", "#cdd1d5", "#6b7075"
 
 
 class FlatSolids:
@@ -64,7 +67,7 @@ class FlatSolids:
 
 
 class RoomSolids:
-    """A floor and the edges of a box; solids are surfaces, containers (inverted shapes) their translucent far sides.
+    """The edges of a box; solids are surfaces, containers (inverted shapes) their translucent far sides.
 
     Args:
         size: of the domain [m].
@@ -75,15 +78,13 @@ class RoomSolids:
         self.size, self.line_width = np.array(size), line_width
 
     def domain(self) -> list[Drawn]:
-        """Return the edges of the domain, and its floor."""
+        """Return the edges of the domain."""
         import pyvista
 
         x, y, z = self.size
-        below = -1e-3 * y
-        floor = pyvista.Rectangle([[0.0, below, 0.0], [x, below, 0.0], [x, below, z]])
         edges = pyvista.Box((0.0, x, 0.0, y, 0.0, z)).extract_all_edges()
         line = {"color": EDGE, "line_width": 0.6 * self.line_width, "lighting": False}
-        return [(floor, {"color": FLOOR, "lighting": False}), (edges, line)]
+        return [(edges, line)]
 
     def prepared(self, solid: Shape) -> Outline:
         """Return what is needed to draw a solid."""
@@ -173,11 +174,30 @@ def nearest_distance(solids: Sequence[tuple[Geometry, Pose]], points: wp.array) 
     return nearest
 
 
+def apart(surface: Surface, solids: Sequence[tuple[Geometry, Pose]], spacing: float) -> Surface:
+    """Return a liquid's surface without what touches solids, which would show their sides once more through the liquid.
+
+    Args:
+        surface: closed triangles, whose normals point out of the liquid.
+        solids: and where they are.
+        spacing: a cell's edge [m]; the surface lies within `TOUCHING` of it at the solids that it touches.
+    """
+    corners = surface.points[surface.corners]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    middle = corners.mean(axis=1)
+    here, ahead = (
+        nearest_distance(solids, wp.array(middle + step * spacing * normal, dtype=wp.vec3, device="cpu")) for step in (0.0, TOUCHING)
+    )
+    touches = (here < TOUCHING * spacing) & (ahead < here - 0.5 * TOUCHING * spacing)
+    return replace(surface, corners=surface.corners[~touches])
+
+
 def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:
     """Cut a surface at the domain's walls, where it reaches beyond; a closed one is closed again there."""
     for axis in range(3):
         for end, sign in ((0.0, 1.0), (size[axis], -1.0)):
             if mesh.n_points and (sign * (mesh.points[:, axis] - end)).min() < -1e-6 * size[axis]:
                 normal, origin = sign * np.eye(3)[axis], end * np.eye(3)[axis]
-                mesh = mesh.clip_closed_surface(normal=normal, origin=origin) if closed else mesh.clip(-normal, origin)
+                mesh = mesh.clip_closed_surface(normal=normal, origin=origin) if closed else mesh.clip(-normal, origin=origin)
     return mesh

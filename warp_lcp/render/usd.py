@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,7 +25,15 @@ LINE_WIDTH = 0.1  # of outlines in 2-D, in cells
 DISPLAY_GAMMA = 2.2  # colors of USD are linear
 
 
-def export_run(folder: Path, file: Path, *, show: Show | None = None, first: int | None = None, last: int | None = None) -> Iterator[int]:
+def export_run(
+    folder: Path,
+    file: Path,
+    *,
+    show: Show | None = None,
+    first: int | None = None,
+    last: int | None = None,
+    told: Callable[[int, int], None] = lambda done, of: None,
+) -> Iterator[int]:
     """Write frames of a run into a USD file, one after the other; yield the number of each when it is written.
 
     A time code is the number of a frame; y is up, lengths are in meters, velocities in meters per second. The file appears when whole.
@@ -36,6 +44,7 @@ def export_run(folder: Path, file: Path, *, show: Show | None = None, first: int
         show: what of the material is written; see `Recording`.
         first: the number of the first frame; that of the run's unless given.
         last: the number of the last frame.
+        told: is called with how many frames are written, and how many there will be.
 
     Raises:
         RenderError: USD is missing, there are no such frames, or the file cannot be written.
@@ -55,8 +64,10 @@ def export_run(folder: Path, file: Path, *, show: Show | None = None, first: int
         make_folder(file.parent)
         with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as scratch:
             stage = Stage(Path(scratch) / "frames.usdc", recording, numbers)
-            for number in numbers:
+            told(0, len(numbers))
+            for done, number in enumerate(numbers, 1):
                 stage.add(number)
+                told(done, len(numbers))
                 yield number
             whole = stage.saved_as(suffix)
             with replacing(file) as temporary:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from datetime import timedelta
 from types import TracebackType
 from typing import Protocol, Self
@@ -19,6 +20,7 @@ from warp_lcp.run.terminal import say
 
 RESIDUALS = "coupled_residual", "solve_residual"  # the first that a log has is the one that the scene's tolerance is of
 CONVERGED = SolveStatus.CONVERGED.name
+LINE_EVERY = 5.0  # seconds between two lines of a count
 WINDOW = 20.0  # seconds of the recent past that the time left is judged by
 
 
@@ -121,6 +123,46 @@ class Bar:
 
     def frame(self, index: int, last: int) -> None:
         """Do nothing: the bar shows the time."""
+
+
+class Count:
+    """How many of a known number of things are done: a line that changes on a terminal, elsewhere a plain line every few seconds.
+
+    Args:
+        console: where it is told.
+        doing: what is done, `drawing`.
+        things: what there are so many of, `images`.
+        clock: tells seconds.
+    """
+
+    def __init__(self, console: Console, doing: str, things: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._console, self._doing, self._things, self._clock = console, doing, things, clock
+        self._status = console.status(doing)
+        self._progress = Progress(console=console, get_time=clock, speed_estimate_period=WINDOW)  # never shown
+        self._task = self._progress.add_task("", total=None)
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._status.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Leave nothing of the line that changes."""
+        self._status.stop()
+
+    def __call__(self, done: int, of: int) -> None:
+        """Learn how many are done; the first call, with none, begins."""
+        if not done:
+            _begin(self._progress, 0.0, of)
+            self._told = self._clock()
+            return
+        self._progress.update(self._task, completed=done)
+        text = f"{self._doing}: {done} of {of} {self._things}  {time_left(self._progress)}"
+        if self._console.is_terminal:
+            self._status.update(text)
+        elif done < of and self._clock() - self._told >= LINE_EVERY:
+            self._told = self._clock()
+            say(self._console, text)
 
 
 def _begin(progress: Progress, time: float, end: float) -> None:
