@@ -476,7 +476,16 @@ class FluidsSimulator:
         if not isinstance(scene, LiquidScene):
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
         solids = placed_solids(scene, folder)
-        bodies = make_bodies(scene, solids)
+        return self.assemble(scene, solids, make_bodies(scene, solids), device=device, folder=folder, wall_velocity=wall_velocity)
+
+    def assemble(
+        self, scene: LiquidScene, solids: Sequence[PlacedSolid], bodies: RigidBodies | None, *, device: str, folder: Path,
+        wall_velocity: np.ndarray | None = None,
+    ) -> LiquidSimulation:  # fmt: skip
+        """Build a simulation of `scene` among `solids`, of which liquid moves `bodies`; the rest as of `create`.
+
+        `scene.solid` says in their order what liquid does at their walls.
+        """
         warnings: list[str] = []
 
         def make_parts(grid: StaggeredGrid) -> Parts:
