@@ -17,9 +17,9 @@ from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 from warp_lcp.fluids.scene import COUPLED_METHODS
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.material.particle_assembly import placed_solids
+from warp_lcp.material.particle_log import Row
 from warp_lcp.newton.bodies import WorldBodies
 from warp_lcp.newton.shapes import geometries, reaches_into, united
-from warp_lcp.run.log import Value
 from warp_lcp.scene.scene_file import SceneSource, load_scene
 from warp_lcp.scene.shapes import SolidSphere
 from warp_lcp.simulation import StepFailed
@@ -64,7 +64,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
         gravity = f"physics.gravity={self._gravity().tolist()}"
         self.scene = load_scene({**DEFAULTS, **scene} if isinstance(scene, Mapping) else scene, [gravity])
         self._origin, self._chosen = np.asarray(origin, dtype=np.float64), bodies
-        self.row: Mapping[str, Value] = {}
+        self.row: Row = {}
         self._coupled = self._restarts = self._again = False
         self._begins = True  # whether the next step is the first since the coupler has set the bodies' poses
         self._kept: dict[str, np.ndarray] = {}
@@ -107,11 +107,14 @@ class SolverLiquid(SolverBase, CouplingInterface):
         and keep their poses. The liquid's own state is this solver's, not `state_in`'s.
 
         Raises:
+            RuntimeError: a graph is being captured.
             StepFailed: the pressure's solve failed, with shorter steps too.
             SimulationFailed: something is not finite, or has left the domain.
         """
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
+        if wp.get_device(str(self.model.device)).is_capturing:
+            raise RuntimeError("a step of liquid reads from its device: take it outside of captured graphs, `wp.ScopedCapture`")
         simulation, bodies = self.simulation, self.bodies
         for name in MOVES:
             here, there = getattr(state_in, name, None), getattr(state_out, name, None)
