@@ -16,7 +16,7 @@ from warp_lcp.rigid.mass_properties import MassProperties
 
 
 class WorldBodies(RigidBodies):
-    """The bodies of a newton model that a liquid holds; a step has no contacts.
+    """The bodies of a newton model that a liquid holds, in the place of `RigidBodies`; a step has no contacts.
 
     Args:
         model: of newton.

@@ -91,10 +91,10 @@ class SolverLiquid(SolverBase, CouplingInterface):
             iterations: how often both take a step; the first time the bodies' solver only guesses what the liquid gives. 1 is cheaper, and
                 bodies far lighter than the liquid then swing for some steps after a jolt.
         """
-        bodies, joints = list(range(model.body_count)), list(range(model.joint_count))
+        bodies, joints, particles = (list(range(count)) for count in (model.body_count, model.joint_count, model.particle_count))
         held = sorted(body for body in geometries(model, np.zeros(3)) if body >= 0)
         entries = [
-            SolverCoupled.Entry("rigid", rigid, bodies=bodies, joints=joints),
+            SolverCoupled.Entry("rigid", rigid, bodies=bodies, joints=joints, particles=particles),
             SolverCoupled.Entry("liquid", lambda view: cls(view, scene, origin=origin)),
         ]
         proxies = [SolverCoupledProxy.Proxy("rigid", "liquid", bodies=held)]
