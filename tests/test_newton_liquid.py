@@ -138,18 +138,21 @@ def test_a_float_on_a_hinge_swings_up(name):
     assert places[-1, 0] < 0.0  # it swings past the top
 
 
-def test_kinematic_bodies_push_liquid_and_take_nothing():
+@pytest.mark.parametrize("alone", [True, False])
+def test_kinematic_bodies_push_liquid_and_take_nothing(alone):
     builder = newton.ModelBuilder()
     body = builder.add_body(xform=wp.transform(wp.vec3(-0.4, 0.0, 0.25), wp.quat_identity()), is_kinematic=True)
     builder.add_shape_box(body, hx=0.06, hy=0.5, hz=0.5)
     model = builder.finalize(device="cpu")
-    liquid = SolverLiquid(model, pool(), origin=MIDDLE)
+    solver = SolverLiquid(model, pool(), origin=MIDDLE) if alone else together(model, pool())
+    liquid = solver if alone else solver.solver("liquid")
     now, later = model.state(), model.state()
-    now.body_qd.assign(np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]))
     for step in range(10):
+        now.body_qd.assign(np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]]))
         now.body_q.assign(np.array([[-0.4 + 0.01 * step, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]]))
-        liquid.step(now, later, None, None, 0.01)
+        solver.step(now, later, None, None, 0.01)
         assert (later.body_q.numpy() == now.body_q.numpy()).all()
+        assert liquid.bodies.prescribed.all()
     assert liquid.bodies.impulses[0, 0] < 0.0
     assert liquid.simulation.particles.velocity.numpy()[:, 0].mean() > 0.05
     x = liquid.particles().numpy()[:, 0]
@@ -199,6 +202,23 @@ def test_graphs_are_not_for_it():
 def test_what_it_cannot_do_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         SolverLiquid(world(((0.0, 0.0, 0.5), 500.0, "sphere", {"radius": 0.1})), pool() | change, origin=MIDDLE)
+
+
+def test_worlds_that_it_cannot_hold_are_refused():
+    ball = world(((0.0, 0.0, 0.5), 500.0, "sphere", {"radius": 0.1}))
+    with pytest.raises(ValueError, match="have no shapes"):
+        SolverLiquid(ball, pool(), bodies=[1])
+    with pytest.raises(ValueError, match="dt = 0"):
+        SolverLiquid(ball, pool(), origin=MIDDLE).step(ball.state(), ball.state(), None, None, 0.0)
+    many, one = newton.ModelBuilder(), newton.ModelBuilder()
+    one.add_shape_sphere(one.add_body(), radius=0.1)
+    many.replicate(one, 2)
+    with pytest.raises(ValueError, match="2 worlds"):
+        SolverLiquid(many.finalize(device="cpu"), pool())
+    walls = newton.ModelBuilder()
+    walls.add_shape_plane(width=1.0, length=1.0)
+    with pytest.raises(ValueError, match="PLANE has no inside"):
+        SolverLiquid(walls.finalize(device="cpu"), pool())
 
 
 def test_newton_s_basic_shapes_fall_into_liquid():

@@ -154,6 +154,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
         super().reset(state, world_mask, flags)
         if world_mask is None or world_mask.numpy().any():
             self.simulation, self.bodies = self._create()
+            self.simulation.gravity[:] = self._gravity()
 
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Learn that a coupler steps this solver, and whether it repeats steps."""
@@ -186,6 +187,8 @@ class SolverLiquid(SolverBase, CouplingInterface):
         shapes = geometries(model, origin)
         standing = [shape for shape in shapes.pop(-1, []) if reaches_into(shape, np.array(scene.domain.size))]
         chosen = sorted(shapes) if self._chosen is None else [int(body) for body in self._chosen]
+        if missing := [body for body in chosen if body not in shapes]:
+            raise ValueError(f"bodies: {missing} have no shapes that collide with shapes")
         held = {body: united(shapes[body]) for body in chosen}
         placed, separating = placed_solids(scene, Path()), scene.domain.wall == "separating"
         placed += [PlacedSolid(geometry=shape, separating=separating, name=f"shape {n} of the world") for n, shape in enumerate(standing)]
