@@ -28,9 +28,10 @@ from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.fluids.distributed_pressure import DistributedPressure
 from warp_lcp.fluids.distributed_probes import SharedProbes
 from warp_lcp.fluids.distributed_state import CELLS, Piece, piece_of, take_pieces
+from warp_lcp.fluids.models import make_surface, pressure_settings
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
-from warp_lcp.fluids.simulator import LiquidSimulation, make_surface, pressure_settings
+from warp_lcp.fluids.simulator import LiquidSimulation
 from warp_lcp.fluids.surface import FreeSurface, WholeCellSurface
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.sides import side_bits
