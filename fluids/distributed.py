@@ -29,9 +29,10 @@ from warp_lcp.fluids.distributed_pressure import DistributedPressure
 from warp_lcp.fluids.distributed_probes import SharedProbes
 from warp_lcp.fluids.distributed_state import CELLS, Piece, piece_of, take_pieces
 from warp_lcp.fluids.distributed_tension import SharedSurfaceTension
+from warp_lcp.fluids.models import make_surface, make_tension, pressure_settings
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
-from warp_lcp.fluids.simulator import LiquidSimulation, make_surface, make_tension, pressure_settings
+from warp_lcp.fluids.simulator import LiquidSimulation
 from warp_lcp.fluids.surface import FreeSurface, WholeCellSurface
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.sides import side_bits

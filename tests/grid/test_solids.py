@@ -6,7 +6,8 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warp_lcp.grid.solids import Box, Capsule, Geometry, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.motion import Pose
+from warp_lcp.grid.solids import Box, Capsule, Geometry, Placement, Plane, Sphere, TriangleMesh, Union
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 
 PLACEMENT = Placement.from_degrees(1.7, [25.0, -70.0, 130.0], [0.3, -0.4, 0.9], 3)
@@ -171,3 +172,21 @@ def test_arrays_of_different_length_are_refused():
     points, out = wp.zeros(3, dtype=wp.vec3, device="cpu"), wp.zeros(2, dtype=wp.float32, device="cpu")
     with pytest.raises(ValueError, match="out has shape"):
         Sphere(center=[0.0, 0.0], radius=1.0).signed_distance(points, out)
+
+
+def test_a_union_is_nearest_to_its_nearest_part():
+    parts = (
+        Sphere(center=[0.2, 0.3, 0.4], radius=0.2),
+        Box(lower=[0.3, 0.3, 0.3], upper=[0.9, 0.5, 0.6]),
+        Sphere(center=[0.8] * 3, radius=0.1),
+    )
+    turned = Pose(Placement.from_degrees(1.0, [20.0, 30.0, 40.0], [0.0] * 3, 3).rotation, np.array([0.1, 0.0, -0.2]))
+    points = np.random.default_rng(77).uniform(-0.5, 1.5, (200, 3))
+    for union in (Union(parts=parts), Union(parts=parts).moved(turned)):
+        expected = np.min([distances(part, points) for part in union.parts], axis=0)
+        assert (distances(union, points) == expected).all()
+        low, high = union.bounds()
+        inside = expected < 0.0
+        assert inside.any()
+        assert ((points[inside] >= low) & (points[inside] <= high)).all()
+    assert Union(parts=(*parts, Plane(point=[0.0] * 3, normal=[0.0, 0.0, 1.0]))).bounds() is None

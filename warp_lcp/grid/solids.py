@@ -1,4 +1,4 @@
-"""Solids and regions of material as signed distances on the device: box, sphere, capsule, plane and triangle mesh.
+"""Solids and regions of material as signed distances on the device: box, sphere, capsule, plane, triangle mesh and unions.
 
 A 2-D scene is the plane z = 0 of these shapes: its callers pass points with z = 0. Boxes given with two coordinates extend without limit in
 z, spheres and capsules lie at z = 0 (discs and stadiums there), and a mesh is cut by the plane z = 0: the sign is that of the cut, the
@@ -21,6 +21,7 @@ from warp_lcp.grid.solids_kernels import (
     ShapeFrame,
     box_distance,
     capsule_distance,
+    least_distance,
     mesh_distance,
     mesh_surface_distance,
     plane_distance,
@@ -412,3 +413,31 @@ class TriangleMesh(_Shape):
 
     def _hull(self) -> tuple[np.ndarray, float]:
         return self.surface.vertices, 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Union:
+    """What lies in one of several regions; the distance is exact outside, and inside no more than the true one where they overlap.
+
+    Args:
+        parts: the regions, at least one.
+    """
+
+    parts: tuple[Geometry, ...]
+
+    def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
+        """Write the least distance [m] to the parts, as of `Geometry`."""
+        self.parts[0].signed_distance(points, out)
+        other = wp.empty_like(out) if len(self.parts) > 1 else out
+        for part in self.parts[1:]:
+            part.signed_distance(points, other)
+            launch_list(least_distance, points.shape[0], [other, out], device=points.device)
+
+    def bounds(self) -> np.ndarray | None:
+        """Return the low and the high corner [m] of a box around all parts, shape (2, 3); None when one has no limits."""
+        boxes = [box for part in self.parts if (box := part.bounds()) is not None]
+        return np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]) if len(boxes) == len(self.parts) else None
+
+    def moved(self, pose: Pose) -> Union:
+        """Return the union after a change of place [m]."""
+        return Union(parts=tuple(part.moved(pose) for part in self.parts))

@@ -55,6 +55,12 @@ def capsule_distance(i, points: Points, frame: ShapeFrame, axis: wp.vec3, radius
 
 
 @list_kernel(MODULE)
+def least_distance(i, other: Distances, out: Distances):
+    """Measure what lies in one of two regions."""
+    out[i] = wp.min(out[i], other[i])
+
+
+@list_kernel(MODULE)
 def plane_distance(i, points: Points, frame: ShapeFrame, normal: wp.vec3, out: Distances):
     """Measure the half-space below the plane through the origin with a unit `normal`."""
     q = to_shape(points[i], frame)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh
+from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh, Union
 
 NO_LENGTH = 1e-9  # of a mesh's size
 AROUND = 48  # points around a disc or ball; even
@@ -68,11 +68,13 @@ class BodySurface:
 
 
 def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
-    """Return the surface of a box, sphere, capsule or mesh as placed.
+    """Return the surface of a box, sphere, capsule or mesh as placed, or the surfaces of a union of such.
 
     Raises:
         ValueError: it is none of these.
     """
+    if isinstance(geometry, Union):
+        return BodySurface.joined([body_surface(part, dimension) for part in geometry.parts])
     if isinstance(geometry, TriangleMesh):
         if dimension == 3:
             return BodySurface(geometry.placement.apply(geometry.surface.vertices), geometry.surface.triangles)
