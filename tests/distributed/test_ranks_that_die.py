@@ -45,12 +45,12 @@ def test_different_things_are_refused_once(mpi):
     assert "done" not in done.stdout
 
 
-SHORT = ("--engine", "petsc", "--device", "cpu", "--set", "domain.resolution=32", "--frames", "2")
+SHORT = ("--engine", "petsc", "--device", "cpu", "--set", "domain.resolution=32", "--frames", "1")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turn", range(200))
 def test_short_runs_end(mpi, turn):
-    """One is started after the other, as a rank that waits for ever does so now and then."""
-    done = mpi(2 + turn % 3, "-c", "from warp_lcp.cli.commands import main; main()", "run", "dam-break-2d", *SHORT, seconds=90.0)
-    assert "frame 2 of 2 reached" in done.stdout + done.stderr
+    """One after the other, as ranks that wait for each other for ever may do so now and then."""
+    done = mpi(2 + turn % 3, "-c", "from warp_lcp.cli.commands import main; main()", "run", "dam-break-2d", *SHORT)
+    assert "finished: frame 1 of" in done.stdout
