@@ -1,4 +1,4 @@
-"""What a liquid costs a rank: `mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for docs/distributed.md.
+"""What a liquid costs a rank: `mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for docs/planning.md.
 
 Prints the figures of the rank that has most of each. Seconds are the processor's, so that neighbors on the machine count less; a rank that
 waits for others in MPI takes them, too. Memory is the most that the process held, less what it held with Python, libraries and kernels.
@@ -97,7 +97,7 @@ def main() -> None:
     most = ranks.max(np.array([*found.values()], dtype=float))
     if ranks.is_root:
         counts = [key for key in ("solve_iterations", "density_iterations") if key in rows[0]]
-        solves = [f"{np.mean([row[key] for row in rows]):.1f} {key}" for key in counts]
+        solves = [f"{np.mean([row[key] or 0 for row in rows]):.1f} {key}" for key in counts]
         print(f"{name} {' '.join(overrides)}, {ranks.size} ranks, {cpu_model()}; a step: {', '.join(solves)}")
         for key, value in zip(found, most, strict=True):
             print(f"{value:14,.1f}  {key}")

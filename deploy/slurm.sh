@@ -9,7 +9,7 @@
 #SBATCH --time=04:00:00
 #SBATCH --signal=USR1@120
 #SBATCH --open-mode=append
-# A rank is a task of one thread; docs/distributed.md says what memory it takes. The signal ends the run after its step, with a checkpoint.
+# A rank is a task of one thread; docs/planning.md says what memory it takes. The signal ends the run after its step, with a checkpoint.
 set -euo pipefail
 scene=${1:?usage: sbatch deploy/slurm.sh SCENE [OPTION...]}
 shift
