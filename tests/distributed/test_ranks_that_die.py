@@ -1,4 +1,4 @@
-"""A rank that is killed or interrupted ends all; ranks that were given different things say so."""
+"""A rank that is killed or interrupted ends all; ranks that were given different things say so; ranks that nothing befalls end, too."""
 
 import pytest
 
@@ -43,3 +43,14 @@ def test_different_things_are_refused_once(mpi):
     done = mpi(3, FAIL, "differ", exit_code=2)
     assert done.stderr.count("the scene on rank 1 is not what it is on rank 0: start all ranks with the same command and files") == 1
     assert "done" not in done.stdout
+
+
+SHORT = ("--engine", "petsc", "--device", "cpu", "--set", "domain.resolution=32", "--frames", "1")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turn", range(200))
+def test_short_runs_end(mpi, turn):
+    """One after the other, as ranks that wait for each other for ever may do so now and then."""
+    done = mpi(2 + turn % 3, "-c", "from warp_lcp.cli.commands import main; main()", "run", "dam-break-2d", *SHORT)
+    assert "finished: frame 1 of" in done.stdout

@@ -3,6 +3,7 @@
 import csv
 import json
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from dots_on_ranks import COUNT, SCENE, DotsSimulator
 from typer.testing import CliRunner
 
 from warp_lcp.cli import commands as cli
+from warp_lcp.distributed import launch
 from warp_lcp.frames.pieces import one_mesh, piece_files
 from warp_lcp.frames.vtu import read_vtu
 from warp_lcp.render.recording import Recording
@@ -217,6 +219,15 @@ def test_without_mpi_one_message_says_how_to_install(run, monkeypatch, variable)
         monkeypatch.setenv(variable, "1")
     said = run(0, "run dots.toml --engine petsc", exit_code=2).stderr
     assert ("pip install 'warp-lcp[distributed]'" in said and "PETSC_DIR" in said) if not variable else said == ""
+
+
+def test_ranks_of_another_mpi_are_refused(mpi, tmp_path):
+    """As srun starts them whose --mpi this MPI does not know; `mpi` skips where there is none."""
+    words = [sys.executable, "-c", "from warp_lcp.cli.commands import main; main()", "run", "dam-break", "--engine", "petsc"]
+    environment = launch.environment() | {"SLURM_STEP_NUM_TASKS": "3"}
+    done = subprocess.run(words, env=environment, cwd=tmp_path, text=True, capture_output=True, check=False)
+    assert done.returncode == 2
+    assert "3 processes were started, but mpi4py knows only one" in done.stderr
 
 
 LIQUID = "--set domain.resolution=24 --set time.duration=0.3 --set output.checkpoint_every=4 --set output.grid_format=vti"

@@ -1,6 +1,7 @@
 """`warp-lcp bench scaling --engine petsc`: what ranks measure, and the tables of several numbers of ranks."""
 
 import json
+import re
 
 import pytest
 from typer.testing import CliRunner
@@ -89,3 +90,13 @@ def test_figures_to_reach(monkeypatch):
     assert [row[2:] for row in table.rows] == [["2", "no"], ["2", "yes"], ["1.2", "yes"], ["not measured here", ""], ["0.55", "yes"]]
     monkeypatch.setattr(ranks.os, "cpu_count", lambda: 1)
     assert ranks.targets(found(kept), [128]).rows[1][2:] == ["not measured here", ""]
+
+
+def test_what_a_liquid_costs_a_rank_is_counted(mpi):
+    """Ghost cells of 28 bytes and more of fields, in 5 layers at the one cut, are filled several times a step."""
+    said = mpi(2, "-m", "warp_lcp.benchmarks.rank_costs", "dam-break-2d", "domain.resolution=32").stdout
+    found = {name: float(value.replace(",", "")) for value, name in re.findall(r"^ *([\d,.]+)  (.*)$", said, flags=re.M)}
+    assert found["cells at cuts"] == 16
+    assert found["cells of the box"] < found["cells stored"] < 32 * 16 * 3
+    assert found["Subdomain.fill: bytes a step"] > 28 * 5 * found["cells at cuts"]
+    assert found["Ranks.gather: times a step"] > 10

@@ -230,10 +230,15 @@ def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> 
 def _most_work(counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]) -> float:
     """Return what the busiest rank has to do, in cells full of material."""
     ends = [np.concatenate([[0], np.cumsum(cut)]) for cut in cuts]
-    whole, most = CellBox((0, 0, 0), counts), 0.0
-    for place in np.ndindex(*(len(cut) for cut in cuts)):
-        low, high = (np.array([end[n + side] for end, n in zip(ends, place, strict=True)]) for side in range(2))
-        box = CellBox.of(low, high)
-        full = sum(float(np.prod(np.clip(np.minimum(b, high) - np.maximum(a, low), 0.0, None))) for a, b in state)
-        most = max(most, full + OPEN * box.grown(layers).common(whole).cells)
-    return most
+    low, high = ([end[side : len(end) - 1 + side] for end in ends] for side in range(2))
+    seen = [np.minimum(h + layers, n) - np.maximum(l - layers, 0) for l, h, n in zip(low, high, counts, strict=True)]
+    work = OPEN * _of_boxes(seen)
+    for corners in state:
+        work += _of_boxes([np.clip(np.minimum(b, h) - np.maximum(a, l), 0.0, None) for a, b, l, h in zip(*corners, low, high, strict=True)])
+    return float(work.max())
+
+
+def _of_boxes(sides: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the volumes of all boxes from the lengths of their sides along x, y, z."""
+    x, y, z = sides
+    return np.multiply.outer(np.multiply.outer(x, y), z)

@@ -13,6 +13,7 @@ from typing import Any
 import typer
 import warp as wp
 
+from warp_lcp.distributed import launch
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.run.continuation import mesh_digests
@@ -29,8 +30,7 @@ from warp_lcp.scene.table import written
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
 PLANNED = (OSError, InputError, StepFailed, SimulationFailed)
-SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")  # how many processes mpiexec has started, as it tells them
-NUMBERS = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")  # which of them this one is
+SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # how many processes mpiexec or srun has started, as it tells them
 SHOWN = 4  # differences in one message
 
 
@@ -124,14 +124,14 @@ def ranks_together() -> Iterator[RankLauncher]:
     try:
         ranks = Ranks.world()
     except ImportError as error:
-        if _number() != "0":
+        if launch.rank_here():
             raise typer.Exit(2) from error
         raise EngineError(f"--engine petsc: {error}") from error
     started = next((os.environ[name] for name in SIZES if name in os.environ), "1")
     if started != "1" and ranks.size == 1:
         raise EngineError(
-            f"--engine petsc: mpiexec has started {started} processes, but mpi4py knows only one: they are of different MPIs; use the "
-            "mpiexec of the MPI that mpi4py was built with"
+            f"--engine petsc: {started} processes were started, but mpi4py knows only one: they are of different MPIs; use the mpiexec "
+            "of the MPI that mpi4py was built with, or the --mpi of srun that it knows"
         )
     try:
         launcher = RankLauncher(ranks)
@@ -144,11 +144,6 @@ def ranks_together() -> Iterator[RankLauncher]:
         if ranks.is_root:
             raise
         raise typer.Exit(2 if isinstance(error, InputError) else 1) from error
-
-
-def _number() -> str:
-    """Return this process's number among those that mpiexec has started, as it says."""
-    return next((os.environ[name] for name in NUMBERS if name in os.environ), "0")
 
 
 def _shown(value: Any) -> str:

@@ -1,0 +1,107 @@
+"""What a liquid costs a rank: `mpiexec -n N python -m warp_lcp.benchmarks.rank_costs SCENE [KEY=VALUE...]`, for docs/planning.md.
+
+Prints the figures of the rank that has most of each. Seconds are the processor's, so that neighbors on the machine count less; a rank that
+waits for others in MPI takes them, too. Memory is the most that the process held, less what it held with Python, libraries and kernels.
+Bytes are those that a rank receives, by who sends them and why.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.benchmarks.harness.machine import cpu_model, forget_peak, resident_bytes
+from warp_lcp.distributed.halo import Gathering, Halo
+from warp_lcp.distributed.particles import MpiPost
+from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.fluids.distributed import create
+from warp_lcp.scene.scene_file import load_scene
+
+SKIPPED, STEPS = 10, 10  # liquid moves when it is measured
+SMALL = "domain.resolution=32"  # loads the kernels
+MEGA = 1 << 20
+
+
+class Traffic:
+    """What a rank receives: bytes and occasions, by their kind."""
+
+    def __init__(self) -> None:
+        """Count from here on, in this process."""
+        self.bytes, self.times = Counter[str](), Counter[str]()
+        self._listen(Subdomain, "fill", lambda part, *fields: _ghosts(part) * sum(map(_item, fields)))
+        self._listen(Halo, "fill", lambda halo, field: _ghosts(halo) * _item(field))
+        self._listen(Gathering, "collect", lambda gathering, mine, whole: (whole.size - mine.size) * _item(whole))
+        self._listen(Ranks, "gather", lambda ranks, values: (ranks.size - 1) * np.asarray(values).nbytes)
+        self._listen(MpiPost, "swap", lambda post, outgoing: sum(array.nbytes for array in outgoing.values()))  # sent; as much comes
+
+    def _listen(self, kind: type, name: str, size: Callable[..., int]) -> None:
+        plain = getattr(kind, name)
+
+        def counted(self_: Any, *arguments: Any) -> Any:
+            self._count(f"{kind.__name__}.{name}", size(self_, *arguments))
+            return plain(self_, *arguments)
+
+        setattr(kind, name, counted)
+
+    def _count(self, kind: str, size: int) -> None:
+        self.bytes[kind] += size
+        self.times[kind] += 1
+
+
+def _ghosts(owner: Subdomain | Halo) -> int:
+    """Return how many ghost cells are filled."""
+    return 0 if owner._forest is None else len(owner._forest.getGraph()[2])
+
+
+def _item(field: wp.array | np.ndarray) -> int:
+    return int((field.numpy() if isinstance(field, wp.array) else field).dtype.itemsize)
+
+
+def main() -> None:
+    """Measure on the ranks there are."""
+    wp.config.log_level = wp.LOG_ERROR
+    ranks, (name, *overrides) = Ranks.world(), sys.argv[1:]
+    traffic, make = Traffic(), partial(create, ranks=ranks, device="cpu", folder=Path())
+    warm = make(load_scene(name, [*overrides, SMALL]))
+    for _ in range(2):
+        warm.step(warm.stable_dt())
+    del warm
+    forget_peak()
+    before = resident_bytes()
+    simulation = make(load_scene(name, overrides))
+    for _ in range(SKIPPED):
+        simulation.step(simulation.stable_dt())
+    traffic.bytes.clear()
+    traffic.times.clear()
+    begun = time.process_time()
+    rows = [simulation.step(simulation.stable_dt()) for _ in range(STEPS)]
+    part, box = simulation.part, simulation.part.box.counts
+    cut = sum(box[0] * box[1] * box[2] // box[axis] for axis in range(3) for side in range(2) if part.cuts >> 2 * axis + side & 1)
+    seconds = (time.process_time() - begun) / STEPS
+    found = {
+        "cells of the box": part.box.cells, "cells stored": part.grid.size, "particles": simulation.particles.count, "cells at cuts": cut,
+        "MiB beyond the libraries'": (resident_bytes(peak=True) - before) / MEGA, "MiB of the libraries": before / MEGA,
+        "processor's ms a step": 1e3 * seconds,
+        **{f"{kind}: bytes a step": size / STEPS for kind, size in sorted(traffic.bytes.items())},
+        **{f"{kind}: times a step": count / STEPS for kind, count in sorted(traffic.times.items())},
+    }  # fmt: skip
+    most = ranks.max(np.array([*found.values()], dtype=float))
+    if ranks.is_root:
+        counts = [key for key in ("solve_iterations", "density_iterations") if key in rows[0]]
+        solves = [f"{np.mean([row[key] or 0 for row in rows]):.1f} {key}" for key in counts]
+        print(f"{name} {' '.join(overrides)}, {ranks.size} ranks, {cpu_model()}; a step: {', '.join(solves)}")
+        for key, value in zip(found, most, strict=True):
+            print(f"{value:14,.1f}  {key}")
+
+
+if __name__ == "__main__":
+    main()
