@@ -28,7 +28,7 @@ PROBES = [
     for n, place in enumerate(([0.3, 0.1, 0.2], [0.26, 0.01, 0.4], [0.9, 0.05, 0.1], [0.51, 0.3, 0.25]))
     for what in ("pressure", "velocity", "level")
 ]
-CAPILLARY = {"surface_tension": {"coefficient": 5.0, "contact_angle": 60.0}, "solver": {"precision": "double"}}
+CAPILLARY = {"surface_tension": {"coefficient": 0.5, "contact_angle": 60.0}, "solver": {"precision": "double"}}
 TILTED = {"physics": {"gravity": [3.0, -8.0, 2.0]}}
 RIVER = {
     "domain": OPEN,
