@@ -85,7 +85,7 @@ def shapes(ranks):
             walls = np.where(rng.random(shape) < 0.3, 0.0, -np.inf)
             compare(ranks, f"walls {shape}", cells, b, walls, method=method, **coefficients(shape))
             compare(ranks, f"number a face {shape}", cells, b, 0.0, method=method, face_x=1.0, face_y=3.0)
-            alike = np.where(np.indices(shape)[0] < shape[0] // 2, walls, -np.random.default_rng(5).random(shape))  # of one finite value on some ranks only
+            alike = np.where(np.indices(shape)[0] < shape[0] // 2, walls, -rng.random(shape))  # of one finite value on some ranks only
             compare(ranks, f"bounds alike on some ranks {shape}", cells, b, alike, method=method)
 
 

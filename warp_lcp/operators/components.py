@@ -145,7 +145,8 @@ class FloatingComponents:
         inside = self.label >= 0
         label = self.label[inside]
         values = b.numpy()[inside], np.abs(b.numpy()[inside]), *(np.isfinite(bound.numpy()[inside]) for bound in (lower, upper))
-        sums = self._total(np.stack([np.bincount(label, v, self.count) for v in values]))
+        mine = np.stack([np.bincount(label, v, self.count) for v in values])  # of nothing NumPy 1 makes integers
+        sums = self._total(mine.astype(np.float64))
         rest, scale, below, above = sums[0], sums[1], sums[2] > 0, sums[3] > 0
         self._net = rest.copy()
         rest[(below & (rest > 0)) | (above & (rest < 0))] = 0
