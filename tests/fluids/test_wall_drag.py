@@ -10,7 +10,6 @@ from pydantic import ValidationError
 import small_sands
 from small_liquids import GRAVITY, advance, box, create, random_tank, scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.fluids.distributed import refusals
 
 DX = 0.05
 FORCES = {"forces": True}
@@ -255,4 +254,3 @@ def test_wrong_coefficients_are_refused() -> None:
             size=[1.0, 0.5], resolution=16, sand=[small_sands.box([0.0, 0.0], [0.3, 0.3])],
             solid=[small_sands.box([0.5, 0.0], [0.6, 0.1], drag=0.1)],
         )  # fmt: skip
-    assert refusals(sheet(1.0, 0.1).scene) == ["output.forces", "wall_drag"]
