@@ -16,7 +16,7 @@ from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface
-from warp_lcp.fluids.surface_tension import REACH
+from warp_lcp.fluids.surface_tension import REACH, SurfaceTension
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
 from warp_lcp.fluids.wall_drag import WallDrag
 from warp_lcp.grid.particles import Particles
@@ -94,7 +94,7 @@ class LiquidSimulation(ParticleSimulation):
         """Allocate what belongs to a grid."""
         super().lay(grid, parts)
         self.surface = self._surface()
-        self.tension = make_tension(self.scene, grid, self.boundary, self.surface)
+        self.tension = self._tension()
         self.projection = self._pressure()
         drags, physics = self.scene.drags, self.scene.physics
         asked = self.forces is not None or drags is not None
@@ -106,6 +106,9 @@ class LiquidSimulation(ParticleSimulation):
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
+
+    def _tension(self) -> SurfaceTension | None:
+        return make_tension(self.scene, self.grid, self.boundary, self.surface)
 
     def _pressure(self) -> PressureProjection:
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
@@ -269,7 +272,7 @@ class LiquidSimulation(ParticleSimulation):
         Raises:
             ValueError: the pieces do not belong to this scene.
         """
-        from warp_lcp.fluids.distributed_state import state_of  # what only such runs need
+        from warp_lcp.fluids.distributed.state import state_of  # what only such runs need
 
         if self.grid.whole is not None and self._coverage is not None:
             self.cover(self._coverage.domain)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from small_liquids import advance, dam
-from warp_lcp.fluids.distributed_state import CELLS, piece_of, state_of
+from warp_lcp.fluids.distributed.state import CELLS, piece_of, state_of
 
 
 def cut(piece, at):

@@ -326,6 +326,18 @@ def test_a_splash_is_no_faster_where_walls_let_go(dimension: int, angle: float) 
     assert fastest["separating"] < 1.2 * fastest["free-slip"]
 
 
+@pytest.mark.parametrize(("angle", "hangs"), [(50.0, True), (130.0, False)])
+def test_a_drop_hangs_from_a_ceiling_that_lets_go_if_it_wets_it(angle: float, hangs: bool) -> None:
+    """Of 7.8 mm of free fall: the air holds up what clings to the ceiling by its surface, and nothing holds up what does not."""
+    drop = {"shape": "sphere", "center": [0.01, 0.01], "radius": 0.004}
+    tension = {"coefficient": 0.072, "contact_angle": angle}
+    simulation = create(scene(size=[0.02, 0.01], resolution=40, liquid=[drop], surface_tension=tension, wall="separating"))
+    before = simulation.particles.position.numpy()[:, 1].mean()
+    advance(simulation, 0.04, 1e-3)
+    fallen = before - simulation.particles.position.numpy()[:, 1].mean()
+    assert fallen < 0.001 if hangs else fallen > 0.005
+
+
 def test_a_full_box_has_no_surface() -> None:
     simulation = create(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [1.0, 1.0])], surface_tension=WATER))
     assert simulation.tension is None

@@ -11,72 +11,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.distributed.decomposition import Decomposition, balanced_processes, pool
 from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
 from warp_lcp.distributed.particles import SharedParticles
-from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.distributed.solids import boundary_of_part
-from warp_lcp.distributed.sources import SharedSources
-from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
-from warp_lcp.fluids.distributed_pressure import DistributedPressure
-from warp_lcp.fluids.distributed_probes import SharedProbes
-from warp_lcp.fluids.distributed_state import CELLS, Piece, piece_of, take_pieces
-from warp_lcp.fluids.distributed_tension import SharedSurfaceTension
+from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.fluids.distributed.extension import Refill, too_far
+from warp_lcp.fluids.distributed.pressure import DistributedPressure
+from warp_lcp.fluids.distributed.probes import SharedProbes
+from warp_lcp.fluids.distributed.state import CELLS, Piece, piece_of, take_pieces
+from warp_lcp.fluids.distributed.surface import SharedSurface
+from warp_lcp.fluids.distributed.tension import SharedSurfaceTension
 from warp_lcp.fluids.models import make_surface, make_tension, pressure_settings
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation
-from warp_lcp.fluids.surface import FreeSurface, WholeCellSurface
-from warp_lcp.grid.particles import Particles, ParticleTotals
-from warp_lcp.grid.sides import side_bits
-from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.particle_assembly import Parts, make_outlets, make_sources, placed_solids, seed_materials, start_velocities
+from warp_lcp.fluids.surface import FreeSurface
+from warp_lcp.fluids.surface_tension import SurfaceTension
+from warp_lcp.grid.particles import ParticleTotals
+from warp_lcp.grid.staggered import Window
+from warp_lcp.material.particle_assembly import Parts
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_state import signature
 from warp_lcp.material.sources import Outlets
-from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import SimulationFailed, StepFailed
-
-LEAST_RIGHT = 2  # layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so far
-METHODS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks
-NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
-
-
-class SharedSurface:
-    """The free surface of liquid that ranks share: each finds it on its part, with what others know of the cells beside.
-
-    `mark` and `volume` are collective.
-
-    Args:
-        part: where this rank works; its particles come with ghosts.
-        surface: on that part, its volume counted in the box.
-    """
-
-    def __init__(self, part: Subdomain, surface: FreeSurface) -> None:
-        self.phi, self.density, self.complete, self._part, self._surface = surface.phi, surface.density, surface.complete, part, surface
-
-    def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds, those of the ghost layers and what they come from by other ranks."""
-        self._surface.mark(particles, window, kind)
-        self._part.fill(kind, *([] if self.phi is None else [self.phi]))
-
-    def measure(self) -> None:
-        """Find the volume of this rank's liquid."""
-        self._surface.measure()
-
-    def volume(self, cells: int) -> float:
-        """Return the volume of all ranks' liquid, given the number of all FLUID cells."""
-        mine = self._surface.volume(cells)
-        return mine if isinstance(self._surface, WholeCellSurface) else float(self._part.ranks.sum(mine))
 
 
 class DistributedLiquid(LiquidSimulation):
@@ -106,16 +69,12 @@ class DistributedLiquid(LiquidSimulation):
         self.probes = SharedProbes(part, scene.probe, self.gravity, part.dimension) if scene.probe else None
         self._everyone = int(part.ranks.sum(particles.count))
 
-    def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
-        """Allocate what belongs to the part."""
-        super().lay(grid, parts)
-        if self.tension is not None:
-            self.tension = make_tension(self.scene, grid, self.boundary, self.surface, partial(SharedSurfaceTension, self.part))
-            self.projection.jump = None if self.tension is None else self.tension.jump
-
     def _surface(self) -> FreeSurface:
         part = self.part
         return SharedSurface(part, make_surface(self.scene, self.grid, self.boundary, lambda _, density: part.fill(density), part.owned))
+
+    def _tension(self) -> SurfaceTension | None:
+        return make_tension(self.scene, self.grid, self.boundary, self.surface, partial(SharedSurfaceTension, self.part))
 
     def _pressure(self) -> PressureProjection:
         solver = wl.METHODS[self.scene.solver.method](precision=self.scene.solver.precision)
@@ -285,136 +244,3 @@ class DistributedLiquid(LiquidSimulation):
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from the state of a simulation in one process; collective."""
         self.restore_pieces([state if "box" in state else piece_of(state)])
-
-
-def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
-    """Return how many cells a face's velocity goes in a time step that may take particles out of the ghost layers; 0: none does.
-
-    A particle at most looks at faces three quarters of its way from where it starts, so that those deep in the box may be faster. Values
-    that are not finite are left to the particles to tell.
-
-    Args:
-        part: where this rank works.
-        velocity: of each component on the faces [m/s].
-        dt: time step [s].
-    """
-    worst, most = 0.0, part.layers - 1
-    for axis, field in enumerate(velocity):
-        sides = [part.cuts >> 2 * axis + side & 1 for side in range(2)]
-        if not any(sides):
-            continue
-        host, others = field.numpy(), tuple(n for n in range(3) if n != 2 - axis)
-        way = np.maximum(host.max(axis=others), -host.min(axis=others)) * (dt / part.grid.spacing)
-        face = np.arange(len(way))
-        inside = [face - part.owned.low[2 - axis], part.owned.high[2 - axis] - face]
-        depth = np.min([d for d, cut in zip(inside, sides, strict=True) if cut], axis=0)
-        far = way > np.maximum(most, (depth + most - 1) / 1.75)
-        worst = max(worst, float(way[far].max(initial=0.0)))
-    return worst
-
-
-class Refill:
-    """Called after every layer that velocities are continued by: fills the ghost layers before what is wrong in them comes near the box.
-
-    Args:
-        part: where this rank works; its ghost layers have been filled.
-    """
-
-    def __init__(self, part: Subdomain) -> None:
-        self._part = part
-        self._right: dict[int, int] = {}  # layers that are right, by the field's address
-
-    def __call__(self, marks: wp.array, field: wp.array) -> None:
-        """Note a layer of a component; collective."""
-        right = self._right.get(field.ptr, self._part.layers) - 1
-        if right <= LEAST_RIGHT:
-            self._part.fill(marks, field)
-            right = self._part.layers
-        self._right[field.ptr] = right
-
-
-def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
-    """Build this rank's part of a simulation of `scene`; collective.
-
-    Args:
-        scene: a LiquidScene, the same on all ranks.
-        ranks: who share it.
-        device: a Warp device's name.
-        folder: where the files are that the scene names.
-
-    Raises:
-        ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed. On all ranks.
-    """
-    if not isinstance(scene, LiquidScene):
-        raise ValueError("scene.simulator: fluids needs a scene of liquid")
-    ranks.agree("the scene", scene.model_dump(mode="json"))
-    refused = [f"{key} {NOT_ON_RANKS}" for key in refusals(scene)]
-    if scene.solver.method not in METHODS:
-        refused.append(f"solver.method = {scene.solver.method} works on one process only (without --engine petsc): {' or '.join(METHODS)}")
-    if refused:
-        raise ValueError("; ".join(refused))
-    part = _part(scene, ranks, device)
-    solids, domain = placed_solids(scene, folder), scene.domain
-    boundary, warnings = boundary_of_part(
-        part, solids, cut_cells=domain.solids == "cut-cell", wall_separating=domain.wall == "separating",
-        open_sides=side_bits(domain.open), sources=bool(scene.source),
-    )  # fmt: skip
-    particles, notes = _particles(scene, part, boundary, folder)
-    sources = make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part))
-    outlets = make_outlets(scene, part.grid, folder)
-    parts, notes = Parts(boundary, sources), [*warnings, *notes]
-    return DistributedLiquid(scene, part, parts, particles, solids=solids, outlets=outlets, notes=notes)
-
-
-def _particles(scene: LiquidScene, part: Subdomain, boundary: Boundary, folder: Path) -> tuple[SharedParticles, list[str]]:
-    """Return this rank's particles at the start, and warnings; the host's arrays are gone before the fields are made."""
-    elsewhere = np.ones(part.grid.counts[::-1], dtype=bool)
-    elsewhere[tuple(slice(low - 1, high - 1) for low, high in zip(part.owned.low, part.owned.high, strict=True))] = False
-    position, owner, notes = seed_materials(scene, part.grid, boundary, folder, elsewhere)
-    _check_seeded(scene, part.ranks.sum(np.bincount(owner, minlength=len(scene.materials()[1]))))
-    velocity = start_velocities(scene).astype(np.float32)[owner]
-    return SharedParticles(part, position, velocity, affine=scene.particles.transfer == "apic"), notes
-
-
-def _part(scene: LiquidScene, ranks: Ranks, device: str) -> Subdomain:
-    """Return where this rank works: all have about as much liquid, at the start and when it has come to rest."""
-    counts, layers = scene.cell_counts, ghost_layers(scene.time.cfl, scene.pressure.smoothing)
-    size = np.array([*scene.domain.size, scene.spacing][:3])
-    start = []
-    for shape in scene.materials()[1]:
-        bounds = shape.bounds(scene.dimension)
-        low, high = (np.zeros(3), size) if bounds is None else (np.clip(corner, 0.0, size) for corner in bounds)
-        if scene.dimension == 2:
-            low[2], high[2] = 0.0, scene.spacing
-        start.append((low / scene.spacing, high / scene.spacing))
-    volume = sum(float(np.prod(high - low)) for low, high in start)
-    rest = pool(counts, scene.dimension, volume, np.array(scene.physics.gravity))
-    processes = balanced_processes(counts, ranks.size, layers=layers, states=[start, [rest]])
-    decomposition = Decomposition(counts, ranks, processes=processes)
-    return Subdomain(decomposition, spacing=scene.spacing, dimension=scene.dimension, device=device, layers=layers)
-
-
-def refusals(scene: LiquidScene) -> list[str]:
-    """Return the keys of a scene that ask for what runs on ranks have not."""
-    output, particles = scene.output, scene.particles
-    asked = {
-        **{f"solid[{n}].mass": solid.is_body for n, solid in enumerate(scene.solid)},
-        "viscosity": scene.viscosity,
-        "particles.narrow_band": particles.narrow_band,
-        "particles.reseed": particles.reseed,
-        'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
-        "output.surface": output.surface,
-        "output.volume": output.volume,
-    }
-    return [key for key, wanted in asked.items() if wanted]
-
-
-def _check_seeded(scene: LiquidScene, counts: np.ndarray) -> None:
-    """Refuse liquid without a particle on any rank."""
-    key, materials = scene.materials()
-    for number, (material, count) in enumerate(zip(materials, counts, strict=True)):
-        if count == 0:
-            raise ValueError(
-                f"{key}[{number}] ({material.shape}) holds no particle: it is too small for cells of {scene.spacing:.4g} m, or lies in "
-                f"solids, outside the domain or in an earlier {key}"
-            )

@@ -1,0 +1,58 @@
+"""How far liquid and velocities that are continued go beyond a rank's box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.distributed.subdomain import Subdomain
+
+LEAST_RIGHT = 2  # layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so far
+
+
+def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
+    """Return how many cells a face's velocity goes in a time step that may take particles out of the ghost layers; 0: none does.
+
+    A particle at most looks at faces three quarters of its way from where it starts, so that those deep in the box may be faster. Values
+    that are not finite are left to the particles to tell.
+
+    Args:
+        part: where this rank works.
+        velocity: of each component on the faces [m/s].
+        dt: time step [s].
+    """
+    worst, most = 0.0, part.layers - 1
+    for axis, field in enumerate(velocity):
+        sides = [part.cuts >> 2 * axis + side & 1 for side in range(2)]
+        if not any(sides):
+            continue
+        host, others = field.numpy(), tuple(n for n in range(3) if n != 2 - axis)
+        way = np.maximum(host.max(axis=others), -host.min(axis=others)) * (dt / part.grid.spacing)
+        face = np.arange(len(way))
+        inside = [face - part.owned.low[2 - axis], part.owned.high[2 - axis] - face]
+        depth = np.min([d for d, cut in zip(inside, sides, strict=True) if cut], axis=0)
+        far = way > np.maximum(most, (depth + most - 1) / 1.75)
+        worst = max(worst, float(way[far].max(initial=0.0)))
+    return worst
+
+
+class Refill:
+    """Called after every layer that velocities are continued by: fills the ghost layers before what is wrong in them comes near the box.
+
+    Args:
+        part: where this rank works; its ghost layers have been filled.
+    """
+
+    def __init__(self, part: Subdomain) -> None:
+        self._part = part
+        self._right: dict[int, int] = {}  # layers that are right, by the field's address
+
+    def __call__(self, marks: wp.array, field: wp.array) -> None:
+        """Note a layer of a component; collective."""
+        right = self._right.get(field.ptr, self._part.layers) - 1
+        if right <= LEAST_RIGHT:
+            self._part.fill(marks, field)
+            right = self._part.layers
+        self._right[field.ptr] = right
