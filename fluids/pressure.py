@@ -57,7 +57,7 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
     liquid, faces = {"u": F32, "v": F32, "w": F32, "touch": U8}, {"x": F64, "field": F32, "known": I8}
     problem = {"previous": F64, "b": F64, "lower": F64, "start": F64, "shift": F32, "jump": F32}
     return SimpleNamespace(
-        prepare=made("prepare", liquid | problem, {"ratio": F64}),
+        prepare=made("prepare", liquid | problem, {"ratio": F64, "adhesion": F64}),
         subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
         support=made("support", faces | {"weight": F32, "jump": F32}, {"axis": int, "limit": F32}),
         contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, sums=("released",), largest=("worst",)),
@@ -106,8 +106,8 @@ class PressureProjection:
         y_i = b_i + sum over faces of (a_f / theta_f) (x_i - x_neighbor),   b_i = sum of s_f [a_f u*_f + (1 - a_f) u_s,f],   x = 0 in AIR,
 
     is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is not open on a separating wall have
-    0 <= x complementary to y >= 0, the others y = 0 (beside a surface whose tension pulls its `jump` takes the place of 0: no air gets
-    between liquid and wall against it). Whole cells have a = 0 or 1, a surface on the cells' faces theta = 1: without
+    0 <= x complementary to y >= 0, the others y = 0. Liquid that wets the wall has -kick_dt `adhesion` in the place of 0, and its `jump`
+    beside a surface that pulls by more: no air gets between liquid and wall against it. Whole cells have a = 0 or 1, a surface on the cells' faces theta = 1: without
     solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal. Beyond an open side of
     the domain lies AIR that the operator does not have: its faces add a_f / theta_f.
 
@@ -136,6 +136,7 @@ class PressureProjection:
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         known: int8, one field a component: which faces the last projection made valid, see `warp_lcp.grid.extrapolate`.
         jump: of the pressure across the surface [m/s] in cells beside it, float32, which whoever pushes u* by it sets; None: there is none.
+        adhesion: what air has to overcome between wall and liquid, as the pressure that a cell bears below the air's, over rho dx [m/s^2].
         automatic: what sets the tolerance from step to step, if something does.
     """
 
@@ -149,6 +150,7 @@ class PressureProjection:
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
         self.jump: wp.array | None = None
+        self.adhesion = 0.0
         self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
         self.kind, self.cells, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
@@ -188,7 +190,8 @@ class PressureProjection:
             return False
         problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
         problem["jump"] = self.jump
-        self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, ratio=self._ratio)
+        numbers = {"ratio": self._ratio, "adhesion": kick_dt * self.adhesion}
+        self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, **numbers)
         self._update()
         return True
 

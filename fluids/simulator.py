@@ -102,7 +102,7 @@ class LiquidSimulation(ParticleSimulation):
         self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
         if self.tension is not None:
-            self.projection.jump = self.tension.jump
+            self.projection.jump, self.projection.adhesion = self.tension.jump, self.tension.adhesion
 
     def _surface(self) -> FreeSurface:
         return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)

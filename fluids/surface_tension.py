@@ -53,6 +53,7 @@ class SurfaceTension:
 
     Attributes:
         jump: kick_dt sigma kappa / (rho dx) [m/s] in cells beside the surface, float32.
+        adhesion: sigma cos(angle) kappa / (rho dx) [m/s^2] of the most curved surface, by which liquid that wets a wall keeps air from it.
     """
 
     def __init__(
@@ -61,6 +62,8 @@ class SurfaceTension:
         self.grid, self.boundary, self._phi = grid, boundary, phi
         self.coefficient, self.density = coefficient, density
         self._cosine = math.cos(math.radians(contact_angle)) if contact_angle != 90.0 else 0.0
+        self._most = float(grid.dimension - 1)  # curvature, of a radius of one cell [1/dx]
+        self.adhesion = max(self._cosine, 0.0) * self._most * coefficient / (density * grid.spacing**2)
         self.jump, self._fields = grid.field(), [grid.field() for _ in range(3)]
         self._passes = kernels.push_pass(bool(boundary.open))
         self._energy = WindowTally(self._passes.energy, grid)
@@ -100,7 +103,7 @@ class SurfaceTension:
         twice = self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
         self._shares = {"once": once, "twice": twice, "planes": planes, **_profile(passes)}
         (bend,) = (field for field in self._fields if field is not once and field is not twice)
-        window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=float(grid.dimension - 1))  # a radius of one cell
+        window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=self._most)
         self._join(bend)
         self._continue(bend, 0, 0.0)  # the nearest point of the surface may lie in a wall
         scale = kick_dt * self.coefficient / (self.density * grid.spacing**2)

@@ -3,17 +3,17 @@
 if (planes != 2) w = u;
 SIMD8 for (int i = first; i < last; ++i) {
     const int fluid = kind[i] == FLUID;
-    const double y = outflow(u, v, w, i), bound = BOUNDED && (touch[i] & LETS_GO) ? 0.0 : -INFINITY, x = previous[i]*ratio;
+    const double y = outflow(u, v, w, i), bound = BOUNDED && (touch[i] & LETS_GO) ? 0.0 - adhesion : -INFINITY, x = previous[i]*ratio;
     b[i] = fluid ? y : 0.0;
     if (BOUNDED) lower[i] = fluid ? bound : -INFINITY;
     start[i] = fluid ? (x < bound ? bound : x) : 0.0;
 }
-// Where the surface itself pulls, with a pressure below that of the air, no air gets to the wall before the pressure is below that.
+// Where the surface itself pulls by more, with a pressure below that of the air, no air gets to the wall before the pressure is below that.
 if (BOUNDED && jump) {
     const long long steps[6] = {-1, 1, -s2, s2, -sz, sz};
     for (int i = first; i < last; ++i) {
-        if (!(lower[i] == 0.0)) continue;
-        double least = 0.0;
+        if (lower[i] == -INFINITY) continue;
+        double least = lower[i];
         for (int n = 0; n < 2*planes + 2; ++n) {
             const long long air = i + steps[n];
             if (kind[air] != AIR) continue;

@@ -338,6 +338,17 @@ def test_a_drop_hangs_from_a_ceiling_that_lets_go_if_it_wets_it(angle: float, ha
     assert fallen < 0.001 if hangs else fallen > 0.005
 
 
+@pytest.mark.parametrize(("width", "angle"), [(0.004, 30.0), (0.004, 70.0), (0.008, 20.0), (0.008, 60.0)])
+def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) -> None:
+    """The pressure in it is below that of the air, down to some cells below the surface too, and no air gets there."""
+    tension, liquid = {"coefficient": 0.072, "contact_angle": angle}, [box([0.0, 0.0], [width, 0.006])]
+    fastest = {}
+    for wall in ("separating", "free-slip"):
+        simulation = create(scene(size=[width, 0.012], resolution=36, liquid=liquid, surface_tension=tension, wall=wall))
+        fastest[wall] = max(row["max_speed"] for row in advance(simulation, 0.04, 1e-3))
+    assert fastest["separating"] < 1.1 * fastest["free-slip"]
+
+
 def test_a_full_box_has_no_surface() -> None:
     simulation = create(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [1.0, 1.0])], surface_tension=WATER))
     assert simulation.tension is None
