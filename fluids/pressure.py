@@ -108,8 +108,8 @@ class PressureProjection:
     is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is not open on a separating wall have
     0 <= x complementary to y >= 0, the others y = 0. Liquid that wets the wall has -kick_dt `adhesion` in the place of 0, and its `jump`
     beside a surface that pulls by more: no air gets between liquid and wall against it. Whole cells have a = 0 or 1, a surface on the
-    cells' faces theta = 1: without solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal. Beyond an open side of
-    the domain lies AIR that the operator does not have: its faces add a_f / theta_f.
+    cells' faces theta = 1: without solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the
+    diagonal. Beyond an open side of the domain lies AIR that the operator does not have: its faces add a_f / theta_f.
 
     Material in AIR cells has no pressure; where the velocity is continued into air, it takes that of liquid beside it. With `weights`, for
     short steps, it rests on the surface instead: a face there that particles gave weight takes the mean change of the projected faces
