@@ -266,18 +266,6 @@ class LiquidSimulation(ParticleSimulation):
         """Continue from the arrays of `own_state`."""
         self.projection.restore(dict(state))
 
-    def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:
-        """Continue from the pieces of all ranks of a run on several, see `fluids.distributed`.
-
-        Raises:
-            ValueError: the pieces do not belong to this scene.
-        """
-        from warp_lcp.fluids.distributed.state import state_of  # what only such runs need
-
-        if self.grid.whole is not None and self._coverage is not None:
-            self.cover(self._coverage.domain)
-        self.restore(state_of(pieces, self.state()))
-
     def _find_surface(self, window: Window) -> None:
         """Mark the liquid's cells, give velocity to their faces, and let the surface's tension push them."""
         projection = self.projection

@@ -11,6 +11,7 @@ from turns import Seat
 
 from small_liquids import box, create, scene
 from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.extension import too_far
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids import distributed
@@ -154,7 +155,7 @@ def test_velocities_that_ranks_cannot_follow_are_seen_near_cuts_and_along_them()
         velocity = part.grid.faces()
         host = velocity[axis].numpy()
         host[1, 4, place] = cells * 0.1 / 0.02
-        assert distributed.too_far(part, velocity, 0.02) == pytest.approx(expected, rel=1e-5)
+        assert too_far(part, velocity, 0.02) == pytest.approx(expected, rel=1e-5)
 
 
 def damaged(name, change):

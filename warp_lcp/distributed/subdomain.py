@@ -105,10 +105,11 @@ class Subdomain:
                 field.assign(host)
 
     def box_of(self, field: wp.array, ring: int = 0) -> Any:
-        """Return the view of a field, host or device, on the cells of the box and on so many cells around it."""
+        """Return the view of a field, host or device, or of layers of one, on the cells of the box and on so many cells around it."""
         low, high = self.owned.low, self.owned.high
         edge = (ring if self.dimension == 3 else 0, ring, ring)
-        return field[tuple(slice(l - e, h + e) for l, h, e in zip(low, high, edge, strict=True))]
+        box = (slice(l - e, h + e) for l, h, e in zip(low, high, edge, strict=True))
+        return field[(slice(None),) * (field.ndim - 3) + tuple(box)]
 
     def stored_box_of(self, field: wp.array) -> Any:
         """Return the view of a field on the cells of the box and one cell around it, in the stored shape of such a box."""

@@ -20,12 +20,14 @@ from warp_lcp.material.narrow_band import without_band
 from warp_lcp.material.particle_assembly import Parts, make_particle_volume, make_surface_mesh
 from warp_lcp.material.particle_frames import ParticleFrames
 from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
+from warp_lcp.material.particle_pieces import Piece, state_of
 from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
 from warp_lcp.material.resample import resampled, resampling_notes
 from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.material.spray import Spray
+from warp_lcp.material.wall import Join
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, Stopwatch
 
@@ -266,9 +268,17 @@ class ParticleSimulation(ParticleFrames):
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.boundary_kernels`.
         """
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
-            self.boundary.extend(window, self.velocity, self.weights, list(known), kind, contact, self.layers)
+            self._continue(window, list(known), kind, contact, self._layer_filled())
             if self.sources is not None:
                 self.sources.hold(self.velocity, [])
+
+    def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
+        """Continue the velocity among the boundary's walls; `join` is called after each layer."""
+        self.boundary.extend(window, self.velocity, self.weights, known, kind, contact, self.layers, join)
+
+    def _layer_filled(self) -> Join | None:
+        """Return what is called with marks and field of a component when a layer of faces is filled."""
+        return None
 
     def exchange(self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
         """Exchange particles with the interior, if there is one; arguments as of `warp_lcp.material.narrow_band.NarrowBand`."""
@@ -419,6 +429,16 @@ class ParticleSimulation(ParticleFrames):
         if self.bodies is not None:
             self.bodies.restore(state)
         self.boundary.place(self.time)
+
+    def restore_pieces(self, pieces: Sequence[Piece]) -> None:
+        """Continue from the pieces of all ranks of a run on several, see `warp_lcp.distributed.particle_simulation`.
+
+        Raises:
+            ValueError: the pieces do not belong to this scene.
+        """
+        if self.grid.whole is not None and self._coverage is not None:
+            self.cover(self._coverage.domain)
+        self.restore(state_of(pieces, self.state()))
 
     def _on_this_grid(self, state: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Lay the grid of a state if the scene allows that, else bring the state to this one's.

@@ -1,10 +1,10 @@
-"""States of liquid in pieces and as a whole."""
+"""States of particles in pieces and as a whole."""
 
 import numpy as np
 import pytest
 
 from small_liquids import advance, dam
-from warp_lcp.fluids.distributed.state import CELLS, piece_of, state_of
+from warp_lcp.material.particle_pieces import fields_of, piece_of, state_of
 
 
 def cut(piece, at):
@@ -16,7 +16,7 @@ def cut(piece, at):
         box = piece["box"].copy()
         box[:, 0] = low, high
         particles = {name: values[inside] for name, values in piece.items() if len(values.shape) and len(values) == len(left)}
-        parts.append({**piece, **particles, **{name: piece[name][:, :, low:high] for name in CELLS}, "box": box})
+        parts.append({**piece, **particles, **{name: field[..., low:high] for name, field in fields_of(piece).items()}, "box": box})
     return parts
 
 
@@ -54,5 +54,5 @@ def test_what_is_missing_is_named():
         state_of([{name: values for name, values in pieces[0].items() if name != "velocity"}, pieces[1]], state)
     with pytest.raises(ValueError, match="the pieces lack everything"):
         state_of([], state)
-    with pytest.raises(ValueError, match="the state lacks cells, contact, position, pressure, signature"):
+    with pytest.raises(ValueError, match="the state lacks cells, position, signature"):
         piece_of({"time": np.array(0.0)})

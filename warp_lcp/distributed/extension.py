@@ -1,4 +1,4 @@
-"""How far liquid and velocities that are continued go beyond a rank's box."""
+"""How far material and velocities that are continued go beyond a rank's box."""
 
 from __future__ import annotations
 

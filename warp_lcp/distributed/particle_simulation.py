@@ -1,0 +1,220 @@
+"""Particles and their fields on the ranks of MPI: each has a box of the domain, and the particles in it.
+
+A step is that of one process on the part of the grid around a rank's box. What another rank knows comes in where the chain of dependence
+needs it: particles a cell from the cut before they are brought to the faces; velocities and weights of the faces; what a material finds of
+its cells; the solve, which is one of all ranks; the velocity that it leaves, and again while that is continued into air and walls.
+All of it is computed by the same kernels from the same numbers in the same order as by one process, so that runs on any number of ranks
+differ by the rounding in the solver and in sums over all particles alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
+from warp_lcp.distributed.extension import Refill, too_far
+from warp_lcp.distributed.particle_pieces import take_pieces
+from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.grid.particles import ParticleTotals
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.particle_assembly import Parts
+from warp_lcp.material.particle_log import Row
+from warp_lcp.material.particle_pieces import Piece, fields_of, piece_of
+from warp_lcp.material.particle_rearrangement import Rearrangement
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.material.particle_state import signature
+from warp_lcp.material.sources import Outlets
+from warp_lcp.simulation import SimulationFailed, StepFailed
+
+
+class SharedParticleSimulation(ParticleSimulation):
+    """A rank's part of a material in progress; with a subclass of `ParticleSimulation` it implements `warp_lcp.simulation.Simulation`.
+
+    Making it, `stable_dt`, `step`, `mark` and `restore_pieces` are collective and give every rank the same numbers, or raise the same error
+    on all: rows of the log are of the whole material. `frame` shows this rank's particles and cells, with positions and cells' numbers of
+    the whole domain; `frame`, `piece_state`, `columns` and `notes` ask nobody.
+
+    A class is made of the material's own simulation and this one, in this order. Its `mark` is in `with_ghosts`, its `step` in `attempt`.
+
+    Args:
+        scene: what to simulate.
+        grid: that of the part.
+        parts: the solids that meet it, and sources.
+        particles: this rank's; they know the part.
+        more: as of the base class.
+
+    Attributes:
+        part: where this rank works.
+    """
+
+    shared = True
+    particles: SharedParticles
+
+    def __init__(self, scene: ParticleScene, grid: StaggeredGrid, parts: Parts, particles: SharedParticles, **more: Any) -> None:
+        """Allocate the fields, fill the sources that run at the start and sort the particles."""
+        self.part = particles.part
+        self._dt = 0.0
+        super().__init__(scene, grid, parts, particles, **more)
+        self._everyone = int(self.part.ranks.sum(particles.count))
+
+    def _rearrangement(self) -> Rearrangement:
+        crowding, correction = partial(SharedCrowding, self.part), partial(SharedDensityCorrection, self.part)
+        return Rearrangement(self.scene, self.grid, self.boundary, crowding=crowding, correction=correction)
+
+    def _flights(self) -> None:
+        """Bodies reach across the cuts between ranks, where none of them knows the whole of one."""
+
+    @contextmanager
+    def with_ghosts(self) -> Iterator[None]:
+        """Let the particles around this rank's box be there."""
+        self.particles.arrange(0)
+        yield
+        self.particles.drop_ghosts()
+
+    @contextmanager
+    def attempt(self, dt: float) -> Iterator[None]:
+        """Take a step of dt [s], after which ghosts are gone even if it fails."""
+        self._dt = dt
+        try:
+            yield
+        except (StepFailed, SimulationFailed):
+            self.particles.drop_ghosts()
+            raise
+
+    def bring_to_faces(self, window: Window) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them."""
+        super().bring_to_faces(window)
+        with self.watch.stage("exchange between ranks", *self.velocity, *self.weights):
+            self.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
+
+    def extend(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
+        """Continue the velocity into air and walls, see the base class; it is then right in all ghost layers.
+
+        Raises:
+            StepFailed: it is so fast that particles would leave the ghost layers.
+        """
+        super().extend(window, known, kind, contact)
+        self.part.fill(*self.velocity)
+        cells = float(self.part.ranks.max(too_far(self.part, self.velocity, self._dt)))
+        if cells > 0.0:
+            raise StepFailed(
+                f"step {self.step_count}: the velocity would take {self.scene.materials()[0]} {cells:.1f} cells far, and a rank knows "
+                f"{self.part.layers - 1} around its box"
+            )
+
+    def _layer_filled(self) -> Refill:
+        return Refill(self.part)
+
+    def bring_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
+        """Give this rank's own particles the velocity of the faces."""
+        self.particles.drop_ghosts()
+        super().bring_to_particles(window, kind, dt)
+
+    def met(self) -> tuple[int, int, int]:
+        """Return how many of all met a wall, were pushed by a solid, and are stuck inside one."""
+        met, pushed, stuck = self.part.ranks.sum(np.array(super().met()))
+        return int(met), int(pushed), int(stuck)
+
+    def _exchange(self, dt: float) -> dict[str, int]:
+        """Exchange this rank's particles with sources and outlets; return what all ranks have."""
+        mine = super()._exchange(dt)
+        total = dict(zip(mine, self.part.ranks.sum(np.array([*mine.values()])).tolist(), strict=True))
+        self._everyone += total["emitted"] - total["drained"] - total["departed"]
+        return total
+
+    def _remove_departed(self, outlets: Outlets) -> int:
+        gone = int(self.part.ranks.sum(super()._remove_departed(outlets)))
+        self._everyone -= gone
+        return gone
+
+    def checked_totals(self, when: str) -> ParticleTotals:
+        """Return sums over all ranks' particles.
+
+        Raises:
+            SimulationFailed: a value is not finite, a particle lies outside the domain, or not all are there; on all ranks.
+        """
+        totals = super().checked_totals(when)
+        if totals.count != self._everyone:
+            raise SimulationFailed(f"{when} step {self.step_count}: {totals.count} particles are there, of {self._everyone}")
+        return totals
+
+    def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
+        """Return what the root rank says on whose part something is wrong."""
+        told = self.part.ranks.comm.allgather(super()._trouble(totals, end))
+        return next((text for text in told if text), "")
+
+    def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
+        return super()._totals_row(totals, dt) | {"particles": totals.count}
+
+    def notes(self) -> list[str]:
+        """Return warnings and facts worth a line at the start of a run."""
+        boxes, whole = self.part.decomposition.boxes, self.part.decomposition.counts
+        most = max(boxes, key=lambda box: box.cells).counts
+        cells, largest = (" x ".join(map(str, counts[: self.grid.dimension])) for counts in (whole, most))
+        return [
+            f"{self._everyone} particles, {cells} cells of {self.grid.spacing:.4g} m",
+            f"{len(boxes)} ranks, boxes of up to {largest} cells and {self.part.layers} layers of ghost cells",
+            *self._notes,
+        ]
+
+    def piece_state(self) -> dict[str, np.ndarray]:
+        """Return this rank's part of the state, without pickles, in the whole domain's coordinates.
+
+        Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's;
+        `time`, `step_count`, `last_dt`, `signature` as of `state`; particles: `position`, `velocity`, `affine_0` ... float32 (n, 3) and
+        `place` int64 (n,), their order; of the box, shape (..., nz, ny, nx): `cells` int8 and the other fields of `own_state`, and once
+        particles were moved apart `density_correction` float64; the numbers of `own_state`, the same on all ranks.
+        """
+        box, own = self.part.box, self.own_state()
+        fields = {name: np.ascontiguousarray(self.part.box_of(field)) for name, field in self._cell_fields(own).items()}
+        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
+        where = {"box": np.array([box.low, box.high]), "counts": np.array(self.part.decomposition.counts)}
+        particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
+        numbers = own | {"signature": signature(self.scene, self.part.grid)}
+        return where | clock | numbers | particles | {"place": self.particles.place.copy()} | fields
+
+    def _cell_fields(self, own: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return fields_of(own) | self.rearrangement.state()
+
+    def restore_pieces(self, pieces: Sequence[Piece]) -> None:
+        """Continue from the pieces of all ranks of a run on any number of ranks; each rank takes what lies in its box. Collective.
+
+        Args:
+            pieces: of `piece_state`, of all ranks, in any order. Of a piece that has nothing in this rank's box grown by some cells the
+                arrays of particles and cells are not read.
+
+        Raises:
+            ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
+        """
+        own, names = self.own_state(), list(self.particles.arrays())
+        base = None if self.boundary.moves else self.boundary.base
+        particles, cells, numbers = take_pieces(self.part, names, own, signature(self.scene, self.part.grid), pieces, base)
+        everyone = int(self.part.ranks.sum(len(particles["place"])))
+        if everyone != self._everyone and not (self.sources or self.outlets):
+            raise ValueError(f"the pieces have {everyone} particles: this scene has {self._everyone}")
+        self._everyone = everyone
+        self.particles.assign_with_places(particles, particles["place"])
+        self._faces_know = False
+        self.rearrangement.expect(cells)
+        fields = self._cell_fields(own)
+        for name, values in cells.items():
+            self.part.box_of(fields[name])[...] = values
+        self.rearrangement.restore(fields)
+        self.restore_own(own | {name: numbers[name] for name in own.keys() & numbers.keys()})
+        self.time, self.step_count, self.last_dt = float(numbers["time"]), int(numbers["step_count"]), float(numbers["last_dt"])
+        self.boundary.place(self.time)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return this rank's part of the state, see `piece_state`."""
+        return self.piece_state()
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from the state of a simulation in one process; collective."""
+        self.restore_pieces([state if "box" in state else piece_of(state)])

@@ -1,0 +1,68 @@
+"""The state of particles and cells in pieces, one of each rank of a run on several, and as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from warp_lcp.material.particle_rearrangement import STATE
+
+Piece = Mapping[str, np.ndarray]  # what one rank has of a simulation's state; the last axes of what lies in cells are z, y, x
+
+LATER = {STATE: np.float64}  # there once particles have been moved apart
+
+
+def fields_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the entries of a state that lie in cells."""
+    return {name: values for name, values in state.items() if np.ndim(values) >= 3}
+
+
+def piece_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the state of a simulation in one process as the piece of a rank that has everything.
+
+    Raises:
+        ValueError: it is not the state of particles.
+    """
+    missing = sorted({"signature", "position", "cells"} - state.keys())
+    if missing:
+        raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
+    counts = np.asarray(state["signature"][:3], dtype=np.int64)
+    cells = {name: np.ascontiguousarray(field[..., 1:-1, 1:-1, 1:-1]) for name, field in fields_of(state).items()}
+    place = np.arange(len(state["position"]), dtype=np.int64)
+    return {**state, **cells, "counts": counts, "box": np.array([np.zeros(3, dtype=np.int64), counts]), "place": place}
+
+
+def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the pieces of all ranks as the state of a simulation in one process.
+
+    Args:
+        pieces: of all ranks.
+        like: a state of the same scene in one process, which gives names, types and what lies around the domain.
+
+    Raises:
+        ValueError: the pieces do not cover the domain, or lack something.
+    """
+    missing = sorted({name for piece in pieces for name in (*like, "place", "box") if name not in (*piece, *LATER)})
+    if missing or not pieces:
+        raise ValueError(f"the pieces lack {', '.join(missing) or 'everything'}: they do not belong to this scene")
+    order = np.argsort(np.concatenate([piece["place"] for piece in pieces]), kind="stable")
+    later = {name: np.zeros(like["cells"].shape, dtype) for name, dtype in LATER.items() if all(name in piece for piece in pieces)}
+    like = {name: values for name, values in like.items() if name not in LATER} | later
+    whole, covered, fields = {}, 0, fields_of(like)
+    for name, values in like.items():
+        if name in fields:
+            whole[name] = np.array(values)
+        elif values.ndim == 2:
+            whole[name] = np.concatenate([piece[name] for piece in pieces])[order]
+        else:
+            whole[name] = np.asarray(pieces[0][name])
+    for piece in pieces:
+        low, high = piece["box"] + 1  # a ring of cells lies around the domain
+        covered += int(np.prod(high - low))
+        for name in fields:
+            z, y, x = (slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
+            whole[name][..., z, y, x] = piece[name]
+    if covered != np.prod(pieces[0]["counts"]):
+        raise ValueError("the pieces do not cover the domain: some are missing, or twice there")
+    return whole
