@@ -18,6 +18,7 @@ DT = 0.01  # the longest step [s]
 STEPS = 10
 DAM_STEPS = 20
 BALL = {"shape": "sphere", "radius": 0.12, "center": [0.5, 0.2, 0.25]}
+DISC = {"shape": "sphere", "radius": 0.1, "center": [0.5, 0.1]}
 FLAT = {"size": [1.0, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0], [0.5, 0.45])]}
 DEEP = {"size": [1.0, 0.5, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0, 0.0], [0.5, 0.45, 0.5])]}
 DROP = box([0.6, 0.3, 0.1], [0.8, 0.45, 0.3], velocity=[-1.0, 0.5, 0.7])
@@ -53,6 +54,7 @@ SCENES = {
     "probes, tilted": DEEP | TILTED | {"probe": PROBES, "pressure": {"surface": "voxel"}},
     "drops": DEEP | CAPILLARY | {"solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "crowded": DEEP | {"density_correction": {"every": 2}, "solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
+    "reseeded": FLAT | {"particles": {"reseed": {"min": 4, "max": 4}}, "solid": [DISC], "solver": {"precision": "double"}},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 

@@ -59,7 +59,7 @@ def alone(model_, **options):
     return distributed.create(model_, Ranks(Seat(0, 1)), device="cpu", folder=Path(), **options)
 
 
-@pytest.mark.parametrize("name", ["flat", "cut", "voxel", "turning", "river", "whole-cell river", "drops", "crowded"])
+@pytest.mark.parametrize("name", ["flat", "cut", "voxel", "turning", "river", "whole-cell river", "drops", "crowded", "reseeded"])
 def test_one_rank_is_one_process_bit_for_bit(name):
     one, shared = single(model(name)), alone(model(name))
     assert advance(shared, 6) == advance(one, 6)
@@ -187,7 +187,6 @@ def test_pieces_of_something_else_are_refused(change, message):
 @pytest.mark.parametrize(
     ("tables", "key"),
     [
-        (FLAT | {"particles": {"reseed": {}}}, "particles.reseed"),
         (FLAT | {"particles": {"narrow_band": {}}}, "particles.narrow_band"),
         (FLAT | {"pressure": {"model": "unilateral"}}, 'pressure.model = "unilateral"'),
         (FLAT | {"output": {"surface": True}}, "output.surface"),

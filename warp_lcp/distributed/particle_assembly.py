@@ -42,7 +42,6 @@ def refusals(scene: ParticleScene) -> list[str]:
     """Return the keys of a scene that ask for what no material has on ranks."""
     asked = {
         **{f"solid[{n}].mass": solid.is_body for n, solid in enumerate(scene.solid)},
-        "particles.reseed": scene.particles.reseed,
         "output.surface": scene.output.surface,
         "output.volume": scene.output.volume,
     }

@@ -21,6 +21,7 @@ from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensit
 from warp_lcp.distributed.extension import Refill, too_far
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.distributed.reseeding import SharedReseeding
 from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.particle_assembly import Parts
@@ -66,7 +67,8 @@ class SharedParticleSimulation(ParticleSimulation):
 
     def _rearrangement(self) -> Rearrangement:
         crowding, correction = partial(SharedCrowding, self.part), partial(SharedDensityCorrection, self.part)
-        return Rearrangement(self.scene, self.grid, self.boundary, crowding=crowding, correction=correction)
+        reseeding = partial(SharedReseeding, self.part)
+        return Rearrangement(self.scene, self.grid, self.boundary, crowding=crowding, correction=correction, reseeding=reseeding)
 
     def _flights(self) -> None:
         """Bodies reach across the cuts between ranks, where none of them knows the whole of one."""

@@ -293,14 +293,16 @@ def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> 
     return near
 
 
-def make_reseeding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Reseeding | None:
-    """Return what evens out the particles if a scene asks for it."""
+def make_reseeding(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., Reseeding] = Reseeding
+) -> Reseeding | None:
+    """Return what evens out the particles if a scene asks for it, made by what takes the arguments of `Reseeding`."""
     settings = scene.particles.reseed
     if settings is None:
         return None
     at_rest = scene.particles.per_axis**grid.dimension
     least, most = scene.particles.reseed_range(grid.dimension)
-    return Reseeding(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
+    return make(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
 
 
 def make_density_correction(

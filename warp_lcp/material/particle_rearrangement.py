@@ -15,6 +15,7 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.particle_assembly import make_crowding, make_density_correction, make_reseeding
 from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.material.reseeding import Reseeding
 from warp_lcp.simulation import Stopwatch
 
 CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
@@ -37,6 +38,7 @@ class Rearrangement:
         boundary: its solids.
         crowding: makes what tells when to act.
         correction: makes what moves apart.
+        reseeding: makes what evens out.
 
     Attributes:
         reseeding: what evens out; None: the scene does not ask for it.
@@ -46,11 +48,12 @@ class Rearrangement:
 
     def __init__(
         self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, crowding: Callable[..., Crowding] = Crowding,
-        correction: Callable[..., DensityCorrection] = DensityCorrection,
+        correction: Callable[..., DensityCorrection] = DensityCorrection, reseeding: Callable[..., Reseeding] = Reseeding,
     ) -> None:  # fmt: skip
         """Make what the scene asks for."""
         self._scene, self._grid, self._boundary, self._make = scene, grid, boundary, correction
-        self.reseeding, self.crowding = make_reseeding(scene, grid, boundary), make_crowding(scene, grid, boundary, crowding)
+        self.reseeding = make_reseeding(scene, grid, boundary, reseeding)
+        self.crowding = make_crowding(scene, grid, boundary, crowding)
         self.correction: DensityCorrection | None = None
         settings = scene.correction
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded

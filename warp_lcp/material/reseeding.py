@@ -46,6 +46,7 @@ class Reseeding:
         self.grid, self.boundary, self.every = grid, boundary, every
         self.least, self.most, self.particles_a_cell = least, most, particles_a_cell
         self._count, self._takers = grid.field(wp.int32), wp.zeros(grid.size, dtype=wp.int32, device=grid.device)
+        self._asked = grid.domain  # cells that may take
         self._offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
         self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)  # of takers, and of particles moved
         steps = [(-1, 0, 1) if axis < grid.dimension else (0,) for axis in (2, 1, 0)]
@@ -59,27 +60,44 @@ class Reseeding:
             window: cells that hold all particles, with two to spare on each side.
             step: number of the step, which the random part of the new places depends on.
         """
-        if particles.count == 0:
+        if not self._anywhere(particles.count):
             return 0
         grid = self.grid
-        particles.sort()
+        self._sort(particles)
         offsets = particles.offsets
         if offsets is None:
             offsets = self._offsets
             wp.launch(offset_kernel, grid.size + 1, [particles.key, particles.count, offsets], device=grid.device)
         self._numbers.zero_()
         window.launch(kernels.count_kernel, [offsets, self._count])
+        self._join()
         b, s = self.boundary, kernels.ReseedingSetting()
         s.planes, s.seed, s.dx, s.inverse_dx = grid.planes, step, grid.spacing, 1.0 / grid.spacing
         s.origin, s.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
         s.least, s.at_rest, s.most = self.least, self.particles_a_cell, self.most
-        inside = window.common(grid.domain)  # beyond open sides lies air without particles, and nothing beyond that
-        assert inside is not None, "windows reach into the domain"
-        inside.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
+        inside = window.common(self._asked)  # beyond open sides lies air without particles, and nothing beyond that
+        if inside is not None:
+            inside.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
         takers = int(self._numbers.numpy()[0])
-        if takers == 0:
+        if not self._anywhere(takers):
             return 0
         inputs = [s, self._takers, offsets, self._count, particles.position, self._numbers]
         for direction in self._directions:
             wp.launch(kernels.exchange_kernel, takers, [wp.vec3i(*direction), *inputs], device=grid.device)
+            self._join()
+        return self._moved()
+
+    def _anywhere(self, count: int) -> bool:
+        """Return whether there are any of what this grid has so many of."""
+        return count > 0
+
+    def _sort(self, particles: Particles) -> None:
+        """Sort the particles that cells near `_asked` hold."""
+        particles.sort()
+
+    def _join(self) -> None:
+        """Give what others know of the counts of cells to this grid's."""
+
+    def _moved(self) -> int:
+        """Return how many particles have moved."""
         return int(self._numbers.numpy()[1])

@@ -97,7 +97,9 @@ def exchange_kernel(way: wp.vec3i, s: ReseedingSetting, takers: INTS, offsets: I
         return
     start = offsets[cell]
     here = offsets[cell + 1] - start
-    donor = offsets[cell + (dk * count.shape[1] + dj) * count.shape[2] + di]
+    other = cell + (dk * count.shape[1] + dj) * count.shape[2] + di
+    donor = offsets[other]
+    here_too = offsets[other + 1] > donor  # its particles: those of another rank's cell may not be
     place = wp.vec3i(i, j, k) + s.origin
     own = (place[2] * s.across[1] + place[1]) * s.across[0] + place[0]  # the same number in all parts of a grid
     first_part = emptiest(planes, place, start, here, s.inverse_dx, position)
@@ -108,7 +110,8 @@ def exchange_kernel(way: wp.vec3i, s: ReseedingSetting, takers: INTS, offsets: I
         x = float(place[0] - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
         y = float(place[1] - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
         z = float(place[2] - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)
-        position[donor + gives - 1] = wp.vec3(x * dx, y * dx, wp.where(planes == 2, z * dx, 0.0))
+        if here_too:
+            position[donor + gives - 1] = wp.vec3(x * dx, y * dx, wp.where(planes == 2, z * dx, 0.0))
         gives -= 1
         has += 1
         taken += 1
