@@ -84,7 +84,6 @@ class LiquidSimulation(ParticleSimulation):
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.reach = max(self.layers, 2 * scene.pressure.smoothing, 0 if self.tension is None else REACH)
-        self.probes = Probes(scene.probe, self.gravity, grid.dimension) if scene.probe else None
         self.measured: dict[str, Row] = {}
         if self.tension is not None:
             self._notes.append(f"surface tension: steps of at most {self.tension.longest_step():.3g} s")
@@ -96,6 +95,7 @@ class LiquidSimulation(ParticleSimulation):
         self.surface = self._surface()
         self.tension = self._tension()
         self.projection = self._pressure()
+        self.probes = self._probes()
         drags, physics = self.scene.drags, self.scene.physics
         asked = self.forces is not None or drags is not None
         self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
@@ -112,6 +112,9 @@ class LiquidSimulation(ParticleSimulation):
 
     def _pressure(self) -> PressureProjection:
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
+
+    def _probes(self) -> Probes | None:
+        return Probes(self.scene.probe, self.gravity, self.grid.dimension) if self.scene.probe else None
 
     def stable_dt(self) -> float:
         """Return the longest step that advection and surface tension allow [s]."""

@@ -10,6 +10,7 @@ from warp_lcp.distributed.particle_assembly import refusals as refusals_of_all
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.sources import SharedSources
+from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed.simulation import DistributedLiquid
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.grid.sides import side_bits
@@ -36,15 +37,21 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     check_shared(scene, ranks, refusals(scene), METHODS)
     part = part_of(scene, ranks, device, smoothing=scene.pressure.smoothing)
     solids, domain = placed_solids(scene, folder), scene.domain
-    boundary, warnings = boundary_of_part(
-        part, solids, cut_cells=domain.solids == "cut-cell", wall_separating=domain.wall == "separating",
-        open_sides=side_bits(domain.open), sources=bool(scene.source),
+    warnings: list[str] = []
+
+    def make_parts(part: Subdomain) -> Parts:
+        boundary, warnings[:] = boundary_of_part(
+            part, solids, cut_cells=domain.solids == "cut-cell", wall_separating=domain.wall == "separating",
+            open_sides=side_bits(domain.open), sources=bool(scene.source),
+        )  # fmt: skip
+        return Parts(boundary, make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part)))
+
+    parts = make_parts(part)
+    particles, notes = particles_of_part(scene, part, parts.boundary, folder)
+    return DistributedLiquid(
+        scene, part.grid, parts, particles, make_parts=make_parts, solids=solids, outlets=make_outlets(scene, part.grid, folder),
+        notes=[*warnings, *notes],
     )  # fmt: skip
-    particles, notes = particles_of_part(scene, part, boundary, folder)
-    sources = make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part))
-    outlets = make_outlets(scene, part.grid, folder)
-    parts, notes = Parts(boundary, sources), [*warnings, *notes]
-    return DistributedLiquid(scene, part, parts, particles, solids=solids, outlets=outlets, notes=notes)
 
 
 def refusals(scene: LiquidScene) -> list[str]:

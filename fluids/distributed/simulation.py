@@ -2,47 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import warp_lcp as wl
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.particles import SharedParticles
-from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed.pressure import DistributedPressure
 from warp_lcp.fluids.distributed.probes import SharedProbes
 from warp_lcp.fluids.distributed.surface import SharedSurface
 from warp_lcp.fluids.distributed.tension import SharedSurfaceTension
 from warp_lcp.fluids.models import make_surface, make_tension, pressure_settings
 from warp_lcp.fluids.pressure import PressureProjection
+from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation
 from warp_lcp.fluids.surface import FreeSurface
 from warp_lcp.fluids.surface_tension import SurfaceTension
 from warp_lcp.grid.staggered import Window
-from warp_lcp.material.particle_assembly import Parts
 from warp_lcp.material.particle_log import Row
+from warp_lcp.simulation import Cells, Part
 
 
 class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
-    """A rank's part of a liquid in progress, see `SharedParticleSimulation`.
-
-    Args:
-        scene: what to simulate.
-        part: where this rank works.
-        parts: the solids that meet it, and sources.
-        particles: this rank's.
-        more: solids, outlets and notes, as of the base class.
-    """
+    """A rank's part of a liquid in progress, see `SharedParticleSimulation`; made of what `LiquidSimulation` and that take."""
 
     scene: LiquidScene
     particles: SharedParticles
     projection: DistributedPressure
-
-    def __init__(self, scene: LiquidScene, part: Subdomain, parts: Parts, particles: SharedParticles, **more: Any) -> None:
-        """Allocate the fields and find the liquid's cells."""
-        super().__init__(scene, part.grid, parts, particles, **more)
-        self.probes = SharedProbes(part, scene.probe, self.gravity, part.dimension) if scene.probe else None
 
     def _surface(self) -> FreeSurface:
         part = self.part
@@ -54,6 +41,14 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
     def _pressure(self) -> PressureProjection:
         solver = wl.METHODS[self.scene.solver.method](precision=self.scene.solver.precision)
         return DistributedPressure(self.part, self.boundary, solver, **pressure_settings(self.scene, self.surface, self.weights))
+
+    def _probes(self) -> Probes | None:
+        return SharedProbes(self.part, self.scene.probe, self.gravity, self.part.dimension) if self.scene.probe else None
+
+    def frame(self) -> list[Part]:
+        """Return this rank's particles and cells, see the base class; cells know the box that they are from."""
+        box = self.part.box
+        return [replace(part, box=(box.low, box.high)) if isinstance(part, Cells) else part for part in super().frame()]
 
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""

@@ -1,11 +1,14 @@
 """How grids are cut so that ranks have about as much to do."""
 
+import itertools
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from warp_lcp.distributed.decomposition import balanced_processes, parts, pool
+from warp_lcp.distributed.balance import Load, edge_of_blocks
+from warp_lcp.distributed.decomposition import OPEN, balanced_processes, parts, pool, seen_by
 
 ALL = np.zeros(3), np.array([64.0, 32.0, 32.0])
 
@@ -54,3 +57,47 @@ def test_the_page_of_large_runs_has_the_boxes_of_the_dam(resolution, ranks):
     largest = " x ".join(str(max(parts(n, p))) for n, p in zip(counts, processes, strict=True))
     page = (Path(__file__).parents[2] / "docs" / "planning.md").read_text()
     assert f"| {ranks} | {largest} |" in page
+
+
+def busiest(load, cut):
+    """Return what the busiest rank has to do, by a sum over its blocks."""
+    ends = [[0, *-(-np.cumsum(part) // load.edge)] for part in cut]
+    boxes = itertools.product(*(list(itertools.pairwise(end)) for end in ends))
+    full = [load.material[tuple(slice(a, b) for a, b in box)].sum() for box in boxes]
+    return (np.array(full) + OPEN * seen_by(load.counts, cut, load.layers).ravel()).max()
+
+
+def every_cut(blocks, p, least):
+    """Yield all cuts of blocks into p parts that have so many at least."""
+    for inner in itertools.combinations(range(1, blocks), p - 1):
+        sizes = np.diff([0, *inner, blocks])
+        if p == 1 or sizes.min() >= least:
+            yield sizes.tolist()
+
+
+@pytest.mark.parametrize("draw", range(6))
+def test_cuts_by_load_leave_the_busiest_rank_as_little_as_any_cuts_along_one_axis(draw):
+    drawn = np.random.default_rng(7300 + draw)
+    counts = tuple(int(n) for n in drawn.integers(9, 17, 3))
+    load = Load(counts, 3, 1, drawn.random(counts) ** 8 * 40.0)
+    ranks = int(drawn.integers(2, 4))
+    work, cut = load.best(ranks)
+    assert work == pytest.approx(busiest(load, cut), rel=1e-12)
+    assert [sum(part) for part in cut] == list(counts)
+    for axis, p in itertools.product(range(3), [ranks]):
+        for part in every_cut(counts[axis], p, 3):
+            assert work <= busiest(load, [part if a == axis else [n] for a, n in enumerate(counts)]) * (1.0 + 1e-12)
+
+
+def test_cuts_by_load_lie_between_blocks_that_multigrid_gathers():
+    counts = (100, 90, 61)
+    material = np.zeros([math.ceil(n / 4) for n in counts])
+    material[:5, :, :3] = 64.0
+    load = Load(counts, 5, edge_of_blocks(counts, 8), material)
+    assert load.edge == 4
+    work, cut = load.best(8)
+    assert all(m % 4 == 0 for part in cut for m in part[:-1])
+    assert work == pytest.approx(busiest(load, cut))
+    assert work < 0.7 * busiest(load, [[parts(n, 2)[0], n - parts(n, 2)[0]] for n in counts])
+    assert load.best(8, cut)[0] == work
+    assert Load((16, 8, 8), 5, 1, np.ones((16, 8, 8))).best(8) is None

@@ -91,6 +91,13 @@ class Decomposition:
         places = map(self.place, range(ranks.size))
         self.boxes = [CellBox.of(*([s[p + n] for s, p in zip(starts, place, strict=True)] for n in range(2))) for place in places]
 
+    def cut_anew(self, cuts: Sequence[Sequence[int]]) -> Decomposition:
+        """Return other boxes of the same cells and ranks, as many along x, y, z as there are cells of each in `cuts`."""
+        px, py, pz = map(len, cuts)
+        other = Decomposition(self.counts, self.ranks, processes=(px, py, pz), cuts=cuts)
+        other.collective = self.collective  # a communicator of its own for each would use them up
+        return other
+
     def place(self, rank: int) -> Triple:
         """Return where a rank is among the ranks along x, y, z, as DMDA numbers them."""
         px, py, _ = self.processes
@@ -166,14 +173,14 @@ def parts(n: int, p: int) -> list[int]:
 def _processes(counts: Triple, size: int) -> Triple:
     """Return the ranks along x, y, z with the least cells at cuts; of equal ones those that cut z, whose planes lie in one piece."""
     nx, ny, nz = counts
-    found = [((px - 1) * ny * nz + (py - 1) * nx * nz + (pz - 1) * nx * ny, px, py, (px, py, pz)) for px, py, pz in _cuttings(counts, size)]
+    found = [((px - 1) * ny * nz + (py - 1) * nx * nz + (pz - 1) * nx * ny, px, py, (px, py, pz)) for px, py, pz in cuttings(counts, size)]
     if not found:
-        most = next(fewer for fewer in range(size - 1, 0, -1) if _cuttings(counts, fewer))
+        most = next(fewer for fewer in range(size - 1, 0, -1) if cuttings(counts, fewer))
         raise ValueError(f"{size} ranks cannot share {' x '.join(map(str, counts))} cells, each with a box: start {most} or fewer")
     return min(found)[3]
 
 
-def _cuttings(counts: Triple, size: int) -> list[Triple]:
+def cuttings(counts: Triple, size: int) -> list[Triple]:
     """Return the numbers of ranks along x, y, z, whose product is `size`, that leave each rank a cell."""
     divisors = [p for p in range(1, size + 1) if size % p == 0]
     triples = [(px, py, size // (px * py)) for px in divisors for py in divisors if size // px % py == 0]
@@ -199,7 +206,7 @@ def balanced_processes(counts: Triple, size: int, *, layers: int, states: Sequen
     (1, 1, 2)
     """
     found = []
-    for p in _cuttings(counts, size):
+    for p in cuttings(counts, size):
         cuts = [parts(n, a) for n, a in zip(counts, p, strict=True)]
         if all(len(cut) == 1 or min(cut) >= layers for cut in cuts):
             found.append((sum(_most_work(counts, cuts, layers, state) for state in states), p))
@@ -229,13 +236,22 @@ def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> 
 
 def _most_work(counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]) -> float:
     """Return what the busiest rank has to do, in cells full of material."""
-    ends = [np.concatenate([[0], np.cumsum(cut)]) for cut in cuts]
-    low, high = ([end[side : len(end) - 1 + side] for end in ends] for side in range(2))
-    seen = [np.minimum(h + layers, n) - np.maximum(l - layers, 0) for l, h, n in zip(low, high, counts, strict=True)]
-    work = OPEN * _of_boxes(seen)
+    low, high = _ends(cuts)
+    work = OPEN * seen_by(counts, cuts, layers)
     for corners in state:
         work += _of_boxes([np.clip(np.minimum(b, h) - np.maximum(a, l), 0.0, None) for a, b, l, h in zip(*corners, low, high, strict=True)])
     return float(work.max())
+
+
+def seen_by(counts: Triple, cuts: Sequence[Sequence[int]], layers: int) -> np.ndarray:
+    """Return how many cells each box has with its ghost layers, shape (boxes along x, y, z)."""
+    return _of_boxes([np.minimum(h + layers, n) - np.maximum(l - layers, 0) for l, h, n in zip(*_ends(cuts), counts, strict=True)])
+
+
+def _ends(cuts: Sequence[Sequence[int]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return where boxes begin and end along x, y, z."""
+    ends = [np.cumsum([0, *cut]) for cut in cuts]
+    return [end[:-1] for end in ends], [end[1:] for end in ends]
 
 
 def _of_boxes(sides: Sequence[np.ndarray]) -> np.ndarray:

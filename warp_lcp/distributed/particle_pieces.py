@@ -52,7 +52,7 @@ def take_pieces(
             for name, values in cells.items() if shared.cells else ():
                 values[..., *shared.moved(part.box.low, -1).slices] = piece[name][..., *shared.moved(box.low, -1).slices]
             if box.grown(part.layers).common(part.box).cells:  # particles move on to their rank when the next step begins
-                inside = _in_box(part, piece)
+                inside = part.owners(cells_of(part, piece["position"])) == part.ranks.rank
                 found.append({name: np.asarray(piece[name])[inside] for name in own})
         own = {name: np.ascontiguousarray(np.concatenate([p[name] for p in found])) for name in own}
         if covered != part.box.cells:
@@ -77,12 +77,11 @@ def _numbers(pieces: Sequence[Piece], names: Sequence[str], others: Sequence[str
     return numbers
 
 
-def _in_box(part: Subdomain, piece: Piece) -> np.ndarray:
-    """Tell which of a piece's particles are in this rank's box; cells are found as kernels find them."""
+def cells_of(part: Subdomain, position: np.ndarray) -> np.ndarray:
+    """Return the cells (x, y, z) of the whole domain that positions [m] lie in, as kernels find them, shape (n, 3)."""
     inverse, one = np.float32(1.0 / part.grid.spacing), np.float32(1.0)
-    inside = np.ones(len(piece["place"]), dtype=bool)
+    cells = np.zeros((len(position), 3), dtype=np.int64)
     for axis in range(part.grid.dimension):
-        coordinate = np.asarray(piece["position"][:, axis], dtype=np.float32) * inverse + one
-        cell = np.clip(coordinate, one, np.float32(part.decomposition.counts[axis])).astype(np.int64) - 1
-        inside &= (cell >= part.box.low[axis]) & (cell < part.box.high[axis])
-    return inside
+        coordinate = np.asarray(position[:, axis], dtype=np.float32) * inverse + one
+        cells[:, axis] = np.clip(coordinate, one, np.float32(part.decomposition.counts[axis])).astype(np.int64) - 1
+    return cells

@@ -9,7 +9,7 @@ differ by the rounding in the solver and in sums over all particles alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -17,11 +17,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.balance import Balance
+from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
 from warp_lcp.distributed.extension import Refill, too_far
+from warp_lcp.distributed.migration import cuts_of, handed_over
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.reseeding import SharedReseeding
+from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.particle_assembly import Parts
@@ -49,18 +53,23 @@ class SharedParticleSimulation(ParticleSimulation):
         grid: that of the part.
         parts: the solids that meet it, and sources.
         particles: this rank's; they know the part.
+        make_parts: makes solids and sources of another part.
         more: as of the base class.
 
     Attributes:
         part: where this rank works.
+        balance: says when the ranks' boxes are cut anew.
     """
 
     shared = True
     particles: SharedParticles
 
-    def __init__(self, scene: ParticleScene, grid: StaggeredGrid, parts: Parts, particles: SharedParticles, **more: Any) -> None:
+    def __init__(
+        self, scene: ParticleScene, grid: StaggeredGrid, parts: Parts, particles: SharedParticles, *,
+        make_parts: Callable[[Subdomain], Parts], **more: Any,
+    ) -> None:  # fmt: skip
         """Allocate the fields, fill the sources that run at the start and sort the particles."""
-        self.part = particles.part
+        self.part, self.balance, self._make_parts = particles.part, Balance(), make_parts
         self._dt = 0.0
         super().__init__(scene, grid, parts, particles, **more)
         self._everyone = int(self.part.ranks.sum(particles.count))
@@ -72,6 +81,31 @@ class SharedParticleSimulation(ParticleSimulation):
 
     def _flights(self) -> None:
         """Bodies reach across the cuts between ranks, where none of them knows the whole of one."""
+
+    def _follow(self, totals: ParticleTotals, dt: float) -> None:
+        """Cut the ranks' boxes anew in a step in which that pays."""
+        if self.balance.due(self.part, self.step_count):
+            self._rebalance()
+
+    def _rebalance(self) -> None:
+        """Go on in the boxes in which the busiest rank has least to do, if they are much better than those there are; collective."""
+        with self.watch.stage("cutting anew", self.particles.position):
+            found = self.balance.better(self.part, self.particles, self.scene.particles.per_axis**self.part.dimension)
+            if found is not None:
+                self.cut_anew(found)
+
+    def cut_anew(self, decomposition: Decomposition) -> None:
+        """Go on in other boxes of the same ranks; collective."""
+        before, piece, names = self.part, self.piece_state(), list(self.particles.arrays())
+        self._work_on(before.cut_anew(decomposition))
+        self._take_pieces([handed_over(piece, names, before, self.part, self.particles.post)])
+
+    def _work_on(self, part: Subdomain) -> None:
+        """Make what belongs to a part; its particles and fields are still to come."""
+        self.part = part
+        self.particles.work_on(part)
+        self._lay_anew(part.grid, lambda _: self._make_parts(part))
+        part.ranks.free_ended()
 
     @contextmanager
     def with_ghosts(self) -> Iterator[None]:
@@ -195,6 +229,16 @@ class SharedParticleSimulation(ParticleSimulation):
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
+        with self.part.decomposition.collective.led():
+            cuts = cuts_of(pieces, self.part)
+        if cuts is not None and cuts != self.part.decomposition.parts:
+            self._work_on(self.part.cut_anew(self.part.decomposition.cut_anew(cuts)))
+        self._take_pieces(pieces)
+        if cuts is None and self.part.ranks.size > 1:
+            self.particles.totals()
+            self._rebalance()
+
+    def _take_pieces(self, pieces: Sequence[Piece]) -> None:
         own, names = self.own_state(), list(self.particles.arrays())
         base = None if self.boundary.moves else self.boundary.base
         particles, cells, numbers = take_pieces(self.part, names, own, signature(self.scene, self.part.grid), pieces, base)

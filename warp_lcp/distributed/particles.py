@@ -93,6 +93,8 @@ class SharedParticles(Particles):
 
     Attributes:
         place: int64, shape (count,): where each particle is in the order of all ranks' particles.
+        post: carries messages.
+        counts: particles of each rank when `totals` found them.
 
     Raises:
         ValueError: the shapes do not match.
@@ -102,17 +104,23 @@ class SharedParticles(Particles):
         self, part: Subdomain, position: np.ndarray, velocity: np.ndarray, *, affine: bool, place: np.ndarray | None = None,
         indexed: bool | None = None, post: Post | None = None,
     ) -> None:  # fmt: skip
-        self.part = part
+        self.post = post or MpiPost(part.ranks.comm)
+        self._take_part(part)
         self.place = np.arange(len(position), dtype=np.int64) if place is None else np.asarray(place, dtype=np.int64)
         self._own: np.ndarray | None = None  # which particles are this rank's; None: all
-        around = part.box.grown(REACH)
-        boxes = part.decomposition.boxes
-        self._neighbors = [r for r, box in enumerate(boxes) if r != part.ranks.rank and around.common(box).cells]
-        if self._neighbors:
-            self.room = ROOM
-        self._post = post or MpiPost(part.ranks.comm)
         super().__init__(part.grid, position, velocity, affine=affine, indexed=indexed)
         self._record = np.dtype([("place", np.int64), ("values", np.float32, (len(self._names), 3))])
+
+    def _take_part(self, part: Subdomain) -> None:
+        self.part, around = part, part.box.grown(REACH)
+        self._neighbors = [r for r, box in enumerate(part.decomposition.boxes) if r != part.ranks.rank and around.common(box).cells]
+        if self._neighbors:
+            self.room = ROOM
+
+    def work_on(self, part: Subdomain) -> None:
+        """Belong to another box from now on; `assign_with_places` then brings what lies in it."""
+        self._own = None
+        self._take_part(part)
 
     def arrange(self, step: int) -> None:
         """Hand particles that have left the box to their ranks, take in those that came, with ghosts, and bring all into order."""
@@ -127,7 +135,7 @@ class SharedParticles(Particles):
         cells = self._cells(border)
         keep = np.ones(self.count, dtype=bool)
         keep[border[~_within(cells, self.part.box.grown(REACH))]] = False
-        places = self._receive(self._post.swap(self._outgoing(border, cells)))
+        places = self._receive(self.post.swap(self._outgoing(border, cells)))
         places = np.concatenate([self.place[keep], places])
         kept = np.concatenate([np.flatnonzero(keep).astype(np.int32), np.arange(len(self.place), self.count, dtype=np.int32)])
         order = np.argsort(places, kind="stable").astype(np.int32)
@@ -181,12 +189,14 @@ class SharedParticles(Particles):
         """Return sums over all ranks' particles; there are no ghosts now."""
         assert self._own is None, "ghosts would be counted twice"
         mine, ranks = super().totals(), self.part.ranks
+        self.counts = [mine.count]
         if ranks.size == 1:
             return mine
         n = mine.count
         with np.errstate(invalid="ignore"):
             means = n * mine.mean_square_speed, *(n * mine.center), *(n * mine.velocity)
-            sums = ranks.sum(np.array([n, mine.bad_positions, mine.bad_velocities, *means]))
+            everyone = ranks.gather(np.array([n, mine.bad_positions, mine.bad_velocities, *means]))
+        sums, self.counts = everyone.sum(axis=0), everyone[:, 0].astype(np.int64).tolist()
         most = ranks.max(np.array([mine.max_speed, *(-mine.low if n else [-np.inf] * 3), *(mine.high if n else [-np.inf] * 3)]))
         count = int(sums[0])
         if count == 0:

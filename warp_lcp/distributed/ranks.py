@@ -70,6 +70,12 @@ class Ranks:
         """Return sums over the ranks of a number or an array."""
         return self._shaped(self.gather(values).sum(axis=0), values)
 
+    def total(self, counts: np.ndarray) -> np.ndarray:
+        """Return sums over the ranks of an array of integers, whose order does not matter."""
+        everyone = np.empty_like(counts)
+        self.comm.Allreduce(counts, everyone)
+        return everyone
+
     def max(self, values: Any) -> Any:
         """Return the largest of the ranks' numbers, entry by entry; NaN where one is."""
         return self._shaped(self.gather(values).max(axis=0), values)
@@ -98,6 +104,11 @@ class Ranks:
         others = np.flatnonzero((found != found[0]).any(axis=1))
         if others.size:
             raise ValueError(f"{name} on rank {others[0]} is not what it is on rank 0: start all ranks with the same command and files")
+
+    def free_ended(self) -> None:
+        """Free what PETSc keeps of objects that Python has ended on every rank, which it does for all ranks at once."""
+        if self.size > 1:
+            petsc().garbage_cleanup(self.comm)
 
     @staticmethod
     def _shaped(found: np.ndarray, values: Any) -> Any:

@@ -73,6 +73,11 @@ class Subdomain:
             for side in range(2):
                 self.cuts |= (decomposition.neighbor(axis, side) is not None) << (2 * axis + side)
 
+    def cut_anew(self, decomposition: Decomposition) -> Subdomain:
+        """Return the part that this rank works on with other boxes."""
+        grid = self.grid
+        return Subdomain(decomposition, spacing=grid.spacing, dimension=self.dimension, device=grid.device, layers=self.layers)
+
     def _cells(self, box: CellBox) -> CellBox:
         """Return the cells of the part around a box, without its ring."""
         return box.grown(self.layers - 1).common(CellBox((0, 0, 0), self.decomposition.counts))

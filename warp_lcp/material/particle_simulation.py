@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import warp as wp
@@ -165,14 +165,18 @@ class ParticleSimulation(ParticleFrames):
         """
         assert self._coverage is not None, "a grid that is kept covers what it must"
         before, kept = self.grid, self._fields() if state is None else state
-        for name in self._laid - {"vicinity"}:  # so that their memory is there for what comes
-            delattr(self, name)
-        self.lay(grid, self._coverage.make_parts(grid))
-        self.particles.move_to(grid)
-        self.boundary.place(self.time)
+        self._lay_anew(grid, self._coverage.make_parts)
         if state is None:
             self.rearrangement.expect(kept)
             self._take_fields(carry_over(kept, before, grid, self._fields()))
+
+    def _lay_anew(self, grid: StaggeredGrid, make_parts: Callable[[StaggeredGrid], Parts]) -> None:
+        """Lay another grid, whose fields then hold nothing yet."""
+        for name in self._laid - {"vicinity"}:  # so that their memory is there for what comes
+            delattr(self, name)
+        self.lay(grid, make_parts(grid))
+        self.particles.move_to(grid)
+        self.boundary.place(self.time)
 
     def _follow(self, totals: ParticleTotals, dt: float) -> None:
         """Lay another grid if the material leaves this one in a step, or has become much smaller."""

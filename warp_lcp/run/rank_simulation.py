@@ -117,5 +117,6 @@ class RankSimulation:
 
     @cached_property
     def _box(self) -> Corners:
+        """The box of a simulation that keeps it; parts of another one tell theirs."""
         (x0, y0, z0), (x1, y1, z1) = self._simulation.piece_state()["box"].tolist()
         return (x0, y0, z0), (x1, y1, z1)

@@ -1,0 +1,176 @@
+"""Cuts by load: the boxes of ranks end where the busiest has least to do, and are cut anew when material has moved so far that it pays."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_lcp.distributed.decomposition import OPEN, Decomposition, Triple, cuttings, parts, seen_by
+from warp_lcp.distributed.hierarchy import GATHERED
+from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.distributed.subdomain import Subdomain
+
+STEP = 1 << 13  # cells full of material whose work is that which a step takes however little there is of it
+BLOCKS = 128  # of a rank, five along an axis
+ROUNDS = 4  # over the axes: each leaves the busiest rank no more to do than before
+
+Parts = list[list[int]]  # cells of each box along x, y, z
+
+
+@dataclass(frozen=True)
+class Load:
+    """What there is to do in a step, by blocks of cells.
+
+    Cuts lie between blocks, so that the levels of multigrid that ranks share end at them.
+
+    Args:
+        counts: cells (nx, ny, nz) of the whole grid.
+        layers: of ghost cells, which no box may be thinner than.
+        edge: of a block, in cells.
+        material: in cells full of it, shape (blocks along x, y, z).
+    """
+
+    counts: Triple
+    layers: int
+    edge: int
+    material: np.ndarray
+
+    def best(self, ranks: int, start: Parts | None = None, *, rank: int | None = None) -> tuple[float, Parts] | None:
+        """Return what the busiest rank has to do at least, and the cuts for that; None: there are too many ranks for the grid.
+
+        Cuts along one axis are the best there are for those along the others (dynamic programming); the axes take turns.
+
+        Args:
+            ranks: how many.
+            start: cuts to start from as well, so that what is found is no worse.
+            rank: look at what falls to this one where all look, each at some numbers of boxes along x, y, z; None: at all.
+        """
+        total, found = float(self.material.sum()), list[tuple[float, Parts]]()
+
+        def least(p: Triple) -> float:
+            """Return what the busiest rank has to do if all have as much."""
+            return (total + OPEN * math.prod(n + 2 * self.layers * (a - 1) for n, a in zip(self.counts, p, strict=True))) / ranks
+
+        processes = sorted(cuttings(self.counts, ranks), key=lambda p: (least(p), p))
+        for p in processes if rank is None else processes[rank::ranks]:
+            if found and least(p) >= min(found)[0]:
+                break
+            starts = [[parts(n, a) for n, a in zip(self.counts, p, strict=True)]]
+            if start is not None and tuple(map(len, start)) == p:
+                starts.append(start)
+            found += filter(None, map(self._improved, starts))
+        return min(found) if found else None
+
+    def _improved(self, cut: Parts) -> tuple[float, Parts] | None:
+        """Return better cuts, as many along each axis, and what the busiest rank then has to do; None: there is no room for them."""
+        work = math.inf
+        for _ in range(ROUNDS):
+            before = work
+            for axis, part in enumerate(cut):
+                if len(part) == 1 and math.isfinite(work):
+                    continue
+                along = self._along(axis, cut)
+                if along is None:
+                    return None
+                work, part = along
+                cut = [*cut[:axis], part, *cut[axis + 1 :]]
+            if work >= before:
+                break
+        return work, cut
+
+    def _along(self, axis: int, cut: Parts) -> tuple[float, list[int]] | None:
+        """Return the best cuts along an axis for those along the others, and what the busiest rank then has to do; None: there are none."""
+        n, ranks, others = self.counts[axis], len(cut[axis]), [a for a in range(3) if a != axis]
+        ends = np.append(np.arange(0, n, self.edge), n)
+        beside, material = seen_by(self.counts, [*cut[:axis], [n], *cut[axis + 1 :]], self.layers), np.moveaxis(self.material, axis, 0)
+        for place, other in enumerate(others, start=1):
+            material = np.diff(_through(material, place).take(-(-np.cumsum([0, *cut[other]]) // self.edge), axis=place), axis=place)
+        through = _through(material.reshape(len(material), -1), 0)
+        thick = ends[None] - ends[:, None]
+        seen = OPEN / n * (np.minimum(ends + self.layers, n)[None] - np.maximum(ends - self.layers, 0)[:, None])
+        work = np.where(thick >= min(max(self.layers, self.edge), n), 0.0, np.inf)  # of the busiest box from a block up to another
+        for box, cells in enumerate(beside.ravel()):
+            np.maximum(work, through[None, :, box] - through[:, None, box] + cells * seen, out=work)
+        most, came = work[0], list[np.ndarray]()
+        for _ in range(ranks - 1):
+            cut_there = np.maximum(most[:, None], work)
+            came.append(cut_there.argmin(axis=0))
+            most = cut_there.min(axis=0)
+        if not math.isfinite(most[-1]):
+            return None
+        at = [len(ends) - 1]
+        for table in reversed(came):
+            at.append(int(table[at[-1]]))
+        cuts = [0, *(int(ends[place]) for place in reversed(at))]
+        return float(most[-1]), [b - a for a, b in itertools.pairwise(cuts)]
+
+
+def _through(material: np.ndarray, axis: int) -> np.ndarray:
+    """Return sums along an axis from its start up to each block's."""
+    return np.insert(np.cumsum(material, axis=axis), 0, 0.0, axis=axis)
+
+
+@dataclass(frozen=True)
+class Balance:
+    """When the boxes of ranks are cut anew.
+
+    Whether that is in a step depends on the step's number, on where particles are and on the boxes alone, so that a run that goes on from a
+    checkpoint does the same.
+
+    Args:
+        every: steps between two looks.
+        bound: how many times what it will be the time of a step must be: then a fifth of `every` steps is gained until the next look. To
+            cut anew takes the time of 2 to 3 steps, of 5 to 8 where it has to measure a mesh.
+        fixed: what a step takes besides, in cells full of material.
+    """
+
+    every: int = 20
+    bound: float = 1.25
+    fixed: float = STEP
+
+    def due(self, part: Subdomain, step: int) -> bool:
+        """Return whether a step looks for other cuts."""
+        return part.ranks.size > 1 and step % self.every == 0
+
+    def better(self, part: Subdomain, particles: SharedParticles, a_cell: int) -> Decomposition | None:
+        """Return boxes that are so much better that the ranks should have them; collective. None: those they have will do.
+
+        Args:
+            part: where this rank works.
+            particles: this rank's, whose totals have been found.
+            a_cell: particles of a full cell.
+        """
+        now, layers, fixed = part.decomposition, part.layers, self.fixed
+        work = [
+            n / a_cell + OPEN * seen for n, seen in zip(particles.counts, seen_by(now.counts, now.parts, layers).ravel("F"), strict=True)
+        ]
+        if max(work) + fixed <= self.bound * (math.fsum(work) / len(work) + fixed):  # the same on all ranks
+            return None
+        edge = edge_of_blocks(now.counts, part.ranks.size)
+        load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
+        everyone = part.ranks.comm.allgather(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
+        least, cut = min(found for found in everyone if found is not None)
+        gains = cut != now.parts and max(work) + fixed > self.bound * (least + fixed)
+        return now.cut_anew(cut) if gains else None
+
+
+def edge_of_blocks(counts: Triple, ranks: int) -> int:
+    """Return the edge of blocks of cells: they are the cells that multigrid gathers, or finer where ranks are many."""
+    edge = 1
+    while math.prod(-(-n // edge) for n in counts) > max(GATHERED, BLOCKS * ranks):
+        edge *= 2
+    return edge
+
+
+def blocks(part: Subdomain, particles: SharedParticles, edge: int) -> np.ndarray:
+    """Return how many of all ranks' particles each block of cells has; collective."""
+    counts = part.decomposition.counts
+    shape = [-(-n // edge) for n in counts]
+    place = np.clip((particles.position.numpy() / (part.grid.spacing * edge)).astype(np.int64), 0, np.array(shape) - 1)
+    if part.dimension == 2:
+        place[:, 2] = 0
+    mine = np.bincount(np.ravel_multi_index(tuple(place.T), shape), minlength=math.prod(shape))
+    return np.asarray(part.ranks.total(mine)).reshape(shape)

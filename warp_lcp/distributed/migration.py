@@ -1,0 +1,68 @@
+"""Pieces of a state that go from the ranks that have them to those whose boxes they are in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from warp_lcp.distributed.decomposition import CellBox
+from warp_lcp.distributed.particle_pieces import cells_of
+from warp_lcp.distributed.particles import Post
+from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.material.particle_pieces import Piece, fields_of
+
+
+def handed_over(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subdomain, post: Post) -> Piece:
+    """Send each rank what of this one's piece lies in the box that it has now, and return the piece of this rank's box; collective.
+
+    Args:
+        piece: this rank's, of where it worked `before`.
+        particles: names of the particles' arrays.
+        before: the part that the piece is of.
+        now: that of other boxes of the same ranks.
+        post: carries messages.
+    """
+    mine, old, new = now.ranks.rank, before.decomposition.boxes, now.decomposition.boxes
+
+    def gives(giver: int, taker: int) -> bool:  # particles move on to their rank when a step begins
+        return old[giver].grown(before.layers).common(new[taker]).cells > 0
+
+    others = [rank for rank in range(now.ranks.size) if rank != mine and (gives(mine, rank) or gives(rank, mine))]
+    owner = now.owners(cells_of(now, piece["position"]))
+    taken = {**piece, "box": np.array([now.box.low, now.box.high])}
+    for name in (*particles, "place"):
+        values = np.asarray(piece[name])
+        come = post.swap({rank: values[owner == rank].ravel() for rank in others})
+        taken[name] = np.concatenate([values[owner == mine], *(found.reshape(-1, *values.shape[1:]) for found in come)])
+    for name, values in fields_of(piece).items():
+        taken[name] = np.zeros((*values.shape[:-3], *now.box.counts[::-1]), dtype=values.dtype)
+        sent = {rank: _cut_out(values, old[mine], new[rank]) for rank in (mine, *others)}
+        for rank, found in zip((mine, *others), [sent.pop(mine), *post.swap(sent)], strict=True):
+            box = old[rank].common(new[mine])
+            if box.cells:
+                taken[name][..., *box.moved(now.box.low, -1).slices] = found.reshape(*values.shape[:-3], *box.counts[::-1])
+    return taken
+
+
+def _cut_out(values: np.ndarray, box: CellBox, other: CellBox) -> np.ndarray:
+    """Return the values of a box's cells that are in another one too, one after another."""
+    shared = box.common(other)
+    return values[..., *shared.moved(box.low, -1).slices].ravel() if shared.cells else values[:0].ravel()
+
+
+def cuts_of(pieces: Sequence[Piece], part: Subdomain) -> list[list[int]] | None:
+    """Return how many cells along x, y, z the boxes of pieces have, if ranks can have the same; else None.
+
+    Args:
+        pieces: of all ranks, in their order.
+        part: where this rank works now.
+    """
+    now = part.decomposition
+    if len(pieces) != now.ranks.size or any("box" not in piece for piece in pieces):
+        return None
+    boxes = [CellBox.of(*piece["box"]) for piece in pieces]
+    cuts = [np.diff([*sorted({box.low[axis] for box in boxes}), n]).tolist() for axis, n in enumerate(now.counts)]
+    fits = math.prod(map(len, cuts)) == len(boxes) and all(len(cut) == 1 or min(cut) >= part.layers for cut in cuts)
+    return cuts if fits and now.cut_anew(cuts).boxes == boxes else None
