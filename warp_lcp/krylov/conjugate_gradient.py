@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program
-from warp_lcp.rows.vectors import Reduction, rows_of
+from warp_lcp.rows.vectors import Across, Reduction, rows_of
 
 RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
 RR = wp.constant(3)  # those of the decision to go on begin here, as elsewhere at the residual's square
@@ -107,16 +107,21 @@ class ConjugateGradient:
         preconditioner: M. If it is recorded (has a `program`), so must A be, and an iteration is one program.
         weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1. Rows that a large shift makes stiff would
             else decide when to stop.
+        rows: of the unknowns, where fields hold others, such as ghost cells; None: all of a field.
+        across: who has the other unknowns; None: nobody.
     """
 
-    def __init__(self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None) -> None:
-        self._product, self._preconditioner, r = product, preconditioner, preconditioner.r
+    def __init__(
+        self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None, rows: Rows | None = None,
+        across: Across | None = None,
+    ) -> None:  # fmt: skip
+        self._product, self._preconditioner, self._rows, r = product, preconditioner, rows, preconditioner.r
         self.device, self.x, self._p, self._q = r.device, zeros_like(r), zeros_like(r), zeros_like(r)
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=r.device)
         self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
-        self._reduction = Reduction(r.size, r.device, self._scalars)
+        self._reduction = Reduction(r.size, r.device, self._scalars, threads=None if rows is None else rows.places, across=across)
         self._program: Program | None = None
-        rows, given = rows_of(r), {"direction": self._p, "scalars": self._scalars}
+        rows, given = rows or rows_of(r), {"direction": self._p, "scalars": self._scalars}
         self._direction = DIRECTION.bind(rows, z=preconditioner.z, **given)
         self._update = UPDATE.bind(rows, q=self._q, w=weight, x=self.x, r=r, out=self._reduction.partials, **given)
 
@@ -156,10 +161,10 @@ class ConjugateGradient:
 
     def _advance(self, launch: Launch) -> None:
         """Launch what follows the preconditioner."""
-        self._reduction.dot(self._preconditioner.r, self._preconditioner.z, int(RZ), launch=launch)
+        self._reduction.dot(self._preconditioner.r, self._preconditioner.z, int(RZ), rows=self._rows, launch=launch)
         self._direction.launch(launch)
         self._product(self._p, self._q, launch=launch)
-        self._reduction.dot(self._p, self._q, int(PQ), launch=launch)
+        self._reduction.dot(self._p, self._q, int(PQ), rows=self._rows, launch=launch)
         self._update.launch(launch)
         self._reduction.add_up(int(RR), launch=launch)
         launch(end_kernel, 1, [self._scalars, self._going], device=self.device)

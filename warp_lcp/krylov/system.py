@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import HEADERS
-from warp_lcp.rows import RowPass
-from warp_lcp.rows.vectors import Sums, rows_of
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.vectors import Across, Sums, rows_of
 
 NORM = RowPass("krylov.norm", HEADERS / "norm.h", "S", reads={"r": "S", "w": "S"}, optional=("w",), sums=("rr",))
 
@@ -19,9 +19,9 @@ class KrylovSystem:
 
     r: wp.array[Any]
 
-    def _iterate_by(self, method: Any, weight: wp.array[Any] | None) -> None:
-        """Take what iterates: it has `solve`, and the solution in `x`. Norms are weighted like its own."""
-        self._krylov, self.e, self._norms, self._weighted_by = method, method.x, Sums(rows_of(self.r)), weight
+    def _iterate_by(self, method: Any, weight: wp.array[Any] | None, rows: Rows | None = None, across: Across | None = None) -> None:
+        """Take what iterates: it has `solve`, and the solution in `x`. Norms are weighted like its own, over the same rows."""
+        self._krylov, self.e, self._norms, self._weighted_by = method, method.x, Sums(rows or rows_of(self.r), across=across), weight
 
     def norm(self, field: wp.array[Any] | None = None) -> float:
         """Return the norm ||weight^(1/2) r||, or that of another field like r."""

@@ -14,7 +14,7 @@ from warp_lcp.problem.protocol import layout_of
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import Layout, check_storable, real_array
 from warp_lcp.rows.program import Launch
-from warp_lcp.rows.vectors import Reduction
+from warp_lcp.rows.vectors import Across, Reduction, add_across
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.low_rank")
@@ -63,7 +63,10 @@ class BlockColumns:
         values: of type dtype, shape (capacity * width,), an entry's one after another.
         count: number of entries, int32, shape (1,).
         sums: what `gather` writes, float64, shape (rank,).
+        across: who has other rows of U; None: nobody.
     """
+
+    across: Across | None = None
 
     def __init__(self, size: int, blocks: int, width: int, dtype: Any, device: wp.Device) -> None:
         self.size, self.width, self.rank, self.dtype, self.device = size, width, blocks * width, dtype, device
@@ -112,6 +115,8 @@ class BlockColumns:
         GATHER.bind(self._all, **self.entry_fields, rank=self.rank, x=x, mask=mask, out=out, FUSED=fused).launch(launch)
         if self._reduction is not None:
             self._reduction.add_up(0, columns=self.rank, launch=launch)
+        if self.across is not None:
+            add_across(self.across, self.sums, slice(0, self.rank), launch)
         return self.sums
 
     def scatter(
@@ -138,7 +143,8 @@ class BlockColumns:
 class LowRankOperator(Pickled):
     """U W U' x, with a few columns U and a small matrix W; usually a term of a SumOperator, A + U W U'.
 
-    Only the rows of U that are not 0 are stored, and a product costs no more than they do.
+    Only the rows of U that are not 0 are stored, and a product costs no more than they do. Where ranks share the fields each has its rows
+    of U, and products are collective.
 
     Args:
         columns: U; its first axes are a field's, its last one counts the columns: (n, k) for vectors, (nz, ny, nx, k) for grids.
@@ -278,7 +284,7 @@ class LowRankOperator(Pickled):
         return LowRankOperator.of_blocks(self, columns, self.weights.numpy())
 
     def _make(self, layout: Layout, columns: BlockColumns, weights: Any) -> None:
-        self.layout, self.columns = layout, columns
+        self.layout, self.columns, columns.across = layout, columns, layout.across
         self.shape, self.device, self.dtype, self.rank, self.version = layout.shape, layout.device, columns.dtype, columns.rank, 0
         W = self._checked_weights(weights)
         self.symmetric = _is_symmetric(W)

@@ -157,9 +157,10 @@ def _felt(label: np.ndarray, count: int, low: LowRankOperator) -> np.ndarray:
     """Return for each component whether a column's sum over it is more than what rounding leaves."""
     rows, blocks, values = low.columns.entries()
     at, k = label[rows], low.columns.width
-    sums, sizes = np.zeros((count, low.rank)), np.zeros((count, low.rank))
+    found = np.zeros((2, count, low.rank))
     inside = at >= 0
     columns = (blocks[inside, None] * k + np.arange(k)).astype(np.int64)
-    np.add.at(sums, (at[inside, None], columns), values[inside])
-    np.add.at(sizes, (at[inside, None], columns), np.abs(values[inside]))
+    np.add.at(found[0], (at[inside, None], columns), values[inside])
+    np.add.at(found[1], (at[inside, None], columns), np.abs(values[inside]))
+    sums, sizes = found if low.layout.across is None else low.layout.across.sum(found)
     return np.asarray((np.abs(sums) > FELT * sizes).any(axis=1))

@@ -141,11 +141,11 @@ class Reduction:
         else:
             fold(add_up_kernel, self.partials, self.threads, columns, self.scalars, slot, self._folded, launch)
         if self._across is not None:
-            perform(partial(_add_across, self._across, self.scalars, slice(slot, slot + columns)), launch)
+            add_across(self._across, self.scalars, slice(slot, slot + columns), launch)
 
-    def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, launch: Launch = wp.launch) -> None:
-        """Write the inner product a.b to scalars[slot]."""
-        DOT.bind(rows_of(a), a=a, b=b, out=self.partials).launch(launch)
+    def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, rows: Rows | None = None, launch: Launch = wp.launch) -> None:
+        """Write the inner product a.b, over some rows if told, to scalars[slot]."""
+        DOT.bind(rows or rows_of(a), a=a, b=b, out=self.partials).launch(launch)
         self.add_up(slot, launch=launch)
 
 
@@ -227,8 +227,12 @@ class Tally:
         return np.array([part.sum() if c < sums else part.max(initial=-np.inf) for c, part in enumerate(parts)])
 
 
+def add_across(across: Across, scalars: wp.array[wp.float64], slots: slice, launch: Launch = wp.launch) -> None:
+    """Add what the others have summed, now or among the launches of a program."""
+    perform(partial(_add_across, across, scalars, slots), launch)
+
+
 def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> None:
-    """Add what the others have summed."""
     if scalars.device.is_cpu:
         sums = scalars.numpy()[slots]
         sums[...] = across.sum(sums)

@@ -205,7 +205,9 @@ class CoupledGridSystem(KrylovSystem):
         self._extra = zeros_like(self.r)
         self._free: wp.array[Any] | None = None
         self._weight = zeros_like(self.r) if shifted else None
-        self._iterate_by(ConjugateGradient(self._product, self, weight=self._weight), self._weight)
+        across = A.layout.across
+        rows = None if across is None else grid.stencil.rows  # without ghost cells, which others sum
+        self._iterate_by(ConjugateGradient(self._product, self, weight=self._weight, rows=rows, across=across), self._weight, rows, across)
         self._take_diagonal()
 
     def refresh(self) -> None:

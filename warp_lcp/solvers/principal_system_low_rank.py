@@ -135,7 +135,8 @@ class LowRankCorrection:
         low, finest, W = self._low, self._hierarchy.finest, self._low.weights.numpy()
         one = Rows.flat(1, low.device)
         SQUARES.bind(one, **self._columns.entry_fields, rank=low.rank, d=finest.stencil.d, squares=self._squares).launch()
-        found, width = self._squares.numpy().copy(), self._columns.width
+        found, width, across = self._squares.numpy().copy(), self._columns.width, low.layout.across
+        found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
         power = 1.0 / max(sum(n > 1 for n in self._hierarchy.finest.stencil.padding.counts) - 1, 1)
         strong = [int(q) for q in np.flatnonzero(np.diag(W) * SPREAD * rows**power * squares >= STRONG)]
@@ -188,7 +189,7 @@ class LowRankCorrection:
         self._dots, finest = None, self._hierarchy.finest
         if strong:
             rows, given = finest.stencil.rows, {"Z": self._Z, "slots": len(strong), "size": n}
-            self._dots = Reduction(n, low.device, self._sums, columns=len(strong), threads=rows.places)
+            self._dots = Reduction(n, low.device, self._sums, columns=len(strong), threads=rows.places, across=low.layout.across)
             self._multiply = DOTS.bind(rows, r=finest.b, out=self._dots.partials, **given)
             self._subtract = SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, **given)
         for q in kept:
