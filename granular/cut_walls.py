@@ -18,7 +18,7 @@ import warp as wp
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.yield_set import COLUMNS, xyz
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import Rows
 from warp_lcp.rows.program import Launch
@@ -37,6 +37,7 @@ class CutWalls:
         grid: the grid.
         cut: the solids.
         friction: Coulomb's coefficient of the domain's walls and of each solid, >= 0; inf sticks.
+        solved: the cells whose walls are asked for; None: all.
 
     Attributes:
         openings: float32: what solids leave open of the lower faces of each axis, then what of each cell the differences of velocity
@@ -49,7 +50,7 @@ class CutWalls:
         area: of each, in units of a cell's face, on the host.
     """
 
-    def __init__(self, grid: StaggeredGrid, cut: CutCells, friction: Sequence[float]) -> None:
+    def __init__(self, grid: StaggeredGrid, cut: CutCells, friction: Sequence[float], solved: Window | None = None) -> None:
         """Find volumes, areas and normals."""
         self.grid, device, dimension = grid, grid.device, grid.dimension
         distance, solid = cut.distance.numpy().astype(np.float64), cut.base.numpy() == SOLID
@@ -68,7 +69,9 @@ class CutWalls:
             wp.array(_around(octants, inner, inner & solid, alpha, beta), dtype=wp.float32, device=device)
             for alpha, beta in SHEARS[dimension]
         ]
-        self._find_walls(cut, inner & ~solid, faces, high, volume)
+        asked, window = np.zeros(grid.shape, dtype=bool), solved or grid.domain
+        asked[tuple(map(slice, window.low, window.high))] = True
+        self._find_walls(cut, asked & ~solid, faces, high, volume)
         self._friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
 
     def _find_walls(self, cut: CutCells, open_: np.ndarray, faces: list[np.ndarray], high: list[np.ndarray], volume: np.ndarray) -> None:

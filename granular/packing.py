@@ -13,6 +13,7 @@ from warp_lcp.granular.yield_set import xyz
 from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows.layout import put
+from warp_lcp.rows.program import Launch
 
 if TYPE_CHECKING:
     from warp_lcp.granular.cut_walls import CutWalls
@@ -34,6 +35,7 @@ class Packing:
         capacity: float32, share of a cell's kernel that is open.
         sides: of axes without an end, if there are any.
         cut: solids that cut cells, if there are any; `base` has those cells alone that they leave nothing of.
+        counted: the cells whose stresses are solved for; None: all of the domain.
 
     Attributes:
         base: that of the arguments.
@@ -47,11 +49,15 @@ class Packing:
         stiff: bound of the friction's diagonal in a cell, float32.
         spans: int32, first and one past the last cell of each row that stresses reach, shape (*grid.shape[:2], 2).
         nodes: the window of lower faces and edges of all cells and the domain's upper side.
+        strained: of it, edges whose rates of strain counted cells take.
+        moved: faces whose velocities these and counted cells take.
+        stressed: edges whose stresses those take.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None
-    ) -> None:
+        self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None,
+        counted: Window | None = None,
+    ) -> None:  # fmt: skip
         self.grid, self.base, self._capacity, self.sides, self.cut = grid, base, capacity, sides, cut
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         wp.copy(self.kind, base)
@@ -63,6 +69,8 @@ class Packing:
         low, high = grid.domain.low, grid.domain.high
         more = 1 if grid.dimension == 3 else 0
         self.nodes = Window(low, (high[0] + more, high[1] + 1, high[2] + 1), grid.device)
+        self.counted = counted or grid.domain
+        self.strained, self.moved, self.stressed = self._around(0, 1), self._around(1, 1), self._around(1, 2)
         if sides is not None:  # what a row's neighbors hold may lie at the other end of it
             self.spans.assign(np.full((*grid.shape[:2], 2), (low[2], high[2] + 1), dtype=np.int32))
 
@@ -102,6 +110,17 @@ class Packing:
             return  # the spans are whole rows
         domain.launch_rows(kernels.span_kernel, [self.flags, self._own])
         nodes.launch_rows(kernels.widen_kernel, [self._own, self.spans])
+
+    def _around(self, below: int, above: int) -> Window:
+        """Return the counted cells and so many layers of nodes on their lower and upper sides, as far as there are nodes."""
+        low, high = [n - below for n in self.counted.low], [n + above for n in self.counted.high]
+        window = Window.of(low, high, self.grid.device)
+        return window.common(self.nodes) or self.nodes
+
+    def join(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:
+        """Bring a field of stresses to where counted cells and nodes around them look for what is counted elsewhere."""
+        if self.sides is not None:
+            self.sides.wrap(stress, launch=launch)
 
     @property
     def cells(self) -> dict[str, Any]:

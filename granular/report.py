@@ -54,6 +54,11 @@ class SandReport:
         """
         stress, p = self.stress, self.stress.packing
         fields = p.cells | stress.checked.fields | {"now": stress.now, "openings": self._openings, "ratio": self.ratio}
-        self._report.take(p.grid.domain, numbers=stress.numbers, **fields)
-        cells, yielded, taken, most = self._report.read(Window((0, 0, 0), p.grid.shape, p.grid.device))
+        self._report.take(p.counted, numbers=stress.numbers, **fields)
+        cells, yielded, taken, most = self._found()
         return {"yielded": yielded / max(cells, 1.0), "dissipation": taken * mass, "predicted_excess": most}
+
+    def _found(self) -> list[float]:
+        """Return how many cells carry shear, how many have yielded, what friction takes and the largest excess."""
+        grid = self.stress.packing.grid
+        return self._report.read(Window((0, 0, 0), grid.shape, grid.device))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -35,10 +35,14 @@ from warp_lcp.material.particle_assembly import (
 )
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
-from warp_lcp.material.wall import extend_velocity
+from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.granular.distributed import DistributedSand
 
 FRONT = 99.0  # percentile of the particles that runout and height are of
 FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step
@@ -81,16 +85,21 @@ class SandSimulation(ParticleSimulation):
     def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate what belongs to a grid."""
         super().lay(grid, parts)
-        scene, boundary, self.solids, self.sides = self.scene, parts.boundary, parts.solids, parts.boundary.sides
-        self._join = None if self.sides is None else self.sides.wrap
+        scene, self.solids, self.sides = self.scene, parts.solids, parts.boundary.sides
         self._base, self.density = grid.field(wp.int8), grid.field()
-        self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides, cut=self.solids.cut)
+        self.packing = self._packing()
         self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
-        self.stress = Stress(self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried)
-        self.outcome = SandReport(self.stress)
+        self.stress, self.outcome = self._stresses(box=box, rate=rate, bodies=self.carried)
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
+
+    def _packing(self) -> Packing:
+        return Packing(self.grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
+
+    def _stresses(self, **settings: Any) -> tuple[Stress, SandReport]:
+        stress = Stress(self.packing, self.solids.walls, **settings)
+        return stress, SandReport(stress)
 
     def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
         """Go on on another grid of the same domain, see the base class."""
@@ -115,7 +124,7 @@ class SandSimulation(ParticleSimulation):
         super().bring_to_faces(window)
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
-        complete(window, self.velocity, self.weights, self.outcome.known, self._join)  # faces have mass farther out than weight
+        complete(window, self.velocity, self.weights, self.outcome.known, self._layer_filled())  # faces have mass farther out than weight
 
     def carry(self, dt: float) -> None:
         """Move particles and solids by dt [s]."""
@@ -140,7 +149,9 @@ class SandSimulation(ParticleSimulation):
         self.bring_to_faces(window)
         solved = self._solve(window, dt)
         measured = self._measured()
-        self._extend(window)
+        self.extend(window, self.outcome.known, self.packing.kind, self.outcome.contact)
+        if self.sources is not None:
+            self.sources.hold(self.velocity, [], self.packing.kind)
         self.bring_to_particles(window, self.packing.kind, dt)
         below, most = self._mass_below(), self._most()
         row = self.move(dt, window)
@@ -188,7 +199,7 @@ class SandSimulation(ParticleSimulation):
         i, j, k = np.clip(self.particles.cells_of(points.points), -1, self.grid.counts).T + 1
         for name, field in fields.items():
             points.fields[name] = field[k, j, i]
-        cells = np.argwhere(self.packing.kind.numpy() == FLUID)
+        cells = self._sand_cells()
         at = tuple(cells.T)
         shown = {name: field[at] for name, field in fields.items()}
         return [
@@ -198,6 +209,10 @@ class SandSimulation(ParticleSimulation):
             *self.volumes(),
             *self.body_surfaces(),
         ]
+
+    def _sand_cells(self) -> np.ndarray:
+        """Return where sand is that a frame shows, as (k, j, i) in the stored shape, shape (n, 3)."""
+        return np.argwhere(self.packing.kind.numpy() == FLUID)
 
     def pressures(self) -> np.ndarray:
         """Return the pressure p = rho dx x / dt [Pa] of the last solve, in the stored shape; zeros before the first."""
@@ -246,12 +261,14 @@ class SandSimulation(ParticleSimulation):
 
     def _gains(self, scale: float) -> bool:
         """Return whether the stresses leave sand faster than it, solids, sources and bodies were and gravity makes it (`scale`, m/s)."""
-        packing, moving = self.packing, [inverse.numpy() > 0.0 for inverse in self.packing.inverse]
-        after, before = (
-            max(float(np.abs(component.numpy()[at]).max(initial=0.0)) for component, at in zip(velocity, moving, strict=True))
+        packing, own = self.packing, self._own
+        moving = [own(inverse) > 0.0 for inverse in packing.inverse]
+        speeds = [
+            max(float(np.abs(own(component)[at]).max(initial=0.0)) for component, at in zip(velocity, moving, strict=True))
             for velocity in (self.stress.checked.u, packing.start)
-        )
-        others = max((float(np.abs(component.numpy()).max()) for component in self.solids.velocity), default=0.0)
+        ]
+        others = max((float(np.abs(own(component)).max()) for component in self.solids.velocity), default=0.0)
+        after, before, others = self._largest([*speeds, others])
         return after > before + scale + others + (self.bodies.top_speed(0.0) if self.bodies is not None else 0.0)
 
     def solve_stress(self, scale: float) -> wl.SolveResult:
@@ -328,35 +345,32 @@ class SandSimulation(ParticleSimulation):
         if self.sides is not None:
             self.sides.add(self.density)
 
-    def _extend(self, window: Window) -> None:
-        """Continue the velocity into air and walls."""
-        outcome, solids = self.outcome, self.solids
-        if solids.cut is not None:
-            self.extend(window, outcome.known, self.packing.kind, outcome.contact)
-            if self.sources is not None:
-                self.sources.hold(self.velocity, [], self.packing.kind)
-            return
-        with self.watch.stage("extrapolation", *self.velocity, *self.weights, *outcome.known):
-            extend_velocity(
-                window, self.velocity, self.weights, outcome.known, self.packing.kind, outcome.contact, solids.index, solids.separating,
-                solids.velocity, self.layers, join=self._join,
-            )  # fmt: skip
-            if self.sources is not None:
-                self.sources.hold(self.velocity, [], self.packing.kind)
+    def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
+        """Continue the velocity among walls as the stresses meet them."""
+        s = self.solids
+        if s.cut is not None:
+            super()._continue(window, known, kind, contact, join)
+        else:
+            walls = s.index, s.separating, s.velocity
+            extend_velocity(window, self.velocity, self.weights, known, kind, contact, *walls, self.layers, join=join)
+
+    def _layer_filled(self) -> Join | None:
+        return super()._layer_filled() if self.sides is None else self.sides.wrap
 
     def _front(self) -> tuple[float, float]:
         """Return the 99th percentile of x and of y [m]."""
         position = self.particles.position.numpy()
         if not len(position):
             return 0.0, 0.0
-        nth = min(int(len(position) * FRONT / 100.0), len(position) - 1)
+        nth = percentile_place(len(position))
         return float(np.partition(position[:, 0], nth)[nth]), float(np.partition(position[:, 1], nth)[nth])
 
     def _mass_below(self) -> float:
         """Return the mass below the gauge [kg; kg/m in 2-D], 0 without one."""
         if self.scene.gauge is None:
             return 0.0
-        return float(np.count_nonzero(self.particles.position.numpy()[:, 1] < self.scene.gauge.height)) * self.particle_mass
+        below = np.count_nonzero(self.particles.position.numpy()[:, 1] < self.scene.gauge.height)
+        return float(self._sum(int(below))) * self.particle_mass
 
     def _flow_rate(self, below: float, row: Row, dt: float) -> float:
         left = sum(int(row.get(name) or 0) for name in ("drained", "departed")) * self.particle_mass
@@ -366,9 +380,26 @@ class SandSimulation(ParticleSimulation):
         """Return the largest fraction of a cell, in units of the densest packing."""
         if self.boundary.capacity is None:
             return 0.0
-        capacity = self.boundary.capacity.numpy()
-        open_ = (self._base.numpy() != SOLID) & (capacity > 0.5)
-        return float((self.density.numpy()[open_] / capacity[open_]).max(initial=0.0))
+        base, density, capacity = (self._own(field) for field in (self._base, self.density, self.boundary.capacity))
+        open_ = (base != SOLID) & (capacity > 0.5)
+        return self._largest([float((density[open_] / capacity[open_]).max(initial=0.0))])[0]
+
+    def _own(self, field: wp.array) -> np.ndarray:
+        """Return what of a field nobody else has."""
+        return np.asarray(field.numpy())
+
+    def _largest(self, values: list[float]) -> list[float]:
+        """Return the largest of what all have, number by number."""
+        return values
+
+    def _sum(self, count: int) -> int:
+        """Return the sum of what all have."""
+        return count
+
+
+def percentile_place(count: int) -> int:
+    """Return which of so many sorted numbers, from 0, is the percentile that runout and height are of."""
+    return min(int(count * FRONT / 100.0), count - 1)
 
 
 class GranularSimulator:
@@ -409,3 +440,9 @@ class GranularSimulator:
         return SandSimulation(
             scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray, notes=(*warnings, *notes)
         )  # fmt: skip
+
+    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSand:
+        """Build a rank's part of a simulation of `scene`, see `granular.distributed.create`."""
+        from warp_lcp.granular.distributed import create  # what it needs is an extra
+
+        return create(scene, ranks, device=device, folder=folder)

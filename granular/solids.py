@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.granular.cut_walls import CutWalls
 from warp_lcp.granular.packing import Packing
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
@@ -25,6 +25,7 @@ class Walls:
         friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
         rubbing_only: leave out the faces of walls without friction. Their stresses are 0 from the start as long as no wall moves; what
             moves may come where other cells of sand had theirs, which its faces then take away.
+        counted: cells whose faces these are; None: all.
 
     Attributes:
         count: faces.
@@ -35,10 +36,13 @@ class Walls:
         active: int32: how many faces sand touches, and which.
     """
 
-    def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float], *, rubbing_only: bool = False) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float], *, rubbing_only: bool = False,
+        counted: Window | None = None,
+    ) -> None:  # fmt: skip
         device = grid.device
         self.friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
-        cells, sides, walls = wall_faces(index, grid.dimension)
+        cells, sides, walls = wall_faces(index, grid.dimension, counted)
         if rubbing_only:
             rubs = np.asarray(friction)[walls] > 0.0
             cells, sides, walls = cells[rubs], sides[rubs], walls[rubs]
@@ -74,6 +78,7 @@ class SandSolids:
         friction: Coulomb's coefficient of the domain's walls and of each solid.
         prescribed: keep velocities on faces even if nothing moves: sources prescribe some.
         cuts: let solids that stand still cut cells for the stresses too, if `boundary` has them so.
+        counted: cells whose walls these are; None: all.
 
     Attributes:
         cut: what they leave open and where they rub; None: they are whole cells.
@@ -87,15 +92,16 @@ class SandSolids:
 
     def __init__(
         self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *,
-        prescribed: bool = False, cuts: bool = False,
+        prescribed: bool = False, cuts: bool = False, counted: Window | None = None,
     ) -> None:  # fmt: skip
+        self._counted = counted
         self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
         self.base = grid.field(wp.int8)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
         self._cells: np.ndarray | None = None  # `index` as `walls` know it
         fits = cuts and isinstance(boundary, CutBoundary) and not boundary.moves and boundary.sides is None
-        self.cut = CutWalls(grid, boundary.cut, friction) if fits and isinstance(boundary, CutBoundary) else None
+        self.cut = CutWalls(grid, boundary.cut, friction, self._counted) if fits and isinstance(boundary, CutBoundary) else None
         self.place(0.0)
         whole = isinstance(boundary, CutBoundary) and self.cut is None
         self.notes = (*self._thin_notes(), *((self._whole_note(cuts),) if whole else ()))
@@ -116,8 +122,7 @@ class SandSolids:
         ]  # fmt: skip
         found = voxelize(grid, now, wall_separating=True, open_sides=self._boundary.open_sides, remarks=False)
         self.index, self._covered = found.index, found.covered
-        if self._boundary.sides is not None:
-            self._boundary.sides.wrap(self.index)
+        self._join(self.index)
         grid.everywhere.launch(kernels.base_kernel, [self.index, self.base])
         cells = self.index.numpy()
         if self.cut is not None:  # the domain's walls alone are whole cells
@@ -125,13 +130,23 @@ class SandSolids:
             cells = cells.copy()
             grid.interior(cells)[...] = -1
         if self._cells is None or not np.array_equal(cells, self._cells):  # else what is recorded for these walls stays valid
-            self._cells, self.walls = cells.copy(), Walls(grid, cells, self._friction, rubbing_only=not self.moves)
+            rubbing = not self.moves
+            self._cells, self.walls = cells.copy(), Walls(grid, cells, self._friction, rubbing_only=rubbing, counted=self._counted)
+
+    def _join(self, index: wp.array) -> None:
+        """Bring the walls' numbers to where they are told by other cells."""
+        if self._boundary.sides is not None:
+            self._boundary.sides.wrap(index)
+
+    def _covers(self) -> list[int]:
+        """Return how many cells' centers each solid holds."""
+        return [int(cells) for cells in self._covered]
 
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid that stands still and that no stress feels."""
         return tuple(
             f"{solid.name} holds no center of a cell of {self.grid.spacing:.4g} m: it bears no sand, and particles may pass"
-            for solid, cells in zip(self._placed, self._covered, strict=True)
+            for solid, cells in zip(self._placed, self._covers(), strict=True)
             if self.cut is None and not cells and solid.motion is None
         )
 
@@ -157,19 +172,20 @@ class SandSolids:
                 field.zero_()
 
 
-def wall_faces(index: np.ndarray, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def wall_faces(index: np.ndarray, dimension: int, counted: Window | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the faces between open cells and solids, by cell.
 
     Args:
         index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
         dimension: 2 or 3.
+        counted: cells whose faces are asked for; None: all.
 
     Returns:
         For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall's number (int32).
     """
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     inner = np.zeros(index.shape, dtype=bool)
-    inner[1:-1, 1:-1, 1:-1] = True
+    inner[(slice(1, -1),) * 3 if counted is None else tuple(map(slice, counted.low, counted.high))] = True
     flat, open_ = index.ravel(), np.flatnonzero((index.ravel() < 0) & inner.ravel())
     for axis, stride in zip(range(dimension), (1, index.shape[2], index.shape[1] * index.shape[2]), strict=False):
         for side in range(2):

@@ -78,18 +78,17 @@ class Velocity:
             respond: first give the bodies the velocity that the stresses leave.
         """
         p, passes, share = self.packing, self.passes, {"share_x": self.packing.share[0]}
-        if p.sides is not None:
-            p.sides.wrap(stress, launch=launch)
-        p.nodes.run(passes.edge_stress, launch=launch, spans=p.spans, y=stress, **xyz(share=p.share, edge=self.edge))
+        p.join(stress, launch=launch)
+        p.stressed.run(passes.edge_stress, launch=launch, spans=p.spans, y=stress, **xyz(share=p.share, edge=self.edge))
         faces = share | self.fields | xyz(start=p.start, inverse=p.inverse)
-        p.nodes.run(passes.face_velocity, launch=launch, spans=p.spans, y=stress, openings=self.openings, **faces)
+        p.moved.run(passes.face_velocity, launch=launch, spans=p.spans, y=stress, openings=self.openings, **faces)
         if bodies is not None:
             if respond:
                 bodies.respond(p, stress, launch, implicit=False)
             bodies.move(self, launch)
         if p.sides is not None:
             p.sides.wrap(*self.u, launch=launch)
-        p.nodes.run(passes.edge_strain, launch=launch, spans=p.spans, **share, **self.fields)
+        p.strained.run(passes.edge_strain, launch=launch, spans=p.spans, **share, **self.fields)
 
 
 class Stress(wl.ConvexSetProblem):
@@ -135,7 +134,8 @@ class Stress(wl.ConvexSetProblem):
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
         self._momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
-        threads = int(np.prod(packing.grid.shape[:2])) * grid.domain.cells.chunks
+        self._total = self._sums  # of all who have a part of the stresses
+        threads = int(np.prod(packing.grid.shape[:2])) * packing.counted.cells.chunks
         self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
         self._wall_sums: Reduction | None = None
         self._host = np.zeros(NUMBERS, dtype=np.float32)
@@ -151,6 +151,7 @@ class Stress(wl.ConvexSetProblem):
         """Take other walls: solids have moved."""
         device = self.packing.grid.device
         self.walls, self._program, self._check = walls, None, None
+        self._sums.zero_()
         self._grain = 1 if device.is_cuda else WALL_GRAIN
         cut = self.packing.cut
         threads = sum(-(-count // self._grain) for count in (walls.count, cut.count if cut is not None else 0))
@@ -174,18 +175,21 @@ class Stress(wl.ConvexSetProblem):
         self.numbers.assign(self._host)
         p = self.packing
         flags = p.flags.numpy()
-        self._cells = max(int(np.count_nonzero(p.grid.interior(flags))), 1)
+        self._cells = max(self._count(flags[tuple(map(slice, p.counted.low, p.counted.high))]), 1)
         self.walls.activate(flags)
         self.cold = kick_dt > GROWN * self.kick_dt
         ratio = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
         share = xyz(share=p.share)
-        p.grid.domain.run(self.velocity.passes.admit, ratio=ratio, flags=p.flags, stiff=p.stiff, **share, **self._stresses)
+        p.counted.run(self.velocity.passes.admit, ratio=ratio, flags=p.flags, stiff=p.stiff, **share, **self._stresses)
         if self.bodies is not None:
             self.bodies.forget(self._stresses)
-        if p.sides is not None:
-            p.sides.wrap(self._point)
-        p.grid.domain.run(self.velocity.passes.damp, flags=p.flags, source=self._point, now=self.now, **share)
+        p.join(self._point)
+        p.counted.run(self.velocity.passes.damp, flags=p.flags, source=self._point, now=self.now, **share)
         self.kick_dt = kick_dt
+
+    def _count(self, flags: np.ndarray) -> int:
+        """Return how many cells hold sand, given the flags of the counted ones."""
+        return int(np.count_nonzero(flags))
 
     def take_back(self) -> None:
         """Put the stresses back to what they were before `begin`, as the step is not taken."""
@@ -224,21 +228,28 @@ class Stress(wl.ConvexSetProblem):
         """Take some periods of steps with momentum, see `PERIOD`; return an estimate of the natural residual [m/s]."""
         if self._program is None:
             self._program = Program(self.packing.grid.device)
-            for _ in range(PERIOD):
-                self._record(self._program.launch)
+            for step in range(PERIOD):
+                self._record(step, self._program.launch)
         for _ in range(periods):
             self._program.run()
         pressure, friction = self._momentum.numpy()[[RESIDUAL_X, RESIDUAL_X + 1]]
         scale = 1.0 / math.sqrt(self._cells)
         return scale * math.hypot(pressure / self._host[PRESSURE_STEP], SHARE * friction / self._host[SHEAR_STEP])
 
-    def _record(self, launch: Launch) -> None:
+    def _record(self, step: int, launch: Launch) -> None:
         self.velocity.find(self._point, launch=launch, bodies=self.bodies)
         if self.bodies is not None:
             self.bodies.search(self.packing, self.velocity, self._stresses, self._step, launch)
         self._project(self.velocity, launch)
+        self._end_step(step, launch)
+
+    def _end_step(self, step: int, launch: Launch) -> None:
+        """Add up what a step of a period has found, and choose the momentum of the next but one."""
         self._add_up(launch)
-        launch(momentum_kernel, 1, [self._sums, self._momentum], device=self.packing.grid.device)
+        self._choose_momentum(self._total, launch)
+
+    def _choose_momentum(self, sums: wp.array, launch: Launch) -> None:
+        launch(momentum_kernel, 1, [sums, self._momentum], device=self.packing.grid.device)
 
     def residual(self) -> tuple[float, float]:
         """Return the natural residual of pressure and friction [m/s], root mean squares over the cells that hold sand, in float64."""
@@ -248,7 +259,7 @@ class Stress(wl.ConvexSetProblem):
             self._project(self.checked, self._check.launch)
             self._add_up(self._check.launch)
         self._check.run()
-        sums = self._sums.numpy()
+        sums = self._total.numpy()
         self.last_residual = math.sqrt(sums[0] / self._cells), math.sqrt((sums[1] + sums[COLUMNS]) / self._cells)
         return self.last_residual
 
@@ -256,7 +267,7 @@ class Stress(wl.ConvexSetProblem):
         p, walls, passes = self.packing, self.walls, velocity.passes
         given = self._stresses | self._step
         cells = p.cells | velocity.fields | {"spans": p.spans, "openings": velocity.openings}
-        p.grid.domain.run(passes.step, launch=launch, partials=self._cell_sums.partials, **given, **cells)
+        p.counted.run(passes.step, launch=launch, partials=self._cell_sums.partials, **given, **cells)
         if self._wall_sums is not None:
             given["partials"] = self._wall_sums.partials
             if walls.count:

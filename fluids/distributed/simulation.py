@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import warp_lcp as wl
@@ -21,7 +20,7 @@ from warp_lcp.fluids.surface import FreeSurface
 from warp_lcp.fluids.surface_tension import SurfaceTension
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.particle_log import Row
-from warp_lcp.simulation import Cells, Part
+from warp_lcp.simulation import Part
 
 
 class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
@@ -46,9 +45,8 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
         return SharedProbes(self.part, self.scene.probe, self.gravity, self.part.dimension) if self.scene.probe else None
 
     def frame(self) -> list[Part]:
-        """Return this rank's particles and cells, see the base class; cells know the box that they are from."""
-        box = self.part.box
-        return [replace(part, box=(box.low, box.high)) if isinstance(part, Cells) else part for part in super().frame()]
+        """Return this rank's particles and cells, see the base class."""
+        return self.in_box(super().frame())
 
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""

@@ -1,4 +1,4 @@
-"""Liquids on ranks, which `test_liquid_on_ranks` starts: `liquids_on_ranks.py WHAT,MORE FOLDER`; rows of the log go into the folder."""
+"""Liquids and sands on ranks, which `test_liquid_on_ranks` starts: `liquids_on_ranks.py WHAT,MORE FOLDER`; logs go into the folder."""
 
 import json
 import sys
@@ -7,12 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from small_liquids import box, scene
+import small_liquids
+import small_sands
+from small_liquids import box
 from warp_lcp.distributed.balance import Balance
+from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.fluids.distributed import DistributedLiquid, create
-from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.distributed import create
+from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.simulator import simulators
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
 EAGER = Balance(every=2, bound=1.0, fixed=0.0)  # cuts boxes anew whenever others are better
@@ -42,6 +46,10 @@ RIVER = {
     "solver": {"precision": "double"},
     "output": {"forces": True},
 }
+COLUMN = {"size": DEEP["size"], "resolution": 24, "sand": [box([0.0, 0.0, 0.0], [0.4, 0.4, 0.5])]}
+HEAP = {"size": FLAT["size"], "resolution": 32, "sand": [box([0.3, 0.0], [1.0, 0.4])]}
+POURED = box([0.6, 0.35, 0.1], [0.8, 0.45, 0.4], velocity=[0.3, -1.0, 0.2])
+TRICKLING = {"open": ["right"], "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.01)], "material": {"cohesion": 50.0}}
 SCENES = {
     "flat": FLAT,
     "flip": DEEP | {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}, "wall": "free-slip"},
@@ -60,8 +68,20 @@ SCENES = {
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 
+SCENES |= {
+    "sand": COLUMN | {"solid": [BALL], "density_correction": {}, "gauge": {"height": 0.1}},
+    "stirred sand": COLUMN | {"solid": [BLADE], "source": [POURED], "particles": {"reseed": {"min": 4, "max": 12}}},
+    "voxel sand": COLUMN | {"solid": [BALL], "solids": "voxel", "friction": {"dynamic_angle": 40.0, "grain_size": 1e-3}},
+    "trickling sand": HEAP | TRICKLING | {"particles": {"transfer": "flip"}, "friction": {"model": "box"}},
+}
 
-def model(name: str) -> LiquidScene:
+
+def scene(**tables) -> ParticleScene:
+    """Return a scene of liquid, or of sand."""
+    return small_sands.scene(**tables) if "sand" in tables else small_liquids.scene(**tables)
+
+
+def model(name: str) -> ParticleScene:
     """Return a scene."""
     return scene(**SCENES[name])
 
@@ -72,14 +92,16 @@ def advance(simulation, steps=STEPS):
     for _ in range(steps):
         dt = min(simulation.stable_dt(), DT)
         row = simulation.step(dt)
-        tables = {f"{table} {name}": value for table, found in simulation.measured.items() for name, value in found.items()}
+        measured = getattr(simulation, "measured", {})
+        tables = {f"{table} {name}": value for table, found in measured.items() for name, value in found.items()}
         rows.append({"dt": dt, **row, **tables})
     return rows
 
 
-def start(ranks: Ranks, name: str, **tables) -> DistributedLiquid:
+def start(ranks: Ranks, name: str, **tables) -> SharedParticleSimulation:
     """Return a simulation on ranks."""
-    return create(scene(**(SCENES[name] | tables)), ranks, device="cpu", folder=Path())
+    made = scene(**(SCENES[name] | tables))
+    return simulators()[made.scene.simulator].create_distributed(made, ranks, device="cpu", folder=Path())
 
 
 def run(ranks: Ranks, folder: Path) -> None:
@@ -107,7 +129,7 @@ def run(ranks: Ranks, folder: Path) -> None:
     assert ranks.size != 4 or len(moved) > 9, moved
 
 
-RESUMED = ("cut", "river", "crowded")
+RESUMED = ("cut", "river", "crowded", "sand", "stirred sand")
 
 
 def keep(ranks: Ranks, folder: Path) -> None:

@@ -230,13 +230,17 @@ def test_ranks_of_another_mpi_are_refused(mpi, tmp_path):
     assert "3 processes were started, but mpi4py knows only one" in done.stderr
 
 
-LIQUID = "--set domain.resolution=24 --set time.duration=0.3 --set output.checkpoint_every=4 --set output.grid_format=vti"
+SMALL = "--set domain.resolution=24 --set time.duration=0.3 --set output.checkpoint_every=4 --set output.grid_format=vti"
+COLUMNS = ("time", "dt", "particles", "mass", "kinetic_energy", "potential_energy", "max_speed")
 
 
-def test_liquid_goes_on_on_other_numbers_of_ranks(mpi, tmp_path):
+@pytest.mark.parametrize(
+    ("scene", "columns"), [("dam-break-2d", ("volume", "active")), ("column-collapse-2d", ("runout", "height", "yielded"))]
+)
+def test_a_material_goes_on_on_other_numbers_of_ranks(mpi, tmp_path, scene, columns):
     """From two ranks to three, and on in one process: one log, and frames with the particles and cells of a run in one process."""
     one, out = tmp_path / "one", tmp_path / "out"
-    words = shlex.split(f"run dam-break-2d --device cpu {LIQUID}")
+    words = shlex.split(f"run {scene} --device cpu {SMALL}")
     go = ["-c", "from warp_lcp.cli.commands import main; main()", *words]
     mpi(2, *go, "--out", "out", "--engine", "petsc", "--frames", 3)
     mpi(3, *go, "--out", "out", "--engine", "petsc", "--frames", 6, "--resume")
@@ -247,7 +251,7 @@ def test_liquid_goes_on_on_other_numbers_of_ranks(mpi, tmp_path):
         rows = list(zip(csv.DictReader(a), csv.DictReader(b), strict=True))
     assert len(rows) > 10
     for expected, found in rows:
-        for name in ("time", "dt", "particles", "mass", "kinetic_energy", "potential_energy", "max_speed", "volume", "active"):
+        for name in (*COLUMNS, *columns):
             assert float(found[name]) == pytest.approx(float(expected[name]), rel=1e-6)
     whole, parts = Recording(one, cells=True), Recording(out, cells=True)
     assert whole.numbers == parts.numbers

@@ -158,23 +158,29 @@ def exchange_all(forest: Any, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) ->
             step(units[roots.dtype.itemsize], roots, leaves, MPI.REPLACE)
 
 
-def star_forest(ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox]) -> Any:
+def star_forest(
+    ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox], *, filled: CellBox | None = None, layers: int = 1
+) -> Any:
     """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
 
     Args:
         ranks: who have the boxes.
         owned: the cells that each rank is the one to know; they do not overlap.
         stored: the cells that each rank stores.
+        filled: the ghost cells that are wanted lie in it; None: all.
+        layers: of numbers of those cells, one behind the other.
     """
     around, mine = stored[ranks.rank], ranks.rank
+    wanted = around if filled is None else around.common(filled)
     leaves, remotes = [np.empty(0, dtype=np.int64)], [np.empty((0, 2), dtype=np.int32)]
     for rank, (box, remote) in enumerate(zip(owned, stored, strict=True)):
-        shared = around.common(box)
+        shared = wanted.common(box)
         if rank != mine and shared.cells:
-            leaves.append(_elements(shared, around))
-            remotes.append(_remote(rank, _elements(shared, remote)))
+            for layer in range(layers):
+                leaves.append(_elements(shared, around) + layer * around.cells)
+                remotes.append(_remote(rank, _elements(shared, remote) + layer * remote.cells))
     forest = petsc().SF().create(comm=ranks.comm)
-    forest.setGraph(around.cells, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
+    forest.setGraph(layers * around.cells, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
     return forest
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -36,7 +37,8 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.particle_state import signature
 from warp_lcp.material.sources import Outlets
-from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.material.wall import Join
+from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed
 
 
 class SharedParticleSimulation(ParticleSimulation):
@@ -46,7 +48,8 @@ class SharedParticleSimulation(ParticleSimulation):
     on all: rows of the log are of the whole material. `frame` shows this rank's particles and cells, with positions and cells' numbers of
     the whole domain; `frame`, `piece_state`, `columns` and `notes` ask nobody.
 
-    A class is made of the material's own simulation and this one, in this order. Its `mark` is in `with_ghosts`, its `step` in `attempt`.
+    A class is made of the material's own simulation and this one, in this order. Its `mark` is in `with_ghosts`, its `step` in `attempt`,
+    its `frame` is `in_box`.
 
     Args:
         scene: what to simulate.
@@ -107,6 +110,11 @@ class SharedParticleSimulation(ParticleSimulation):
         self._lay_anew(part.grid, lambda _: self._make_parts(part))
         part.ranks.free_ended()
 
+    def in_box(self, frame: list[Part]) -> list[Part]:
+        """Return a frame of this rank whose cells know the box that they are from."""
+        box = self.part.box
+        return [replace(part, box=(box.low, box.high)) if isinstance(part, Cells) else part for part in frame]
+
     @contextmanager
     def with_ghosts(self) -> Iterator[None]:
         """Let the particles around this rank's box be there."""
@@ -145,7 +153,7 @@ class SharedParticleSimulation(ParticleSimulation):
                 f"{self.part.layers - 1} around its box"
             )
 
-    def _layer_filled(self) -> Refill:
+    def _layer_filled(self) -> Join | None:
         return Refill(self.part)
 
     def bring_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -57,6 +56,7 @@ class Subdomain:
     def __init__(self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int) -> None:
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box = decomposition.ranks, decomposition.box
+        self._forests: dict[tuple[int, int | None], Any] = {}
         for axis in decomposition.cut_axes:
             least, most = min(decomposition.parts[axis]), max(decomposition.counts[axis] // layers, 1)
             if least < layers:
@@ -82,14 +82,15 @@ class Subdomain:
         """Return the cells of the part around a box, without its ring."""
         return box.grown(self.layers - 1).common(CellBox((0, 0, 0), self.decomposition.counts))
 
-    @cached_property
-    def _forest(self) -> Any:
-        """The star forest that fills ghost cells and the rings beside them; None: there is one rank."""
-        if self.ranks.size == 1:
-            return None
-        boxes = self.decomposition.boxes
-        owned = [self._with_sides(box) for box in boxes]
-        return star_forest(self.ranks, owned, [self._cells(box).grown(1) for box in boxes])
+    def _forest(self, layers: int, width: int | None) -> Any:
+        """Return the star forest that fills ghost cells and the rings beside them; arguments as of `fill`."""
+        if (layers, width) not in self._forests:
+            boxes = self.decomposition.boxes
+            owned = [self._with_sides(box) for box in boxes]
+            filled = None if width is None else self.box.grown(width)
+            stored = [self._cells(box).grown(1) for box in boxes]
+            self._forests[layers, width] = star_forest(self.ranks, owned, stored, filled=filled, layers=layers)
+        return self._forests[layers, width]
 
     def _with_sides(self, box: CellBox) -> CellBox:
         """Return a box with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
@@ -99,12 +100,18 @@ class Subdomain:
             high[axis] += high[axis] == self.decomposition.counts[axis]
         return CellBox.of(low, high)
 
-    def fill(self, *fields: wp.array) -> None:
-        """Fill the ghost cells of fields of the part; collective."""
-        if self._forest is None:
+    def fill(self, *fields: wp.array, width: int | None = None) -> None:
+        """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
+
+        Args:
+            fields: any types, the last axes z, y, x.
+            width: how far from the box; None: all.
+        """
+        if self.ranks.size == 1:
             return
         hosts = [field.numpy() for field in fields]
-        exchange_all(self._forest, [(host, host) for host in hosts])
+        forest = self._forest(1 if fields[0].ndim == 3 else fields[0].shape[0], width)
+        exchange_all(forest, [(host, host) for host in hosts])
         for field, host in zip(fields, hosts, strict=True):
             if field.device.is_cuda:
                 field.assign(host)
@@ -115,6 +122,11 @@ class Subdomain:
         edge = (ring if self.dimension == 3 else 0, ring, ring)
         box = (slice(l - e, h + e) for l, h, e in zip(low, high, edge, strict=True))
         return field[(slice(None),) * (field.ndim - 3) + tuple(box)]
+
+    def known_of(self, field: np.ndarray) -> np.ndarray:
+        """Return the view of a host's field on what this rank alone knows: the cells of the box and the ring beyond the domain's sides."""
+        box = self._with_sides(self.box).moved(self.grid.origin, -1).moved((1, 1, 1))
+        return field[box.slices]
 
     def stored_box_of(self, field: wp.array) -> Any:
         """Return the view of a field on the cells of the box and one cell around it, in the stored shape of such a box."""
