@@ -60,7 +60,7 @@ class Traffic:
 def _ghosts(owner: Subdomain | Halo) -> int:
     """Return how many ghost cells are filled."""
     if isinstance(owner, Subdomain):
-        return len(owner._forest(1, None).getGraph()[2]) if owner.ranks.size > 1 else 0
+        return len(owner._forest(1, None, 1).getGraph()[2]) if owner.ranks.size > 1 else 0
     return 0 if owner._forest is None else len(owner._forest.getGraph()[2])
 
 

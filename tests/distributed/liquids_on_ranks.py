@@ -14,6 +14,8 @@ from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.fluids.distributed import create
+from warp_lcp.frames.pieces import one_mesh
+from warp_lcp.frames.vtu import Mesh
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
@@ -129,6 +131,25 @@ def run(ranks: Ranks, folder: Path) -> None:
     assert ranks.size != 4 or len(moved) > 9, moved
 
 
+WRAPPED = {
+    "flat": SCENES["flat"] | {"output": {"surface": True}, "solid": [DISC]},
+    "coarse": SCENES["cut"] | {"output": {"surface": True, "surface_resolution": 1}, "resolution": 40},
+    "fine": SCENES["cut"] | {"output": {"surface": True, "surface_smoothing": 2.0}},
+}
+
+
+def wrap(ranks: Ranks, folder: Path) -> None:
+    """Keep the triangles of surfaces, at the start and later."""
+    for name, tables in WRAPPED.items():
+        simulation = create(scene(**tables), ranks, device="cpu", folder=Path())
+        for step in range(2):
+            advance(simulation, 2 * step)
+            pieces = [Mesh(part.points, part.corners, part.fields) for part in ranks.comm.allgather(simulation.frame()[2])]
+            if ranks.is_root:
+                mesh = one_mesh(pieces)
+                np.savez(folder / f"{name}_{step}_{ranks.size}.npz", points=mesh.points, corners=mesh.corners, **mesh.fields)
+
+
 RESUMED = ("cut", "river", "crowded", "sand", "stirred sand")
 
 
@@ -202,4 +223,4 @@ def differ(ranks: Ranks, folder: Path) -> None:
 if __name__ == "__main__":
     world = Ranks.world()
     for what in sys.argv[1].split(","):
-        {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ, "dam": dam}[what](world, Path(sys.argv[2]))
+        {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ, "dam": dam, "wrap": wrap}[what](world, Path(sys.argv[2]))

@@ -9,14 +9,12 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
-from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.distributed.particles import UNSORTED, SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import Trail, Window
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.rows.vectors import convert
-
-UNSORTED = 1  # a step in which particles are not sorted: ghosts come, and each goes to its rank
 
 
 class SharedCrowding(Crowding):

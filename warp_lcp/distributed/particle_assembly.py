@@ -11,6 +11,7 @@ from warp_lcp.distributed.decomposition import Decomposition, balanced_processes
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
+from warp_lcp.distributed.surface_mesh import surface_layers
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_assembly import seed_materials, start_velocities
 from warp_lcp.material.particle_scene import ParticleScene
@@ -40,11 +41,7 @@ def check_shared(scene: ParticleScene, ranks: Ranks, refused: Sequence[str], met
 
 def refusals(scene: ParticleScene) -> list[str]:
     """Return the keys of a scene that ask for what no material has on ranks."""
-    asked = {
-        **{f"solid[{n}].mass": solid.is_body for n, solid in enumerate(scene.solid)},
-        "output.surface": scene.output.surface,
-        "output.volume": scene.output.volume,
-    }
+    asked = {**{f"solid[{n}].mass": solid.is_body for n, solid in enumerate(scene.solid)}, "output.volume": scene.output.volume}
     return [key for key, wanted in asked.items() if wanted]
 
 
@@ -58,6 +55,8 @@ def part_of(scene: ParticleScene, ranks: Ranks, device: str, *, smoothing: int =
         smoothing: binomial passes over the level set.
     """
     counts, layers = scene.cell_counts, ghost_layers(scene.time.cfl, smoothing)
+    if scene.output.surface:
+        layers = max(layers, surface_layers(scene.output.surface_resolution or scene.particles.per_axis))
     size = np.array([*scene.domain.size, scene.spacing][:3])
     start = []
     for shape in scene.materials()[1]:

@@ -24,12 +24,14 @@ from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensit
 from warp_lcp.distributed.extension import Refill, too_far
 from warp_lcp.distributed.migration import cuts_of, handed_over
 from warp_lcp.distributed.particle_pieces import take_pieces
-from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.distributed.particles import SORTED, UNSORTED, SharedParticles
 from warp_lcp.distributed.reseeding import SharedReseeding
 from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.distributed.surface_mesh import SharedSurfaceMesh
 from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.particle_assembly import Parts
+from warp_lcp.grid.surface_mesh import SurfaceMesh
+from warp_lcp.material.particle_assembly import Parts, make_surface_mesh
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_pieces import Piece, fields_of, piece_of
 from warp_lcp.material.particle_rearrangement import Rearrangement
@@ -38,7 +40,7 @@ from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.particle_state import signature
 from warp_lcp.material.sources import Outlets
 from warp_lcp.material.wall import Join
-from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed
+from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, Surface
 
 
 class SharedParticleSimulation(ParticleSimulation):
@@ -46,7 +48,7 @@ class SharedParticleSimulation(ParticleSimulation):
 
     Making it, `stable_dt`, `step`, `mark` and `restore_pieces` are collective and give every rank the same numbers, or raise the same error
     on all: rows of the log are of the whole material. `frame` shows this rank's particles and cells, with positions and cells' numbers of
-    the whole domain; `frame`, `piece_state`, `columns` and `notes` ask nobody.
+    the whole domain; it is collective, too. `piece_state`, `columns` and `notes` ask nobody.
 
     A class is made of the material's own simulation and this one, in this order. Its `mark` is in `with_ghosts`, its `step` in `attempt`,
     its `frame` is `in_box`.
@@ -82,6 +84,19 @@ class SharedParticleSimulation(ParticleSimulation):
         reseeding = partial(SharedReseeding, self.part)
         return Rearrangement(self.scene, self.grid, self.boundary, crowding=crowding, correction=correction, reseeding=reseeding)
 
+    def _surface_mesh(self) -> SurfaceMesh | None:
+        return make_surface_mesh(self.scene, self.grid, self.boundary, partial(SharedSurfaceMesh, self.part))
+
+    def surfaces(self) -> list[Surface]:
+        """Return the surface in this rank's box; collective."""
+        if self.surface_mesh is None:
+            return []
+        with self.with_ghosts(UNSORTED):
+            return super().surfaces()
+
+    def _fill(self, *fields: wp.array) -> None:
+        self.part.fill(*fields)
+
     def _flights(self) -> None:
         """Bodies reach across the cuts between ranks, where none of them knows the whole of one."""
 
@@ -116,9 +131,9 @@ class SharedParticleSimulation(ParticleSimulation):
         return [replace(part, box=(box.low, box.high)) if isinstance(part, Cells) else part for part in frame]
 
     @contextmanager
-    def with_ghosts(self) -> Iterator[None]:
-        """Let the particles around this rank's box be there."""
-        self.particles.arrange(0)
+    def with_ghosts(self, step: int = SORTED) -> Iterator[None]:
+        """Let the particles around this rank's box be there, arranged as in a step of this number."""
+        self.particles.arrange(step)
         yield
         self.particles.drop_ghosts()
 

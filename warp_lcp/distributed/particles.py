@@ -34,6 +34,7 @@ WHERE = particle_pass(
 MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
 REACH = 1  # cells from a box within which particles touch its faces and cells
 ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
+SORTED, UNSORTED = 0, 1  # steps in which `arrange` sorts, and in which it need not
 ENDLESS = 1e30  # a coordinate beyond all
 NEW = 1 << 62  # places from which on particles have come since the last sort
 COUNT, DATA = 7101, 7102  # tags of messages

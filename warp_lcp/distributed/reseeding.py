@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.distributed.particles import SORTED, SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.reseeding import Reseeding
-
-SORTED = 0  # a step in which particles are sorted
 
 
 class SharedReseeding(Reseeding):

@@ -56,7 +56,7 @@ class Subdomain:
     def __init__(self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int) -> None:
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box = decomposition.ranks, decomposition.box
-        self._forests: dict[tuple[int, int | None], Any] = {}
+        self._forests: dict[tuple[int, int | None, int], Any] = {}
         for axis in decomposition.cut_axes:
             least, most = min(decomposition.parts[axis]), max(decomposition.counts[axis] // layers, 1)
             if least < layers:
@@ -82,35 +82,42 @@ class Subdomain:
         """Return the cells of the part around a box, without its ring."""
         return box.grown(self.layers - 1).common(CellBox((0, 0, 0), self.decomposition.counts))
 
-    def _forest(self, layers: int, width: int | None) -> Any:
+    def _forest(self, layers: int, width: int | None, parts: int) -> Any:
         """Return the star forest that fills ghost cells and the rings beside them; arguments as of `fill`."""
-        if (layers, width) not in self._forests:
+        if (layers, width, parts) not in self._forests:
             boxes = self.decomposition.boxes
-            owned = [self._with_sides(box) for box in boxes]
-            filled = None if width is None else self.box.grown(width)
-            stored = [self._cells(box).grown(1) for box in boxes]
-            self._forests[layers, width] = star_forest(self.ranks, owned, stored, filled=filled, layers=layers)
-        return self._forests[layers, width]
+            owned = [self._with_sides(box, parts) for box in boxes]
+            filled = None if width is None else self._refined(self.box.grown(width), parts)
+            stored = [self._refined(self._cells(box), parts).grown(1) for box in boxes]
+            self._forests[layers, width, parts] = star_forest(self.ranks, owned, stored, filled=filled, layers=layers)
+        return self._forests[layers, width, parts]
 
-    def _with_sides(self, box: CellBox) -> CellBox:
-        """Return a box with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
-        low, high = list(box.low), list(box.high)
+    def _refined(self, box: CellBox, parts: int) -> CellBox:
+        """Return a box in cells that are cut into so many along each axis."""
+        each = [parts if axis < self.dimension else 1 for axis in range(3)]
+        return CellBox.of(*([n * p for n, p in zip(corner, each, strict=True)] for corner in (box.low, box.high)))
+
+    def _with_sides(self, box: CellBox, parts: int = 1) -> CellBox:
+        """Return a box, refined, with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
+        found = self._refined(box, parts)
+        low, high = list(found.low), list(found.high)
         for axis in range(self.dimension):  # in 2-D one plane is used
-            low[axis] -= low[axis] == 0
-            high[axis] += high[axis] == self.decomposition.counts[axis]
+            low[axis] -= box.low[axis] == 0
+            high[axis] += box.high[axis] == self.decomposition.counts[axis]
         return CellBox.of(low, high)
 
-    def fill(self, *fields: wp.array, width: int | None = None) -> None:
+    def fill(self, *fields: wp.array, width: int | None = None, parts: int = 1) -> None:
         """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
 
         Args:
             fields: any types, the last axes z, y, x.
             width: how far from the box; None: all.
+            parts: the fields are of `grid.refined(parts)`.
         """
         if self.ranks.size == 1:
             return
         hosts = [field.numpy() for field in fields]
-        forest = self._forest(1 if fields[0].ndim == 3 else fields[0].shape[0], width)
+        forest = self._forest(1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts)
         exchange_all(forest, [(host, host) for host in hosts])
         for field, host in zip(fields, hosts, strict=True):
             if field.device.is_cuda:

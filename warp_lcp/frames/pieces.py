@@ -18,6 +18,7 @@ from warp_lcp.frames.vtu import Mesh
 from warp_lcp.simulation import Cells, Points, Surface
 
 RANK_FOLDER = re.compile(r"rank_\d{4,}")  # where each process keeps its pieces of frames and checkpoints
+SURFACES = (2, 3)  # corners of segments and triangles
 WHOLE = {"vtu": "pvtu", "vti": "pvti"}  # the suffix of the file that names the pieces, by theirs
 
 Kind = Literal["vtu", "vti"]
@@ -104,6 +105,8 @@ def piece_files(path: Path) -> list[Path]:
 def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
     """Return the mesh of all pieces, of which there is at least one; empty ones need not have the kind of cells of the others.
 
+    Pieces of a surface have the points on cuts twice, in the same place to the last bit: it comes back with each once.
+
     Raises:
         ValueError: they have other fields or cells than each other.
     """
@@ -112,12 +115,13 @@ def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
     if any(mesh.fields.keys() != first.fields.keys() or mesh.on_cells != first.on_cells for mesh in filled):
         raise ValueError("its pieces have different fields")
     starts = np.cumsum([0, *(len(mesh.points) for mesh in filled)])
-    return Mesh(
+    whole = Mesh(
         np.concatenate([mesh.points for mesh in filled]),
         np.concatenate([mesh.corners + start for mesh, start in zip(filled, starts[:-1], strict=True)]),
         {name: np.concatenate([mesh.fields[name] for mesh in filled]) for name in first.fields},
         first.on_cells,
     )
+    return _sewn(whole) if len(filled) > 1 and whole.corners.shape[1] in SURFACES else whole
 
 
 def one_grid(parts: Sequence[Cells]) -> Cells:
@@ -156,6 +160,15 @@ def remove_empty_ranks(folder: Path) -> None:
     for path in list(folder.iterdir()) if folder.is_dir() else ():
         if _is_rank(path) and not any(path.iterdir()):
             path.rmdir()
+
+
+def _sewn(mesh: Mesh) -> Mesh:
+    """Return a mesh with the points of one place as one point, the first of them."""
+    places = np.ascontiguousarray(mesh.points).view(np.dtype((np.void, mesh.points.strides[0]))).ravel()
+    _, first, place = np.unique(places, return_index=True, return_inverse=True)
+    kept, number = np.unique(first, return_inverse=True)
+    fields = mesh.fields if mesh.on_cells else {name: values[kept] for name, values in mesh.fields.items()}
+    return Mesh(mesh.points[kept], number[place][mesh.corners], fields, mesh.on_cells)
 
 
 def _mesh(pieces: Sequence[tuple[str, Piece]], first: Piece) -> Iterator[str]:

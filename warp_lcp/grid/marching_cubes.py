@@ -186,17 +186,40 @@ class MarchingCubes:
         low = (1, 0, 0) if grid.dimension == 2 else (0, 0, 0)
         high = (2 if grid.dimension == 2 else grid.shape[0] - 1, grid.shape[1] - 1, grid.shape[2] - 1)
         cells = Window(low, high, device)  # between the centers of cells and of their upper neighbors
-        counts = [wp.empty(cells.rows, dtype=wp.int32, device=device) for _ in range(2)]
-        run = functools.partial(cells.run, whole=True, phi=phi, planes=grid.planes)
-        run(COUNT, table=self._table, owned=counts[0], made=counts[1])
-        ends = [wp.empty(count.size, dtype=wp.int32, device=device) for count in counts]
-        for count, end in zip(counts, ends, strict=True):
-            wp.utils.array_scan(count.flatten(), end, inclusive=True)
-        points, corners = (int(end[-1:].numpy()[0]) for end in ends)
-        mesh = DeviceMesh(
-            wp.empty(points, dtype=wp.vec3, device=device), wp.empty((corners, grid.dimension), dtype=wp.int32, device=device)
-        )
+        owned, made = self._counted(cells, phi)
+        points = wp.empty(_total(owned[1]), dtype=wp.vec3, device=device)
         placed: dict[str, Any] = dict(zip(_PLACED, [grid.spacing, *grid.origin, *grid.domain_counts], strict=True))
-        run(POINTS, **placed, number=number, counts=counts[0], ends=ends[0], into=mesh.points)
-        run(CORNERS, table=self._table, number=number, counts=counts[1], ends=ends[1], into=mesh.corners)
-        return mesh
+        given = {"phi": phi, "planes": grid.planes, "number": number}
+        cells.run(POINTS, whole=True, counts=owned[0], ends=owned[1], into=points, **placed, **given)
+        return DeviceMesh(points, self._corners(cells, phi, number, made))
+
+    def corners(self, phi: wp.array, number: wp.array, cells: Window) -> wp.array:
+        """Return those corners of the last surface that lie in some cells.
+
+        Args:
+            phi: as `contour` was given it.
+            number: as it has left it.
+            cells: between the centers of these and of their upper neighbors.
+        """
+        return self._corners(cells, phi, number, self._counted(cells, phi)[1])
+
+    def _counted(self, cells: Window, phi: wp.array) -> tuple[tuple[wp.array, wp.array], tuple[wp.array, wp.array]]:
+        """Return how many points nodes of rows own, and triangles their cells have, each with sums up to and with each row."""
+        owned, made = (wp.empty(cells.rows, dtype=wp.int32, device=cells.device) for _ in range(2))
+        cells.run(COUNT, whole=True, phi=phi, planes=self.grid.planes, table=self._table, owned=owned, made=made)
+        ends = [wp.empty(count.size, dtype=wp.int32, device=cells.device) for count in (owned, made)]
+        for count, end in zip((owned, made), ends, strict=True):
+            wp.utils.array_scan(count.flatten(), end, inclusive=True)
+        return (owned, ends[0]), (made, ends[1])
+
+    def _corners(self, cells: Window, phi: wp.array, number: wp.array, made: tuple[wp.array, wp.array]) -> wp.array:
+        """Return the triangles of cells, whose rows have so many."""
+        corners = wp.empty((_total(made[1]), self.grid.dimension), dtype=wp.int32, device=cells.device)
+        given = {"phi": phi, "planes": self.grid.planes, "number": number, "table": self._table, "into": corners}
+        cells.run(CORNERS, whole=True, counts=made[0], ends=made[1], **given)
+        return corners
+
+
+def _total(ends: wp.array) -> int:
+    """Return the last of sums."""
+    return int(ends[-1:].numpy()[0])

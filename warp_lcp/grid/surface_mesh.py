@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import warp as wp
@@ -20,6 +21,7 @@ SHARPEST = 0.5  # particle distances: standard deviation of the narrowest kernel
 EXTENDED = 2  # layers that the distance is continued into solids, and the velocity into air
 CROWD = 0.1  # the largest smoothed share that a lone particle is taken to have: kernels as narrow as particles cannot tell it from others
 ROUNDS = 3  # of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume
+SEEN = 2 * ROUNDS + 1  # lattice cells around one that its points depend on by the smoothing
 MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9  # a lattice cell, and more where there are solids
 MESH_POINT_BYTES = 80  # a point, its triangles and its velocity included
 
@@ -134,8 +136,12 @@ class SurfaceMesh:
         if self._room is not None:
             extrapolate(window, self._known, phi, EXTENDED)
             window.run(kernels.CARVE, room=self._room, phi=phi)
-        mesh = self._cubes.contour(phi, smooth.view(wp.int32))
-        smooth_mesh(mesh, lattice, self._room, ROUNDS)
+        return self._mesh(phi, smooth.view(wp.int32))
+
+    def _mesh(self, phi: wp.array, number: wp.array) -> DeviceMesh:
+        """Return the smoothed surface phi = 0; `number` is scratch memory."""
+        mesh = self._cubes.contour(phi, number)
+        smooth_mesh(mesh, self.lattice, self._room, ROUNDS)
         return mesh
 
     def _place(self, obstacles: Obstacles) -> None:
@@ -168,8 +174,9 @@ class SurfaceMesh:
 
 
 def faces_from_particles(
-    grid: StaggeredGrid, position: wp.array, velocity: wp.array, fields: list[wp.array], weights: list[wp.array]
-) -> None:
+    grid: StaggeredGrid, position: wp.array, velocity: wp.array, fields: list[wp.array], weights: list[wp.array],
+    join: Callable[..., None] | None = None,
+) -> None:  # fmt: skip
     """Bring the particles' velocity to the faces around them, and `EXTENDED` layers farther.
 
     Args:
@@ -178,8 +185,11 @@ def faces_from_particles(
         velocity: [m/s], shape (n,), vectors.
         fields: velocity of each component on the faces [m/s] (written).
         weights: a field a component (written), scratch memory.
+        join: fills fields where others know them; None: nobody does.
     """
     particles_to_faces(grid, position, velocity, [], fields, weights)
+    if join is not None:
+        join(*fields, *weights)
     known = grid.field(wp.int8)
     for field, weight in zip(fields, weights, strict=True):
         grid.everywhere.launch(weighted_kernel, [0.0, weight, known])

@@ -135,11 +135,13 @@ def make_spray(scene: ParticleScene, coverage: Coverage, placed: Sequence[Placed
     return Spray(coverage.domain, placed, side_bits(scene.domain.open), keeps=scene.kept(()) is not None)
 
 
-def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:
-    """Return what wraps the particles in a surface, if the scene's output has one."""
+def make_surface_mesh(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., SurfaceMesh] = SurfaceMesh
+) -> SurfaceMesh | None:
+    """Return what wraps the particles in a surface, made by what takes the arguments of `SurfaceMesh`, if the scene's output has one."""
     if not scene.output.surface:
         return None
-    return SurfaceMesh(
+    return make(
         grid, per_axis=scene.particles.per_axis, resolution=scene.output.surface_resolution, smoothing=scene.output.surface_smoothing,
         obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves) if scene.solid else None,
     )  # fmt: skip

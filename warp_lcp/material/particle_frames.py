@@ -54,7 +54,7 @@ class ParticleFrames(ABC):
         band = self.band
         mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
         if not self._faces_know:  # the next step overwrites what the faces are given here
-            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
+            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights, self._fill)
         velocity = sample(self.grid, self.velocity, mesh.points)
         return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
 
@@ -62,6 +62,10 @@ class ParticleFrames(ABC):
         """Return the material's level set and density as a frame shows them, if the scene wants them."""
         fill = self.band.fill if self.band is not None else None
         return [] if self.particle_volume is None else self.particle_volume.measure(self.particles, fill=fill)
+
+    def _fill(self, *fields: wp.array) -> None:
+        """Give fields what others who have parts of the grid know of them."""
+        assert not self.shared, "nobody has"
 
     def body_surfaces(self) -> list[Surface]:
         """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""
