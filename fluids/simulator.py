@@ -105,7 +105,7 @@ class LiquidSimulation(ParticleSimulation):
             self.projection.jump, self.projection.adhesion = self.tension.jump, self.tension.adhesion
 
     def _surface(self) -> FreeSurface:
-        return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
+        return make_surface(self.scene, self.grid, self.boundary, self._fill_density())
 
     def _tension(self) -> SurfaceTension | None:
         return make_tension(self.scene, self.grid, self.boundary, self.surface)

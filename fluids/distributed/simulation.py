@@ -32,7 +32,7 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
 
     def _surface(self) -> FreeSurface:
         part = self.part
-        return SharedSurface(part, make_surface(self.scene, self.grid, self.boundary, lambda _, density: part.fill(density), part.owned))
+        return SharedSurface(part, make_surface(self.scene, self.grid, self.boundary, self._fill_density(), part.owned))
 
     def _tension(self) -> SurfaceTension | None:
         return make_tension(self.scene, self.grid, self.boundary, self.surface, partial(SharedSurfaceTension, self.part))

@@ -102,8 +102,12 @@ def advance(simulation, steps=STEPS):
 
 def start(ranks: Ranks, name: str, **tables) -> SharedParticleSimulation:
     """Return a simulation on ranks."""
-    made = scene(**(SCENES[name] | tables))
-    return simulators()[made.scene.simulator].create_distributed(made, ranks, device="cpu", folder=Path())
+    return on_ranks(ranks, scene(**(SCENES[name] | tables)))
+
+
+def on_ranks(ranks: Ranks, given: ParticleScene) -> SharedParticleSimulation:
+    """Return the simulation of a scene on ranks."""
+    return simulators()[given.scene.simulator].create_distributed(given, ranks, device="cpu", folder=Path())
 
 
 def run(ranks: Ranks, folder: Path) -> None:
@@ -134,20 +138,24 @@ def run(ranks: Ranks, folder: Path) -> None:
 WRAPPED = {
     "flat": SCENES["flat"] | {"output": {"surface": True}, "solid": [DISC]},
     "coarse": SCENES["cut"] | {"output": {"surface": True, "surface_resolution": 1}, "resolution": 40},
-    "fine": SCENES["cut"] | {"output": {"surface": True, "surface_smoothing": 2.0}},
+    "heap": HEAP | {"output": {"surface": True}},
+    "fine": SCENES["cut"] | {"output": {"surface": True, "surface_smoothing": 2.0, "volume": True}},
 }
 
 
 def wrap(ranks: Ranks, folder: Path) -> None:
-    """Keep the triangles of surfaces, at the start and later."""
+    """Keep surfaces and volumes, at the start and later."""
     for name, tables in WRAPPED.items():
-        simulation = create(scene(**tables), ranks, device="cpu", folder=Path())
+        simulation = on_ranks(ranks, scene(**tables))
         for step in range(2):
             advance(simulation, 2 * step)
-            pieces = [Mesh(part.points, part.corners, part.fields) for part in ranks.comm.allgather(simulation.frame()[2])]
+            _, _, surface, *volumes = simulation.frame()
+            assert ranks.is_root or not volumes
+            pieces = [Mesh(part.points, part.corners, part.fields) for part in ranks.comm.allgather(surface)]
             if ranks.is_root:
                 mesh = one_mesh(pieces)
-                np.savez(folder / f"{name}_{step}_{ranks.size}.npz", points=mesh.points, corners=mesh.corners, **mesh.fields)
+                found = {volume.name: volume.values for volume in volumes} | mesh.fields
+                np.savez(folder / f"{name}_{step}_{ranks.size}.npz", points=mesh.points, corners=mesh.corners, **found)
 
 
 RESUMED = ("cut", "river", "crowded", "sand", "stirred sand")

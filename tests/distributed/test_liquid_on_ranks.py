@@ -6,7 +6,7 @@ from pathlib import Path
 import liquids_on_ranks
 import numpy as np
 import pytest
-from liquids_on_ranks import COLUMN, DAM_STEPS, DEEP, FLAT, HEAP, RESUMED, SCENES, WRAPPED, advance, model, scene
+from liquids_on_ranks import COLUMN, DAM_STEPS, FLAT, HEAP, RESUMED, SCENES, WRAPPED, advance, model, scene
 from scipy.spatial import cKDTree
 from turns import Seat
 
@@ -105,15 +105,17 @@ def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs,
 
 
 @pytest.mark.parametrize("ranks", [3, 4])
-def test_ranks_have_the_surface_of_one_process(mpi, tmp_path, ranks):
+def test_ranks_have_the_surface_and_the_volumes_of_one_process(mpi, tmp_path, ranks):
     """Where nothing has been rounded otherwise yet bit for bit: the same triangles, with points on cuts once."""
     mpi(ranks, PROGRAM, "wrap", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"})
     for name, tables in WRAPPED.items():
         simulation = single(scene(**tables))
         for step in range(2):
             advance(simulation, 2 * step)
-            expected = simulation.frame()[2]
+            _, _, expected, *volumes = simulation.frame()
             found = np.load(tmp_path / f"{name}_{step}_{ranks}.npz")
+            for volume in volumes:
+                np.testing.assert_allclose(found[volume.name], volume.values, atol=1e-6 * step)
             order, other = (np.lexsort(part.T) for part in (found["points"], expected.points))
             velocity = expected.fields["velocity"]
             if step == 0:
@@ -228,11 +230,9 @@ def test_pieces_of_something_else_are_refused(change, message):
     [
         (FLAT | {"particles": {"narrow_band": {}}}, "particles.narrow_band"),
         (FLAT | {"pressure": {"model": "unilateral"}}, 'pressure.model = "unilateral"'),
-        (DEEP | {"output": {"volume": True}}, "output.volume"),
         (FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], mass=10.0)]}, r"solid\[0\].mass"),
         (FLAT | {"viscosity": {"value": 1.0}}, "viscosity"),
         (COLUMN | {"periodic": [False, False, True]}, "domain.periodic"),
-        (HEAP | {"output": {"surface": True}}, "output.surface"),
     ],
 )
 def test_what_ranks_have_not_is_refused_by_name(tables, key):

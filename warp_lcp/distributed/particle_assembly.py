@@ -41,8 +41,7 @@ def check_shared(scene: ParticleScene, ranks: Ranks, refused: Sequence[str], met
 
 def refusals(scene: ParticleScene) -> list[str]:
     """Return the keys of a scene that ask for what no material has on ranks."""
-    asked = {**{f"solid[{n}].mass": solid.is_body for n, solid in enumerate(scene.solid)}, "output.volume": scene.output.volume}
-    return [key for key, wanted in asked.items() if wanted]
+    return [f"solid[{n}].mass" for n, solid in enumerate(scene.solid) if solid.is_body]
 
 
 def part_of(scene: ParticleScene, ranks: Ranks, device: str, *, smoothing: int = 0) -> Subdomain:

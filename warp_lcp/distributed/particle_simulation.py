@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.balance import Balance
-from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
 from warp_lcp.distributed.extension import Refill, too_far
 from warp_lcp.distributed.migration import cuts_of, handed_over
@@ -28,6 +28,7 @@ from warp_lcp.distributed.particles import SORTED, UNSORTED, SharedParticles
 from warp_lcp.distributed.reseeding import SharedReseeding
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.distributed.surface_mesh import SharedSurfaceMesh
+from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import SurfaceMesh
@@ -40,7 +41,7 @@ from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.particle_state import signature
 from warp_lcp.material.sources import Outlets
 from warp_lcp.material.wall import Join
-from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, Surface
+from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, Surface, Volume
 
 
 class SharedParticleSimulation(ParticleSimulation):
@@ -93,6 +94,27 @@ class SharedParticleSimulation(ParticleSimulation):
             return []
         with self.with_ghosts(UNSORTED):
             return super().surfaces()
+
+    def volumes(self) -> list[Volume]:
+        """Return the whole domain's level set and density on the root rank: no reader makes one volume of several. Collective."""
+        if self.particle_volume is None:
+            return []
+        with self.with_ghosts(UNSORTED):
+            mine = super().volumes()
+        first = [box - origin for box, origin in zip(self.part.box.low, self.grid.origin, strict=True)]
+        inside = CellBox((0, 0, 0), self.part.box.counts).moved(first).slices
+        whole = [self.part.gathered(volume.values[inside]) for volume in mine]
+        return [replace(volume, values=v, origin=(0, 0, 0)) for volume, v in zip(mine, whole, strict=True) if v is not None]
+
+    def _fill_density(self) -> Fill:
+        others = super()._fill_density()
+
+        def fill(window: Window, density: wp.array) -> None:
+            if others is not None:
+                others(window, density)
+            self.part.fill(density)
+
+        return fill
 
     def _fill(self, *fields: wp.array) -> None:
         self.part.fill(*fields)

@@ -151,6 +151,19 @@ class Subdomain:
         if view.ptr != box.ptr:
             wp.copy(box, view)
 
+    def gathered(self, box: np.ndarray) -> np.ndarray | None:
+        """Return what all ranks have of their boxes, shape (nz, ny, nx), as an array of the whole grid on the root rank; None elsewhere.
+
+        Collective.
+        """
+        everyone = [box] if self.ranks.size == 1 else self.ranks.comm.gather(box)
+        if everyone is None:
+            return None
+        whole = np.empty(self.decomposition.counts[::-1], dtype=box.dtype)
+        for part, values in zip(self.decomposition.boxes, everyone, strict=True):
+            whole[part.slices] = values
+        return whole
+
     def owners(self, cells: np.ndarray) -> np.ndarray:
         """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""
         place = [np.searchsorted(np.cumsum(part)[:-1], cells[:, axis], side="right") for axis, part in enumerate(self.decomposition.parts)]

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Interior, SurfaceMesh, faces_from_particles, sample
@@ -60,8 +61,11 @@ class ParticleFrames(ABC):
 
     def volumes(self) -> list[Volume]:
         """Return the material's level set and density as a frame shows them, if the scene wants them."""
-        fill = self.band.fill if self.band is not None else None
-        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles, fill=fill)
+        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles, fill=self._fill_density())
+
+    def _fill_density(self) -> Fill | None:
+        """Return what adds to the particles' density in a window what none of them stands for, as a surface sees it; None: nothing does."""
+        return self.band.fill if self.band is not None else None
 
     def _fill(self, *fields: wp.array) -> None:
         """Give fields what others who have parts of the grid know of them."""

@@ -63,8 +63,6 @@ def check_ranks(scene: Scene) -> None:
     problems = []
     if not isinstance(simulators()[name], DistributedSimulator):
         problems.append(KeyFault("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
-    if scene.output.volume:
-        problems.append(KeyFault("output.volume", "--engine petsc has no volumes, which cannot be written in pieces", "true"))
     if scene.output.surface_ply:
         problems.append(KeyFault("output.surface_ply", "--engine petsc writes surfaces as .vtu pieces alone", "true"))
     if problems:

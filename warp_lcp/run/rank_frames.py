@@ -19,6 +19,8 @@ Pieces = dict[str, Piece]  # of a rank, by their parts' names
 class RankFrames:
     """The frames of a run on several ranks: `frames/rank_0003/<name>_<index>.vtu` (or .vti), and `frames/<name>_<index>.pvtu` (.pvti).
 
+    Volumes are whole, on one rank, and stand beside those.
+
     Args:
         whole: the folder of the run's frames.
         collective: of the ranks.
@@ -45,7 +47,8 @@ class RankFrames:
             OSError: a file cannot be written; the earlier ones are intact.
         """
         make_folder(self.pieces)
-        return [self.whole.write_part(self.pieces / f"{part.name}_{index:06d}", part) for part in frame]
+        folders = [self.frames if isinstance(part, Volume) else self.pieces for part in frame]
+        return [self.whole.write_part(folder / f"{part.name}_{index:06d}", part) for folder, part in zip(folders, frame, strict=True)]
 
     @on_root
     def resume(self, times: list[float]) -> None:
