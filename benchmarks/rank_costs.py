@@ -37,7 +37,8 @@ class Traffic:
     def __init__(self) -> None:
         """Count from here on, in this process."""
         self.bytes, self.times = Counter[str](), Counter[str]()
-        self._listen(Subdomain, "fill", lambda part, *fields: _ghosts(part) * sum(map(_item, fields)))
+        self._listen(Subdomain, "fill", lambda part, *fields, width=None: _ghosts(part, width) * sum(map(_item, fields)))
+        self._listen(Subdomain, "collect", lambda part, mine, whole: (whole[0].size - mine[0].size) * sum(map(_item, whole)))
         self._listen(Halo, "fill", lambda halo, field: _ghosts(halo) * _item(field))
         self._listen(Gathering, "collect", lambda gathering, mine, whole: (whole.size - mine.size) * _item(whole))
         self._listen(Ranks, "gather", lambda ranks, values: (ranks.size - 1) * np.asarray(values).nbytes)
@@ -46,9 +47,9 @@ class Traffic:
     def _listen(self, kind: type, name: str, size: Callable[..., int]) -> None:
         plain = getattr(kind, name)
 
-        def counted(self_: Any, *arguments: Any) -> Any:
-            self._count(f"{kind.__name__}.{name}", size(self_, *arguments))
-            return plain(self_, *arguments)
+        def counted(self_: Any, *arguments: Any, **options: Any) -> Any:
+            self._count(f"{kind.__name__}.{name}", size(self_, *arguments, **options))
+            return plain(self_, *arguments, **options)
 
         setattr(kind, name, counted)
 
@@ -57,10 +58,10 @@ class Traffic:
         self.times[kind] += 1
 
 
-def _ghosts(owner: Subdomain | Halo) -> int:
+def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
     """Return how many ghost cells are filled."""
     if isinstance(owner, Subdomain):
-        return len(owner._forest(1, None, 1).getGraph()[2]) if owner.ranks.size > 1 else 0
+        return len(owner._forest(1, width, 1).getGraph()[2]) if owner.ranks.size > 1 else 0
     return 0 if owner._forest is None else len(owner._forest.getGraph()[2])
 
 

@@ -88,13 +88,14 @@ def make_pressure(
 
 
 def make_viscosity(
-    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, bodies: RigidBodies | None
-) -> Viscosity | None:
-    """Return the viscosity that a scene asks for, if it does."""
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, bodies: RigidBodies | None,
+    make: Callable[..., Viscosity] = Viscosity,
+) -> Viscosity | None:  # fmt: skip
+    """Return the viscosity that a scene asks for, if it does, made by what takes the arguments of `Viscosity`."""
     if scene.viscosity is None:
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
     settings: dict[str, Any] = {"viscosity": scene.viscosity.value, "density": scene.physics.density, "slip_lengths": scene.slip_lengths}
     kept = scene.kept([*scene.liquid, *scene.source])
     settings["thickest"] = None if kept is None else max(*kept, 1.0)
-    return Viscosity(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies, **settings)
+    return make(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies, **settings)

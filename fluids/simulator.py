@@ -100,7 +100,7 @@ class LiquidSimulation(ParticleSimulation):
         asked = self.forces is not None or drags is not None
         self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
         self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
-        self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
+        self.viscosity = self._viscosity()
         if self.tension is not None:
             self.projection.jump, self.projection.adhesion = self.tension.jump, self.tension.adhesion
 
@@ -110,11 +110,21 @@ class LiquidSimulation(ParticleSimulation):
     def _tension(self) -> SurfaceTension | None:
         return make_tension(self.scene, self.grid, self.boundary, self.surface)
 
+    def _viscosity(self) -> Viscosity | None:
+        return make_viscosity(self.scene, self.grid, self.boundary, self.surface, self.bodies)
+
     def _pressure(self) -> PressureProjection:
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
 
     def _probes(self) -> Probes | None:
         return Probes(self.scene.probe, self.gravity, self.grid.dimension) if self.scene.probe else None
+
+    def bring_to_faces(self, window: Window) -> None:
+        """Bring the particles' velocities to the faces, let gravity act on them, and bring along what the particles have of viscosities."""
+        super().bring_to_faces(window)
+        if self.viscosity is not None and self.viscosity.relative:
+            p, fields = self.particles, (self.viscosity.relative, self.weights)  # which stay what they are
+            particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets)
 
     def stable_dt(self) -> float:
         """Return the longest step that advection and surface tension allow [s]."""
@@ -142,9 +152,6 @@ class LiquidSimulation(ParticleSimulation):
         window = self.window(before)
         self.bring_to_faces(window)
         speed = self.top_speed(before)
-        if self.viscosity is not None and self.viscosity.relative:
-            p, fields = self.particles, (self.viscosity.relative, self.weights)  # which stay what they are
-            particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets)
         self._find_surface(window)
         viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
         projected = self._project(window, dt, speed)

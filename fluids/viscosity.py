@@ -112,7 +112,7 @@ class Viscosity:
         self._slips = wp.array(slips, dtype=wp.float32, device=grid.device)
         self._walls = ~open_sides_of(grid, boundary.open_sides) & (1 << 2 * grid.dimension) - 1
         self._walls_change, self._placed = boundary.moves or sources, False
-        self.multigrid = VectorMultigrid(grid)
+        self.multigrid = self._multigrid()
         self._fine = self.multigrid.levels[0]
         size = grid.dimension * grid.size
         self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)
@@ -124,7 +124,8 @@ class Viscosity:
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
             self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes)
-        self._solver = ConjugateGradient(self._product, self.multigrid)
+        self._solver = self._krylov()
+        self._inner = grid.domain
         self._trail, self._sums = Trail(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
 
     def solve(
@@ -140,18 +141,17 @@ class Viscosity:
             dt: how long viscosity acts [s].
             speed: scale of the velocities [m/s].
         """
-        box = replace(self._trail.through(window), near=None)
-        inner = box.common(self.grid.domain)
+        box, inner = self._boxes(window)
         self._change.zero_()
         if inner is None:
             return ViscousResult(0, 0.0, True, 0.0, 0.0)
         tau = self._viscosity / self._density * dt / self.grid.spacing**2
-        self._set_up(box, inner, kind, contact, tau)
+        self._set_up(box, kind, contact, tau)
         given = {"u": velocity, "kind": kind, "contact": contact}
         if self._bodies is not None:
             self._bodies.take(self._fine, self._walls_of_faces, {"kind": kind, "contact": contact}, velocity)
             if self._bodies.moved:  # a recorded iteration knows where they lay
-                self._solver = ConjugateGradient(self._product, self.multigrid)
+                self._solver = self._krylov()
         first, lost, driven, stiff = self._force(inner, given, changed=False)
         norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
         while norm > least and iterations < self.max_iterations:
@@ -165,15 +165,35 @@ class Viscosity:
             iterations += done
             for u, total, more in zip(velocity, self.change, self.multigrid.components(self._solver.x), strict=True):
                 inner.run(self._passes.add, u=u, total=total, more=more)
+            self._share(velocity)
             norm, lost, driven, _ = self._force(inner, given, changed=True)
             if not norm < 0.5 * before:  # what float32 can tell
                 break
         for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True)):
             covered = {"hold": self._fine.hold[axis], "h": self._slip[axis], "own": own, "kind": kind, "base": self.boundary.base}
             inner.run(self._passes.cover, total=total, u=u, axis=axis, **covered)
+        self._share(self.change)
         energy = self._density * self.grid.cell_volume
         residual = norm / first if first > 0.0 else 0.0
         return ViscousResult(iterations, residual, norm <= least, energy * (lost + driven), energy * driven)
+
+    def _multigrid(self) -> VectorMultigrid:
+        return VectorMultigrid(self.grid)
+
+    def _krylov(self) -> ConjugateGradient:
+        return ConjugateGradient(self._product, self.multigrid)
+
+    def _boxes(self, window: Window) -> tuple[Window, Window | None]:
+        """Return where something may differ from what the last step left, and which cells of these have unknowns; None: none has."""
+        box = replace(self._trail.through(window), near=None)
+        return box, box.common(self.grid.domain)
+
+    def _share(self, fields: Sequence[wp.array]) -> None:
+        """Take what other parts of the grid know of fields, if there are any."""
+
+    def _of_all(self, found: np.ndarray) -> np.ndarray:
+        """Return sums over all parts of the grid."""
+        return found
 
     @property
     def _walls_of_faces(self) -> dict[str, Sequence[wp.array]]:
@@ -191,7 +211,7 @@ class Viscosity:
         """
         if self._pull is None:
             self._pull = WallPull(self.grid, self.boundary, range(len(points)), len(points), self._passes)
-        self._pull.take(self.grid.domain, self._fine, self._walls_of_faces, {"kind": kind, "contact": contact}, points)
+        self._pull.take(self._inner, self._fine, self._walls_of_faces, {"kind": kind, "contact": contact}, points)
         pulled, drags = self._pull.pulled(velocity, points)
         if isinstance(self.boundary, CutBoundary) and self.boundary.moves:
             turn, shift = self.boundary.cut.turn.numpy(), self.boundary.cut.shift.numpy()
@@ -218,7 +238,7 @@ class Viscosity:
         for u, kept, more in zip(velocity, self.before, self.change, strict=True):
             self.grid.everywhere.run(self._passes.sum, u=u, kept=kept, more=more)
 
-    def _set_up(self, box: Window, inner: Window, kind: wp.array, contact: wp.array, tau: float) -> None:
+    def _set_up(self, box: Window, kind: wp.array, contact: wp.array, tau: float) -> None:
         """Find the equations of a step."""
         fine, boundary, passes, planes = self._fine, self.boundary, self._passes, self.grid.planes
         slip, distance, where = self._slip, self._distance, {"kind": kind, "contact": contact}
@@ -246,7 +266,6 @@ class Viscosity:
             given = {"diagonal": fine.diagonal[axis], "drag": fine.drag[axis], "held": fine.hold[axis], "volume": fine.volume[axis]}
             given |= {"d": distance[axis], "h": slip[axis], "cell": fine.cell, "axis": axis, "planes": planes}
             above.run(passes.diagonal, **given, **fine.across(axis), **where)
-        fine.find_spans(inner)
         self.multigrid.set_up(box)
 
     def _motion(self, axis: int) -> dict[str, Any]:
@@ -283,6 +302,7 @@ class Viscosity:
         if self._bodies is not None:
             self._bodies.answer(self.multigrid.r, self._change)
             found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
+        found = self._of_all(found)
         return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]
 
 

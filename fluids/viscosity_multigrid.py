@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.fluids.viscosity_passes import viscous_passes
+from warp_lcp.fluids.viscosity_passes import SHIFT, viscous_passes
 from warp_lcp.grid.staggered import CLEAR, StaggeredGrid, Window
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch, Program
@@ -39,7 +39,11 @@ class VectorLevel:
             holds it; the interpolation's normalization; and what that is to find.
         r: the residual, and what a sweep keeps.
         span: where a row's unknowns begin and end, and its core, a run of cells with the equations of those around them.
+        shift: from cell 2n - 1 to the first cell of the finer level that is in cell n of this one; not 0 in parts of grids.
     """
+
+    shift: dict[str, Any] = dict.fromkeys(SHIFT.split(), 0)
+    odd_row, odd_cell = 0, 0  # whether row and cell 0 have the colors of row and cell 1 of the whole grid
 
     def __init__(self, grid: StaggeredGrid, x: list[wp.array], b: list[wp.array]) -> None:
         self.grid, self.dimension, self.passes = grid, grid.dimension, viscous_passes(grid.dimension)
@@ -67,10 +71,31 @@ class VectorLevel:
         given = {"x": x[axis], "y": y, "z": z, "cell": self.cell, "mixed": self.mixed, "diagonal": self.diagonal[axis]}
         return given | self.across(axis) | {"axis": axis, "span": self.span}
 
+    @property
+    def equations(self) -> list[wp.array]:
+        """The fields that say what the equations are."""
+        fields = (self.edges.values(), self.volume, self.drag, self.hold, self.diagonal)
+        return [self.cell, self.mixed, *(field for each in fields for field in each)]
+
+    def around(self, width: int) -> Window:
+        """Return the cells in which something is to be found: those of this part of a grid and so many around it."""
+        return self.grid.domain
+
+    def share(self, fields: Sequence[wp.array], launch: Launch | None = None) -> None:
+        """Take what other parts of a grid know of fields, if there are any: of equations, or between the launches of a sweep."""
+
+    def halved(self, window: Window) -> Window:
+        """Return the cells of this level that take something from a window of the finer one."""
+        low = [n // 2 for n in window.low]
+        high = [min(n // 2 + 2, size) for n, size in zip(window.high, self.grid.shape, strict=True)]
+        if self.dimension == 2:
+            low[0], high[0] = 1, 2
+        return Window.of(low, high, self.grid.device)
+
     def find_spans(self, window: Window) -> None:
         """Find where the rows' unknowns lie."""
         dx, dy, dz = [*self.diagonal, None][:3]
-        window.run(self.passes.span, whole=True, dx=dx, dy=dy, dz=dz, span=self.span)
+        window.run(self.passes.span, whole=True, dx=dx, dy=dy, dz=dz, span=self.span, ends=None)
 
     def smooth(self, forth: bool, launch: Launch) -> None:
         """Relax all, and what lies before and behind the rows' cores, where errors last, before and after."""
@@ -80,24 +105,26 @@ class VectorLevel:
     def sweep(self, forth: bool, launch: Launch, *, band: bool = False) -> None:
         """Relax all components, the last one first if not forth; in a band at surfaces and walls alone if asked."""
         for axis in range(self.dimension) if forth else reversed(range(self.dimension)):
-            for color in (0, 1) if forth else (1, 0):
-                given = self._row(axis, self.x) | {"b": self.b[axis], "scratch": self.r[axis], "color": color}
-                given |= {"order": int(not forth), "band": int(band)}
+            for left, color in (1, 0), (0, 1):
+                given = self._row(axis, self.x) | {"b": self.b[axis], "scratch": self.r[axis], "band": int(band)}
+                given |= {"color": color ^ self.odd_row ^ int(not forth), "order": int(not forth) ^ self.odd_cell}
+                window = self.around(1 + left)
                 if self.grid.device.is_cuda:
-                    for parity in (0, 1) if forth else (1, 0):
-                        self.grid.domain.run(self.passes.sweep, launch=launch, only=parity, **given)
+                    for parity in (0, 1):
+                        window.run(self.passes.sweep, launch=launch, only=parity ^ given["order"], **given)
                 else:
-                    self.grid.domain.run(self.passes.sweep, whole=True, launch=launch, only=-1, **given)
+                    window.run(self.passes.sweep, whole=True, launch=launch, only=-1, **given)
+            self.share([self.x[axis]], launch)
 
     def residual(self, launch: Launch) -> None:
         """Find r = b - A x."""
         for axis in range(self.dimension):
-            self.grid.domain.run(self.passes.residual, launch=launch, right=self.b[axis], out=self.r[axis], **self._row(axis, self.x))
+            self.around(1).run(self.passes.residual, launch=launch, right=self.b[axis], out=self.r[axis], **self._row(axis, self.x))
 
     def product(self, x: list[wp.array], out: list[wp.array], launch: Launch) -> None:
         """Find A x."""
         for axis in range(self.dimension):
-            self.grid.domain.run(self.passes.product, launch=launch, right=None, out=out[axis], **self._row(axis, x))
+            self.around(0).run(self.passes.product, launch=launch, right=None, out=out[axis], **self._row(axis, x))
 
     def clear(self, launch: Launch) -> None:
         """Set x to 0."""
@@ -109,7 +136,7 @@ class VectorLevel:
         planes, axes = self.grid.planes, range(self.dimension)
 
         def mean(out: wp.array, of: wp.array, faces: int, scale: float) -> None:
-            window.run(self.passes.average, out=out, fine=of, planes=planes, faces=faces, scale=scale)
+            window.run(self.passes.average, out=out, fine=of, planes=planes, faces=faces, scale=scale, **self.shift)
 
         mean(self.cell, fine.cell, 0, 0.25)
         mean(self.mixed, fine.mixed, 0, MIXED * 0.25)
@@ -118,7 +145,8 @@ class VectorLevel:
         for axis in axes:
             mean(self.volume[axis], fine.volume[axis], 1 << axis, 1.0)
             mean(self.drag[axis], fine.drag[axis], 1 << axis, WALL)
-            window.run(self.passes.close, out=self.hold[axis], fine=fine.hold[axis], axis=axis, planes=planes)
+            window.run(self.passes.close, out=self.hold[axis], fine=fine.hold[axis], axis=axis, planes=planes, **self.shift)
+        self.share(self.equations)
         inner = window.common(self.grid.domain)
         if inner is None:
             return
@@ -126,25 +154,28 @@ class VectorLevel:
             given = {"h": self.hold[axis], "volume": self.volume[axis], "drag": self.drag[axis], "cell": self.cell}
             given["there"] = self.there[axis]
             window.run(self.passes.coarse_diagonal, diagonal=self.diagonal[axis], axis=axis, planes=planes, **given, **self.across(axis))
+        self.share([*self.diagonal, *self.there])
         self.find_spans(inner)
 
     def normalize(self, coarse: VectorLevel, window: Window) -> None:
         """Find the normalization of the interpolation from a coarser level."""
         for axis in range(self.dimension):
-            given = {"coarse": coarse.there[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "x": None}
+            given = {"coarse": coarse.there[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "x": None} | coarse.shift
             window.run(self.passes.normalize, norm=self.norm[axis], diagonal=self.diagonal[axis], **given)
 
     def restrict(self, coarse: VectorLevel, launch: Launch) -> None:
         """Make the residual the coarser level's right-hand side."""
         for axis in range(self.dimension):
-            given = {"fine": self.r[axis], "norm": self.norm[axis], "axis": axis, "planes": self.grid.planes, "span": coarse.span}
-            coarse.grid.domain.run(self.passes.restrict, launch=launch, out=coarse.b[axis], diagonal=coarse.diagonal[axis], **given)
+            given = {"fine": self.r[axis], "norm": self.norm[axis], "axis": axis, "planes": self.grid.planes} | coarse.shift
+            coarse.around(0).run(
+                self.passes.restrict, launch=launch, out=coarse.b[axis], diagonal=coarse.diagonal[axis], span=coarse.span, **given
+            )
 
     def prolong(self, coarse: VectorLevel, launch: Launch) -> None:
         """Add the coarser level's solution."""
         for axis in range(self.dimension):
-            given = {"coarse": coarse.x[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "diagonal": None}
-            self.grid.domain.run(self.passes.prolong, launch=launch, x=self.x[axis], norm=self.norm[axis], **given)
+            given = {"coarse": coarse.x[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "diagonal": None} | coarse.shift
+            self.around(3).run(self.passes.prolong, launch=launch, x=self.x[axis], norm=self.norm[axis], **given)
 
 
 class VectorMultigrid:
@@ -162,13 +193,18 @@ class VectorMultigrid:
     def __init__(self, grid: StaggeredGrid) -> None:
         self.grid, size = grid, grid.dimension * grid.size
         self.r, self.z = (zeros(size, wp.float32, grid.device, small_pages=grid.sparse) for _ in range(2))
-        self.levels = [VectorLevel(grid, self.components(self.z), self.components(self.r))]
+        self.levels: Sequence[VectorLevel] = self._levels()
+        self.program = Program(grid.device)
+        self._cycle(0, self.program.launch)
+
+    def _levels(self) -> Sequence[VectorLevel]:
+        grid = self.grid
+        levels = [VectorLevel(grid, self.components(self.z), self.components(self.r))]
         while max(grid.counts) > LEAST:
             nx, ny, nz = (-(-n // 2) for n in grid.counts)
             grid = StaggeredGrid((nx, ny, nz), 2.0 * grid.spacing, grid.dimension, grid.device)
-            self.levels.append(VectorLevel(grid, grid.faces(), grid.faces()))
-        self.program = Program(grid.device)
-        self._cycle(0, self.program.launch)
+            levels.append(VectorLevel(grid, grid.faces(), grid.faces()))
+        return levels
 
     def components(self, field: wp.array) -> list[wp.array]:
         """Return a flat field as one field a component."""
@@ -185,18 +221,17 @@ class VectorMultigrid:
 
     def set_up(self, window: Window) -> None:
         """Make the coarse levels from the finest, of which something may differ from what it was in a window."""
-        boxes = [window]
-        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
-            box = boxes[-1]
-            low = [n // 2 for n in box.low]
-            high = [min(n // 2 + 2, size) for n, size in zip(box.high, coarse.grid.shape, strict=True)]
-            if self.grid.dimension == 2:
-                low[0], high[0] = 1, 2
-            boxes.append(Window.of(low, high, self.grid.device))
-            coarse.average(fine, boxes[-1])
-            inner = box.common(fine.grid.domain)
+        fine, box = self.levels[0], window
+        inner = box.common(fine.grid.domain)
+        fine.share(fine.equations)
+        if inner is not None:
+            fine.find_spans(inner)
+        for coarse in self.levels[1:]:
+            box = coarse.halved(box)
+            coarse.average(fine, box)
             if inner is not None:
                 fine.normalize(coarse, inner)
+            fine, inner = coarse, box.common(coarse.grid.domain)
 
     def _cycle(self, number: int, launch: Launch) -> None:
         level = self.levels[number]

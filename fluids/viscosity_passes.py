@@ -21,6 +21,7 @@ ALIKE = 1.001  # viscosities at most as far apart are one
 CORE = 1e-3  # diagonals that differ by less of theirs are alike
 ALONG = 0.95  # of a cell that the distance changes by from face to face: the wall lies across the axis
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
+SHIFT = "shift_x shift_y shift_z"  # cells from one less than twice a coarse cell to the finer level's first one in it, in parts of grids
 LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE}
 
 
@@ -84,7 +85,7 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
         cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
         add=made("add", _fields("u total more"), ""),
         sum=made("sum", _fields("u kept more"), ""),
-        span=made("span", _fields("dx dy dz"), "", whole=row, optional=("dz",), constants={"ALIKE": CORE}),
+        span=made("span", _fields("dx dy dz"), "", whole=row | {"ends": wp.int32}, optional=("dz", "ends"), constants={"ALIKE": CORE}),
         sweep=made(
             "sweep", stencil | _fields("b scratch"), "axis color order only band", constants={"DEPTH": deep}, whole=row,
             optional=("z", "xc"),
@@ -93,10 +94,10 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
         residual=made(
             "apply", stencil | _fields("out right"), "axis", apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans
         ),
-        average=made("average", _fields("out"), "planes faces scale", whole={"fine": F32}),
-        close=made("close", _fields("out"), "axis planes", whole={"fine": F32}),
+        average=made("average", _fields("out"), f"planes faces scale {SHIFT}", whole={"fine": F32}),
+        close=made("close", _fields("out"), f"axis planes {SHIFT}", whole={"fine": F32}),
         coarse_diagonal=made("coarse_diagonal", _fields("diagonal there h volume drag cell xb xc"), "axis planes", optional=("xc",)),
-        normalize=made("prolong", _fields("norm diagonal x"), "axis planes", apart="_norm", constants={"NORM": True}, **carried),
-        prolong=made("prolong", _fields("norm diagonal x"), "axis planes", constants={"NORM": False}, **carried),
-        restrict=made("restrict", _fields("out diagonal"), "axis planes", whole=_fields("fine norm") | row),
+        normalize=made("prolong", _fields("norm diagonal x"), f"axis planes {SHIFT}", apart="_norm", constants={"NORM": True}, **carried),
+        prolong=made("prolong", _fields("norm diagonal x"), f"axis planes {SHIFT}", constants={"NORM": False}, **carried),
+        restrict=made("restrict", _fields("out diagonal"), f"axis planes {SHIFT}", whole=_fields("fine norm") | row),
     )  # fmt: skip

@@ -11,13 +11,15 @@ from warp_lcp.fluids.distributed.pressure import DistributedPressure
 from warp_lcp.fluids.distributed.probes import SharedProbes
 from warp_lcp.fluids.distributed.surface import SharedSurface
 from warp_lcp.fluids.distributed.tension import SharedSurfaceTension
-from warp_lcp.fluids.models import make_surface, make_tension, pressure_settings
+from warp_lcp.fluids.distributed.viscosity import SharedViscosity
+from warp_lcp.fluids.models import make_surface, make_tension, make_viscosity, pressure_settings
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation
 from warp_lcp.fluids.surface import FreeSurface
 from warp_lcp.fluids.surface_tension import SurfaceTension
+from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.particle_log import Row
 from warp_lcp.simulation import Part
@@ -48,6 +50,9 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
         """Return this rank's particles and cells, see the base class."""
         return self.in_box(super().frame())
 
+    def _viscosity(self) -> Viscosity | None:
+        return make_viscosity(self.scene, self.grid, self.boundary, self.surface, None, partial(SharedViscosity, self.part))
+
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""
         with self.with_ghosts():
@@ -57,6 +62,19 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
         """Advance by dt [s]; see the base class. What it raises is raised on all ranks."""
         with self.attempt(dt):
             return super().step(dt)
+
+    def bring_to_faces(self, window: Window) -> None:
+        """Bring the particles' velocities to the faces, and viscosities, which ghosts' own ghosts would have a share in."""
+        super().bring_to_faces(window)
+        if self.viscosity is not None and self.viscosity.relative:
+            self.part.fill(*self.viscosity.relative, *self.weights)
+
+    def _rub(self, viscosity: Viscosity, window: Window, dt: float, speed: float) -> Row:
+        """Change the velocity by what viscosity does to that after the pressure, by which nothing moves, however fast it is."""
+        self._dt = 0.0
+        row = super()._rub(viscosity, window, dt, speed)
+        self._dt = dt
+        return row
 
     def _meet_walls(self, window: Window, dt: float) -> Row:
         """Collect what the projection has done to solids in this rank's box, and let walls drag there."""

@@ -5,7 +5,7 @@ const auto part = [&](int axis, int n, int c, int size, float& weight) {
     if (axis == 2 && planes == 1) { weight = c == 0 ? 1.0f : 0.0f; return n; }
     const bool face = faces >> axis & 1;
     weight = face ? (c == 1 ? 0.5f : 0.25f) : (c < 2 ? 0.5f : 0.0f);
-    return clamped(face ? 2*n - 2 + c : 2*n - 1 + c, size);
+    return clamped(2*n - 1 - (int)face + c + shift[axis], size);
 };
 for (int i = first; i < last; ++i) {
     float sum = 0.0f, wz, wy, wx;

@@ -52,6 +52,9 @@ COLUMN = {"size": DEEP["size"], "resolution": 24, "sand": [box([0.0, 0.0, 0.0], 
 HEAP = {"size": FLAT["size"], "resolution": 32, "sand": [box([0.3, 0.0], [1.0, 0.4])]}
 POURED = box([0.6, 0.35, 0.1], [0.8, 0.45, 0.4], velocity=[0.3, -1.0, 0.2])
 TRICKLING = {"open": ["right"], "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.01)], "material": {"cohesion": 50.0}}
+SPOUT = box([0.5, 0.45, 0.1], [0.7, 0.5, 0.3], velocity=[0.0, -0.8, 0.0], viscosity=0.5)
+PLUNGER = box([0.4, 0.0, 0.1], [0.55, 0.3, 0.3], wall="sticky", motion={"kind": "translation", "velocity": [0.3, 0.2, 0.0]})
+THICK = {"viscosity": {"value": 20.0}, "wall": "sticky", "solid": [BALL]}
 SCENES = {
     "flat": FLAT,
     "flip": DEEP | {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}, "wall": "free-slip"},
@@ -67,6 +70,9 @@ SCENES = {
     "drops": DEEP | CAPILLARY | {"solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "crowded": DEEP | {"density_correction": {"every": 2}, "solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
     "reseeded": FLAT | {"particles": {"reseed": {"min": 4, "max": 4}}, "solid": [DISC], "solver": {"precision": "double"}},
+    "thick": DEEP | THICK,
+    "thick and thin": DEEP | THICK | {"source": [SPOUT], "solid": [PLUNGER], "output": {"forces": True}},
+    "thick letting go": FLAT | {"viscosity": {"value": 30.0, "slip_length": 0.02}, "liquid": [box([0.3, 0.1], [0.7, 0.5])]},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 
@@ -158,7 +164,7 @@ def wrap(ranks: Ranks, folder: Path) -> None:
                 np.savez(folder / f"{name}_{step}_{ranks.size}.npz", points=mesh.points, corners=mesh.corners, **found)
 
 
-RESUMED = ("cut", "river", "crowded", "sand", "stirred sand")
+RESUMED = ("cut", "river", "crowded", "thick and thin", "sand", "stirred sand")
 
 
 def keep(ranks: Ranks, folder: Path) -> None:

@@ -116,13 +116,8 @@ class Gathering:
     def __init__(self, decomposition: Decomposition) -> None:
         self.decomposition = decomposition
         whole = CellBox((0, 0, 0), decomposition.counts)
-        leaves, remotes = [], []
-        for rank, box in enumerate(decomposition.boxes):
-            leaves.append(_elements(box, whole.grown(1)))
-            remotes.append(_remote(rank, _elements(box, box.grown(1))))
-        roots = decomposition.box.grown(1).cells
-        self._forest = petsc().SF().create(comm=decomposition.ranks.comm)
-        self._forest.setGraph(roots, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
+        boxes = decomposition.boxes
+        self._forest = star_forest(decomposition.ranks, boxes, [box.grown(1) for box in boxes], whole=whole.grown(1))
         self._mine = decomposition.box.grown(1).moved((1, 1, 1)).slices
         nx, ny, nz = decomposition.box.counts
         self._shape, self._whole = (nz + 2, ny + 2, nx + 2), tuple(n + 2 for n in reversed(decomposition.counts))
@@ -159,8 +154,9 @@ def exchange_all(forest: Any, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) ->
 
 
 def star_forest(
-    ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox], *, filled: CellBox | None = None, layers: int = 1
-) -> Any:
+    ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox], *, filled: CellBox | None = None, layers: int = 1,
+    whole: CellBox | None = None,
+) -> Any:  # fmt: skip
     """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
 
     Args:
@@ -169,18 +165,20 @@ def star_forest(
         stored: the cells that each rank stores.
         filled: the ghost cells that are wanted lie in it; None: all.
         layers: of numbers of those cells, one behind the other.
+        whole: the cells of other fields, in which what each rank knows is wanted, this one too; None: leaves lie among the roots.
     """
-    around, mine = stored[ranks.rank], ranks.rank
+    mine, roots = ranks.rank, layers * stored[ranks.rank].cells
+    around = whole or stored[mine]
     wanted = around if filled is None else around.common(filled)
     leaves, remotes = [np.empty(0, dtype=np.int64)], [np.empty((0, 2), dtype=np.int32)]
     for rank, (box, remote) in enumerate(zip(owned, stored, strict=True)):
         shared = wanted.common(box)
-        if rank != mine and shared.cells:
+        if (whole or rank != mine) and shared.cells:
             for layer in range(layers):
                 leaves.append(_elements(shared, around) + layer * around.cells)
                 remotes.append(_remote(rank, _elements(shared, remote) + layer * remote.cells))
     forest = petsc().SF().create(comm=ranks.comm)
-    forest.setGraph(layers * around.cells, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
+    forest.setGraph(roots, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
     return forest
 
 

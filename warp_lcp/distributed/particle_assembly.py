@@ -13,7 +13,7 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.distributed.surface_mesh import surface_layers
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.particle_assembly import seed_materials, start_velocities
+from warp_lcp.material.particle_assembly import kept_by, seed_materials, start_velocities
 from warp_lcp.material.particle_scene import ParticleScene
 
 NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
@@ -82,7 +82,7 @@ def particles_of_part(scene: ParticleScene, part: Subdomain, boundary: Boundary,
     position, owner, notes = seed_materials(scene, part.grid, boundary, folder, elsewhere)
     _check_seeded(scene, part.ranks.sum(np.bincount(owner, minlength=len(scene.materials()[1]))))
     velocity = start_velocities(scene).astype(np.float32)[owner]
-    return SharedParticles(part, position, velocity, affine=scene.particles.transfer == "apic"), notes
+    return SharedParticles(part, position, velocity, affine=scene.particles.transfer == "apic", kept=kept_by(scene, owner)), notes
 
 
 def _check_seeded(scene: ParticleScene, counts: np.ndarray) -> None:

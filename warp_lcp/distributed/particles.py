@@ -88,6 +88,7 @@ class SharedParticles(Particles):
         position: [m], shape (n, 3), in this rank's box or within its ghost layers.
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
+        kept: of `Particles`.
         place: int64, shape (n,), in what order particles of one cell are; None: as they come.
         indexed: of `Particles`.
         post: carries messages; MPI's if None.
@@ -102,14 +103,14 @@ class SharedParticles(Particles):
     """
 
     def __init__(
-        self, part: Subdomain, position: np.ndarray, velocity: np.ndarray, *, affine: bool, place: np.ndarray | None = None,
-        indexed: bool | None = None, post: Post | None = None,
+        self, part: Subdomain, position: np.ndarray, velocity: np.ndarray, *, affine: bool, kept: np.ndarray | None = None,
+        place: np.ndarray | None = None, indexed: bool | None = None, post: Post | None = None,
     ) -> None:  # fmt: skip
         self.post = post or MpiPost(part.ranks.comm)
         self._take_part(part)
         self.place = np.arange(len(position), dtype=np.int64) if place is None else np.asarray(place, dtype=np.int64)
         self._own: np.ndarray | None = None  # which particles are this rank's; None: all
-        super().__init__(part.grid, position, velocity, affine=affine, indexed=indexed)
+        super().__init__(part.grid, position, velocity, affine=affine, kept=kept, indexed=indexed)
         self._record = np.dtype([("place", np.int64), ("values", np.float32, (len(self._names), 3))])
 
     def _take_part(self, part: Subdomain) -> None:

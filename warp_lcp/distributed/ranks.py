@@ -110,6 +110,10 @@ class Ranks:
         if self.size > 1:
             petsc().garbage_cleanup(self.comm)
 
+    def in_rows(self, count: int) -> Ranks:
+        """Return those of so many ranks one after another that this one is among, the first of them a multiple of the number."""
+        return _in_rows(self.comm.py2f(), count)
+
     @staticmethod
     def _shaped(found: np.ndarray, values: Any) -> Any:
         return found if np.ndim(values) else found.item()
@@ -128,6 +132,15 @@ def petsc() -> Any:
     except ImportError as error:
         raise ImportError(f"{HOW_TO_INSTALL} ({error})") from error
     return PETSc
+
+
+@cache
+def _in_rows(handle: int, count: int) -> Ranks:
+    """Return some ranks of a communicator; made once, as MPI has room for some thousand of them."""
+    from mpi4py import MPI
+
+    comm = MPI.Comm.f2py(handle)
+    return Ranks(comm.Split(comm.rank // count, comm.rank))
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,7 @@ class Subdomain:
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box = decomposition.ranks, decomposition.box
         self._forests: dict[tuple[int, int | None, int], Any] = {}
+        self._gathering: Any = None
         for axis in decomposition.cut_axes:
             least, most = min(decomposition.parts[axis]), max(decomposition.counts[axis] // layers, 1)
             if least < layers:
@@ -123,6 +125,22 @@ class Subdomain:
             if field.device.is_cuda:
                 field.assign(host)
 
+    def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:
+        """Write what the ranks know of fields of the part to fields of the whole grid, on every rank; collective."""
+        if self._gathering is None:
+            boxes, cells = self.decomposition.boxes, CellBox((0, 0, 0), self.decomposition.counts)
+            stored = [self._cells(box).grown(1) for box in boxes]
+            self._gathering = star_forest(self.ranks, [self._with_sides(box) for box in boxes], stored, whole=cells.grown(1))
+        hosts = [field.numpy() for field in whole]
+        exchange_all(self._gathering, [(field.numpy(), host) for field, host in zip(fields, hosts, strict=True)])
+        for field, host in zip(whole, hosts, strict=True):
+            if field.device.is_cuda:
+                field.assign(host)
+
+    def take(self, whole: wp.array, field: wp.array) -> None:
+        """Write what a field of the whole grid has on this part to a field of the part."""
+        wp.copy(field, whole[self._cells(self.box).grown(1).moved((1, 1, 1)).slices])
+
     def box_of(self, field: wp.array, ring: int = 0) -> Any:
         """Return the view of a field, host or device, or of layers of one, on the cells of the box and on so many cells around it."""
         low, high = self.owned.low, self.owned.high
@@ -130,10 +148,14 @@ class Subdomain:
         box = (slice(l - e, h + e) for l, h, e in zip(low, high, edge, strict=True))
         return field[(slice(None),) * (field.ndim - 3) + tuple(box)]
 
+    @property
+    def known(self) -> CellBox:
+        """The stored cells that this rank is the one to know: those of the box and the ring beyond the domain's sides."""
+        return self._with_sides(self.box).moved(self.grid.origin, -1).moved((1, 1, 1))
+
     def known_of(self, field: np.ndarray) -> np.ndarray:
-        """Return the view of a host's field on what this rank alone knows: the cells of the box and the ring beyond the domain's sides."""
-        box = self._with_sides(self.box).moved(self.grid.origin, -1).moved((1, 1, 1))
-        return field[box.slices]
+        """Return the view of a host's field on what this rank alone knows."""
+        return field[self.known.slices]
 
     def stored_box_of(self, field: wp.array) -> Any:
         """Return the view of a field on the cells of the box and one cell around it, in the stored shape of such a box."""

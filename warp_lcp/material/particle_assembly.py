@@ -206,9 +206,13 @@ def make_particles(
     """
     position, owner, notes = seed_materials(scene, grid, boundary, folder, without)
     velocity = start_velocities(scene).astype(np.float32)[owner]
+    return Particles(grid, position, velocity, affine=scene.particles.transfer == "apic", kept=kept_by(scene, owner)), notes
+
+
+def kept_by(scene: ParticleScene, owner: np.ndarray) -> np.ndarray | None:
+    """Return what particles of these materials take along, shape (n,); None: nothing."""
     kept = scene.kept(scene.materials()[1])
-    numbers = None if kept is None else np.array([*kept, 1.0], dtype=np.float32)[owner]
-    return Particles(grid, position, velocity, affine=scene.particles.transfer == "apic", kept=numbers), notes
+    return None if kept is None else np.array([*kept, 1.0], dtype=np.float32)[owner]
 
 
 def start_velocities(scene: ParticleScene) -> np.ndarray:

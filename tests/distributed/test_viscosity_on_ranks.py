@@ -1,0 +1,13 @@
+"""The viscous equations that ranks share are one process's, and so is the cycle that preconditions them."""
+
+from pathlib import Path
+
+import pytest
+
+PROGRAM = Path(__file__).with_name("viscosity_on_ranks.py")
+TESTS = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("ranks", [2, 4])
+def test_a_cycle_is_that_of_one_process(mpi, ranks):
+    assert mpi(ranks, PROGRAM, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}).returncode == 0
