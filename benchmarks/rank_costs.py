@@ -61,7 +61,7 @@ class Traffic:
 def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
     """Return how many ghost cells are filled."""
     if isinstance(owner, Subdomain):
-        return len(owner._forest(1, width, 1).getGraph()[2]) if owner.ranks.size > 1 else 0
+        return len(owner.forest(width=width).getGraph()[2]) if owner.ranks.size > 1 else 0
     return 0 if owner._forest is None else len(owner._forest.getGraph()[2])
 
 

@@ -1,8 +1,8 @@
 """The stress of sand that ranks share: one problem of all ranks a step, each of which has the cells of its box.
 
 What a step does to a cell looks at the velocities of faces and the rates of strain of edges around it, these at faces a cell farther, and
-those at the stresses of cells a cell farther still. So a step begins with the stresses of `REACH` layers of ghost cells, and then needs
-nobody: velocities and rates beside a cut are computed on both sides of it, from the same numbers in the same order. What momentum and
+those at the stresses of cells a cell farther still. So a step begins with the stresses of sand in `REACH` layers of ghost cells, and then
+needs nobody: velocities and rates beside a cut are computed on both sides of it, from the same numbers in the same order. What momentum and
 residual come from are sums of all ranks; the momentum changes by them once a period of steps alone, and so they are shared once a period.
 """
 
@@ -39,11 +39,25 @@ class SharedPacking(Packing):
 
     def __init__(self, part: Subdomain, base: wp.array, capacity: wp.array, **more: Any) -> None:
         self._part = part
+        self._forest: Any = None  # of this step's sand
         super().__init__(part.grid, base, capacity, counted=part.owned, **more)
 
+    def update(self, *arguments: Any) -> None:
+        """Take sand as it is now, see the base class."""
+        super().update(*arguments)
+        if self._forest is not None:
+            self._forest.destroy()
+            self._forest = None
+
     def join(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:
-        """Fill the ghost cells of a field of stresses; collective."""
-        perform(partial(self._part.fill, stress, width=REACH), launch)
+        """Fill the ghost cells of a field of stresses that hold sand; in others they are 0. Collective."""
+        perform(partial(self._fill, stress), launch)
+
+    def _fill(self, stress: wp.array) -> None:
+        part = self._part
+        if self._forest is None and part.ranks.size > 1:
+            self._forest = part.forest(stress.shape[0], REACH, which=self.flags.numpy() != 0)
+        part.fill(stress, forest=self._forest)
 
 
 class SharedStress(Stress):
@@ -61,6 +75,11 @@ class SharedStress(Stress):
         super().__init__(packing, walls, **more)
         self._total, self._nothing = wp.zeros_like(self._sums), wp.zeros_like(self._sums)
         self._found = np.zeros((PERIOD, 2 * COLUMNS))  # by the steps of a period on this rank
+
+    def begin(self, *arguments: Any) -> None:
+        """Start from the last stresses, see the base class, of which cells without sand lose theirs in ghost layers, too."""
+        super().begin(*arguments)
+        self._part.fill(self.now, width=REACH)
 
     def _count(self, flags: np.ndarray) -> int:
         return int(self._part.ranks.sum(super()._count(flags)))

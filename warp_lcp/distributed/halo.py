@@ -155,7 +155,7 @@ def exchange_all(forest: Any, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) ->
 
 def star_forest(
     ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox], *, filled: CellBox | None = None, layers: int = 1,
-    whole: CellBox | None = None,
+    whole: CellBox | None = None, which: np.ndarray | None = None,
 ) -> Any:  # fmt: skip
     """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
 
@@ -166,6 +166,7 @@ def star_forest(
         filled: the ghost cells that are wanted lie in it; None: all.
         layers: of numbers of those cells, one behind the other.
         whole: the cells of other fields, in which what each rank knows is wanted, this one too; None: leaves lie among the roots.
+        which: of the cells that this rank stores are wanted, bool of their shape (nz, ny, nx); None: all.
     """
     mine, roots = ranks.rank, layers * stored[ranks.rank].cells
     around = whole or stored[mine]
@@ -174,9 +175,13 @@ def star_forest(
     for rank, (box, remote) in enumerate(zip(owned, stored, strict=True)):
         shared = wanted.common(box)
         if (whole or rank != mine) and shared.cells:
+            here, there = _elements(shared, around), _elements(shared, remote)
+            if which is not None:
+                chosen = which.ravel()[here]
+                here, there = here[chosen], there[chosen]
             for layer in range(layers):
-                leaves.append(_elements(shared, around) + layer * around.cells)
-                remotes.append(_remote(rank, _elements(shared, remote) + layer * remote.cells))
+                leaves.append(here + layer * around.cells)
+                remotes.append(_remote(rank, there + layer * remote.cells))
     forest = petsc().SF().create(comm=ranks.comm)
     forest.setGraph(roots, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
     return forest

@@ -84,15 +84,20 @@ class Subdomain:
         """Return the cells of the part around a box, without its ring."""
         return box.grown(self.layers - 1).common(CellBox((0, 0, 0), self.decomposition.counts))
 
-    def _forest(self, layers: int, width: int | None, parts: int) -> Any:
-        """Return the star forest that fills ghost cells and the rings beside them; arguments as of `fill`."""
-        if (layers, width, parts) not in self._forests:
-            boxes = self.decomposition.boxes
-            owned = [self._with_sides(box, parts) for box in boxes]
-            filled = None if width is None else self._refined(self.box.grown(width), parts)
-            stored = [self._refined(self._cells(box), parts).grown(1) for box in boxes]
-            self._forests[layers, width, parts] = star_forest(self.ranks, owned, stored, filled=filled, layers=layers)
-        return self._forests[layers, width, parts]
+    def forest(self, layers: int = 1, width: int | None = None, parts: int = 1, which: np.ndarray | None = None) -> Any:
+        """Return the star forest of several ranks that fills ghost cells and the rings beside them; collective.
+
+        Args:
+            layers: of a field.
+            width: how far from the box; None: all.
+            parts: the fields are of `grid.refined(parts)`.
+            which: of a field's cells, bool; None: all.
+        """
+        boxes = self.decomposition.boxes
+        owned = [self._with_sides(box, parts) for box in boxes]
+        filled = None if width is None else self._refined(self.box.grown(width), parts)
+        stored = [self._refined(self._cells(box), parts).grown(1) for box in boxes]
+        return star_forest(self.ranks, owned, stored, filled=filled, layers=layers, which=which)
 
     def _refined(self, box: CellBox, parts: int) -> CellBox:
         """Return a box in cells that are cut into so many along each axis."""
@@ -108,18 +113,21 @@ class Subdomain:
             high[axis] += box.high[axis] == self.decomposition.counts[axis]
         return CellBox.of(low, high)
 
-    def fill(self, *fields: wp.array, width: int | None = None, parts: int = 1) -> None:
+    def fill(self, *fields: wp.array, width: int | None = None, parts: int = 1, forest: Any = None) -> None:
         """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
 
         Args:
             fields: any types, the last axes z, y, x.
             width: how far from the box; None: all.
             parts: the fields are of `grid.refined(parts)`.
+            forest: of `forest`, for such fields; None: one that is made once.
         """
         if self.ranks.size == 1:
             return
         hosts = [field.numpy() for field in fields]
-        forest = self._forest(1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts)
+        if forest is None:
+            kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
+            forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
         exchange_all(forest, [(host, host) for host in hosts])
         for field, host in zip(fields, hosts, strict=True):
             if field.device.is_cuda:
