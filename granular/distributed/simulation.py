@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.granular.distributed.stress import SharedPacking, SharedReport, SharedStress
@@ -17,7 +18,9 @@ from warp_lcp.grid.staggered import Window
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_pieces import Piece
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.simulation import Part
+from warp_lcp.simulation import Part, StepFailed
+
+STEP = 1 << 9  # cells full of sand whose work is that which a step takes however little there is of it
 
 
 class DistributedSand(SandSimulation, SharedParticleSimulation):
@@ -25,6 +28,11 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
 
     scene: SandScene
     particles: SharedParticles
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        """Allocate the fields and find the sand's cells."""
+        super().__init__(*arguments, **more)
+        self.balance = Balance(fixed=STEP)
 
     def _packing(self) -> SharedPacking:
         return SharedPacking(self.part, self._base, self.boundary.capacity, cut=self.solids.cut)
@@ -42,7 +50,11 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
     def step(self, dt: float) -> Row:
         """Advance by dt [s]; see the base class. What it raises is raised on all ranks."""
         with self.attempt(dt):
-            return super().step(dt)
+            try:
+                return super().step(dt)
+            except StepFailed:
+                self.stress.take_back()  # also where it is the velocity that ranks cannot follow
+                raise
 
     def frame(self) -> list[Part]:
         """Return this rank's particles and cells, see the base class."""

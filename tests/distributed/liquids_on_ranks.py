@@ -205,6 +205,13 @@ def fail(ranks: Ranks, folder: Path) -> None:
     after = simulation.piece_state()
     assert simulation.step_count == 0
     assert (np.sort(before["place"]) == np.sort(after["place"])).all()
+    sand = start(ranks, "sand", sand=[box([0.0, 0.1, 0.0], [0.5, 0.4, 0.5], velocity=[0.5, 0.0, 0.5])])
+    first = sand.step(1e-3)
+    before = sand.own_state()
+    with pytest.raises(StepFailed, match=r"would take sand .* cells far"):
+        sand.step(0.5)
+    assert (before["stress"] == sand.own_state()["stress"]).all()
+    assert sand.step(1e-3)["particles"] == first["particles"]
     simulation = start(ranks, "cut")
     with pytest.raises(StepFailed, match="cells far"):
         simulation.step(0.3)
