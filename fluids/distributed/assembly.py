@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from warp_lcp.distributed.narrow_band import SharedNarrowBand
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
 from warp_lcp.distributed.particle_assembly import refusals as refusals_of_all
 from warp_lcp.distributed.ranks import Ranks
@@ -14,7 +15,7 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed.simulation import DistributedLiquid
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.grid.sides import side_bits
-from warp_lcp.material.particle_assembly import Parts, make_outlets, make_sources, placed_solids
+from warp_lcp.material.particle_assembly import Parts, make_narrow_band, make_outlets, make_sources, placed_solids
 from warp_lcp.scene.scene import Scene
 
 METHODS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks
@@ -44,10 +45,11 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
             part, solids, cut_cells=domain.solids == "cut-cell", wall_separating=domain.wall == "separating",
             open_sides=side_bits(domain.open), sources=bool(scene.source),
         )  # fmt: skip
-        return Parts(boundary, make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part)))
+        sources = make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part))
+        return Parts(boundary, sources, make_narrow_band(scene, part.grid, boundary, folder, partial(SharedNarrowBand, part)))
 
     parts = make_parts(part)
-    particles, notes = particles_of_part(scene, part, parts.boundary, folder)
+    particles, notes = particles_of_part(scene, part, parts, folder)
     return DistributedLiquid(
         scene, part.grid, parts, particles, make_parts=make_parts, solids=solids, outlets=make_outlets(scene, part.grid, folder),
         notes=[*warnings, *notes],
@@ -56,5 +58,5 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
 
 def refusals(scene: LiquidScene) -> list[str]:
     """Return the keys of a scene that ask for what runs on ranks have not."""
-    asked = {"particles.narrow_band": scene.particles.narrow_band, 'pressure.model = "unilateral"': scene.pressure.model == "unilateral"}
+    asked = {'pressure.model = "unilateral"': scene.pressure.model == "unilateral"}
     return [*refusals_of_all(scene), *(key for key, wanted in asked.items() if wanted)]

@@ -50,7 +50,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
         return Parts(boundary, make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part)), solids=solids)
 
     parts = make_parts(part)
-    particles, notes = particles_of_part(scene, part, parts.boundary, folder)
+    particles, notes = particles_of_part(scene, part, parts, folder)
     outlets = make_outlets(scene, part.grid, folder)
     return DistributedSand(
         scene, part.grid, parts, particles, make_parts=make_parts, outlets=outlets, notes=[*warnings, *notes]

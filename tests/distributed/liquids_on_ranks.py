@@ -29,6 +29,7 @@ BALL = {"shape": "sphere", "radius": 0.12, "center": [0.5, 0.2, 0.25]}
 DISC = {"shape": "sphere", "radius": 0.1, "center": [0.5, 0.1]}
 FLAT = {"size": [1.0, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0], [0.5, 0.45])]}
 DEEP = {"size": [1.0, 0.5, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0, 0.0], [0.5, 0.45, 0.5])]}
+POOL = {"size": [1.0, 0.5], "resolution": 40, "liquid": [box([0.0, 0.0], [0.7, 0.45])]}
 DROP = box([0.6, 0.3, 0.1], [0.8, 0.45, 0.3], velocity=[-1.0, 0.5, 0.7])
 BLADE = box([0.2, 0.1, 0.2], [0.7, 0.25, 0.26], motion={"kind": "rotation", "rate": 300.0, "axis": [0, 1, 0], "center": [0.45, 0, 0.23]})
 OPEN = {"size": FLAT["size"], "resolution": 32, "wall": "separating", "open": ["right"]}
@@ -73,6 +74,7 @@ SCENES = {
     "thick": DEEP | THICK,
     "thick and thin": DEEP | THICK | {"source": [SPOUT], "solid": [PLUNGER], "output": {"forces": True}},
     "thick letting go": FLAT | {"viscosity": {"value": 30.0, "slip_length": 0.02}, "liquid": [box([0.3, 0.1], [0.7, 0.5])]},
+    "banded": POOL | {"particles": {"narrow_band": {"width": 3.0}, "reseed": {}, "transfer": "flip"}, "solver": {"precision": "double"}},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 
@@ -164,7 +166,7 @@ def wrap(ranks: Ranks, folder: Path) -> None:
                 np.savez(folder / f"{name}_{step}_{ranks.size}.npz", points=mesh.points, corners=mesh.corners, **found)
 
 
-RESUMED = ("cut", "river", "crowded", "thick and thin", "sand", "stirred sand")
+RESUMED = ("cut", "river", "crowded", "thick and thin", "banded", "sand", "stirred sand")
 
 
 def keep(ranks: Ranks, folder: Path) -> None:

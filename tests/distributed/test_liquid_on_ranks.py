@@ -65,9 +65,10 @@ def alone(model_, **options):
     return simulators()[model_.scene.simulator].create_distributed(model_, Ranks(Seat(0, 1)), device="cpu", folder=Path(), **options)
 
 
-@pytest.mark.parametrize(
-    "name", ["flat", "cut", "voxel", "turning", "river", "whole-cell river", "drops", "crowded", "reseeded", "thick and thin", *SANDS]
-)
+ONE_RANK = ("flat", "cut", "voxel", "turning", "river", "whole-cell river", "drops", "crowded", "reseeded", "thick and thin", "banded")
+
+
+@pytest.mark.parametrize("name", [*ONE_RANK, *SANDS])
 def test_one_rank_is_one_process_bit_for_bit(name):
     one, shared = single(model(name)), alone(model(name))
     assert advance(shared, 6) == advance(one, 6)
@@ -230,7 +231,6 @@ def test_pieces_of_something_else_are_refused(change, message):
 @pytest.mark.parametrize(
     ("tables", "key"),
     [
-        (FLAT | {"particles": {"narrow_band": {}}}, "particles.narrow_band"),
         (FLAT | {"pressure": {"model": "unilateral"}}, 'pressure.model = "unilateral"'),
         (FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], mass=10.0)]}, r"solid\[0\].mass"),
         (COLUMN | {"periodic": [False, False, True]}, "domain.periodic"),

@@ -12,8 +12,7 @@ from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.distributed.surface_mesh import surface_layers
-from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.particle_assembly import kept_by, seed_materials, start_velocities
+from warp_lcp.material.particle_assembly import Parts, kept_by, seed_materials, start_band, start_velocities
 from warp_lcp.material.particle_scene import ParticleScene
 
 NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
@@ -71,15 +70,20 @@ def part_of(scene: ParticleScene, ranks: Ranks, device: str, *, smoothing: int =
     return Subdomain(decomposition, spacing=scene.spacing, dimension=scene.dimension, device=device, layers=layers)
 
 
-def particles_of_part(scene: ParticleScene, part: Subdomain, boundary: Boundary, folder: Path) -> tuple[SharedParticles, list[str]]:
+def particles_of_part(scene: ParticleScene, part: Subdomain, parts: Parts, folder: Path) -> tuple[SharedParticles, list[str]]:
     """Return this rank's particles at the start, and warnings; the host's arrays are gone before the fields are made. Collective.
+
+    The narrow band of `parts` gets what particles need not carry.
 
     Raises:
         ValueError: a material has no particle on any rank; on all ranks.
     """
     elsewhere = np.ones(part.grid.counts[::-1], dtype=bool)
     elsewhere[tuple(slice(low - 1, high - 1) for low, high in zip(part.owned.low, part.owned.high, strict=True))] = False
-    position, owner, notes = seed_materials(scene, part.grid, boundary, folder, elsewhere)
+    without = start_band(scene, part.grid, parts.boundary, folder, parts.band)
+    if without is not None:
+        elsewhere |= without
+    position, owner, notes = seed_materials(scene, part.grid, parts.boundary, folder, elsewhere)
     _check_seeded(scene, part.ranks.sum(np.bincount(owner, minlength=len(scene.materials()[1]))))
     velocity = start_velocities(scene).astype(np.float32)[owner]
     return SharedParticles(part, position, velocity, affine=scene.particles.transfer == "apic", kept=kept_by(scene, owner)), notes

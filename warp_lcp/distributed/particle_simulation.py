@@ -78,7 +78,12 @@ class SharedParticleSimulation(ParticleSimulation):
         self.part, self.balance, self._make_parts = particles.part, Balance(), make_parts
         self._dt = 0.0
         super().__init__(scene, grid, parts, particles, **more)
-        self._everyone = int(self.part.ranks.sum(particles.count))
+        self._everyone = int(self.part.ranks.sum(particles.count)) + self._in_band
+
+    @property
+    def _in_band(self) -> int:
+        """How many particles the material without any stands for."""
+        return self.band.held if self.band is not None else 0
 
     def _rearrangement(self) -> Rearrangement:
         crowding, correction = partial(SharedCrowding, self.part), partial(SharedDensityCorrection, self.part)
@@ -232,7 +237,7 @@ class SharedParticleSimulation(ParticleSimulation):
         return next((text for text in told if text), "")
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
-        return super()._totals_row(totals, dt) | {"particles": totals.count}
+        return super()._totals_row(totals, dt) | {"particles": totals.count - self._in_band}
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
@@ -240,7 +245,7 @@ class SharedParticleSimulation(ParticleSimulation):
         most = max(boxes, key=lambda box: box.cells).counts
         cells, largest = (" x ".join(map(str, counts[: self.grid.dimension])) for counts in (whole, most))
         return [
-            f"{self._everyone} particles, {cells} cells of {self.grid.spacing:.4g} m",
+            f"{self._everyone - self._in_band} particles, {cells} cells of {self.grid.spacing:.4g} m",
             f"{len(boxes)} ranks, boxes of up to {largest} cells and {self.part.layers} layers of ghost cells",
             *self._notes,
         ]
@@ -250,16 +255,20 @@ class SharedParticleSimulation(ParticleSimulation):
 
         Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's;
         `time`, `step_count`, `last_dt`, `signature` as of `state`; particles: `position`, `velocity`, `affine_0` ... float32 (n, 3) and
-        `place` int64 (n,), their order; of the box, shape (..., nz, ny, nx): `cells` int8 and the other fields of `own_state`, and once
-        particles were moved apart `density_correction` float64; the numbers of `own_state`, the same on all ranks.
+        `place` int64 (n,), their order; of the box, shape (..., nz, ny, nx): `cells` int8, the other fields of `own_state` and those of a
+        narrow band, and once particles were moved apart `density_correction` float64; the numbers of `own_state` and of a band, the same on
+        all ranks.
         """
-        box, own = self.part.box, self.own_state()
+        box, own = self.part.box, self._own_fields()
         fields = {name: np.ascontiguousarray(self.part.box_of(field)) for name, field in self._cell_fields(own).items()}
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
         where = {"box": np.array([box.low, box.high]), "counts": np.array(self.part.decomposition.counts)}
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
         numbers = own | {"signature": signature(self.scene, self.part.grid)}
         return where | clock | numbers | particles | {"place": self.particles.place.copy()} | fields
+
+    def _own_fields(self) -> dict[str, np.ndarray]:
+        return self.own_state() | (self.band.state() if self.band is not None else {})
 
     def _cell_fields(self, own: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         return fields_of(own) | self.rearrangement.state()
@@ -284,10 +293,10 @@ class SharedParticleSimulation(ParticleSimulation):
             self._rebalance()
 
     def _take_pieces(self, pieces: Sequence[Piece]) -> None:
-        own, names = self.own_state(), list(self.particles.arrays())
+        own, names = self._own_fields(), list(self.particles.arrays())
         base = None if self.boundary.moves else self.boundary.base
         particles, cells, numbers = take_pieces(self.part, names, own, signature(self.scene, self.part.grid), pieces, base)
-        everyone = int(self.part.ranks.sum(len(particles["place"])))
+        everyone = int(self.part.ranks.sum(len(particles["place"]))) + (int(numbers["interior"][0]) if self.band is not None else 0)
         if everyone != self._everyone and not (self.sources or self.outlets):
             raise ValueError(f"the pieces have {everyone} particles: this scene has {self._everyone}")
         self._everyone = everyone
@@ -298,7 +307,10 @@ class SharedParticleSimulation(ParticleSimulation):
         for name, values in cells.items():
             self.part.box_of(fields[name])[...] = values
         self.rearrangement.restore(fields)
-        self.restore_own(own | {name: numbers[name] for name in own.keys() & numbers.keys()})
+        found = own | {name: numbers[name] for name in own.keys() & numbers.keys()}
+        self.restore_own({name: found[name] for name in self.own_state()})
+        if self.band is not None:
+            self.band.restore(found)
         self.time, self.step_count, self.last_dt = float(numbers["time"]), int(numbers["step_count"]), float(numbers["last_dt"])
         self.boundary.place(self.time)
 

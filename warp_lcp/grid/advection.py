@@ -92,6 +92,7 @@ def distance_pass(endless: int) -> RowPass:
 def carry_pass(axis: int) -> RowPass:
     """Return the pass of `carry_field` for the faces of an axis or `CENTERS`."""
     name, numbers = f"warp_lcp.grid.semi_lagrangian_{axis}.carry", {"planes": int, "h": wp.float32, "least": wp.float32}
+    numbers |= dict.fromkeys(("before_x", "before_y", "before_z"), int)
     constants = {"AXIS": axis, "CENTERS": CENTERS, "ENDLESS": 0}
     return cell_pass(name, "u v w level field out", numbers=numbers, constants=constants, optional=("w",))
 
@@ -194,7 +195,7 @@ def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved:
 
 def carry_field(
     grid: StaggeredGrid, window: Window, velocity: list[wp.array], dt: float, field: wp.array, out: wp.array, *, axis: int, level: wp.array,
-    least: float,
+    least: float, before: tuple[int, int, int] = (0, 0, 0),
 ) -> None:  # fmt: skip
     """Find what a field will be after a time step.
 
@@ -208,8 +209,10 @@ def carry_field(
         axis: whose faces the field lies on, or `CENTERS`.
         level: float32 of cells; a face has the mean of its two.
         least: see `out`.
+        before: cells (x, y, z) of a larger grid before this one, whose places are rounded as there.
     """
     u, v, w = [*velocity, None][:3]
     inner = Window.of([max(start, 1) for start in window.low], window.high, window.device)
     given = {"u": u, "v": v, "w": w, "level": level, "field": field, "out": out}
+    given |= dict(zip(("before_x", "before_y", "before_z"), before, strict=True))
     inner.run(carry_pass(axis), planes=grid.planes, h=dt / grid.spacing, least=least, **given)

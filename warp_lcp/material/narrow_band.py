@@ -95,7 +95,7 @@ class NarrowBand:
         self.held = self.fresh = 0
         self._numbered = kernels.Numbered()
         self._numbered.origin, self._numbered.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
-        self._window = grid.everywhere
+        self._window, self._own, self._before = grid.everywhere, grid.domain, (0, 0, 0)
         self.interior = self._summed(grid.everywhere)
 
     @property
@@ -126,12 +126,14 @@ class NarrowBand:
         self._measure(grid.everywhere, kind, None, grid.field(wp.uint8))
         wp.copy(self.depth, self._now)
         deep = (self.depth.numpy() > self.width) & (padded >= 0)
-        self.held = int(deep.sum()) * self.particles_a_cell
+        own = tuple(map(slice, self._own.low, self._own.high))
+        self.held = self._of_all(int(deep[own].sum())) * self.particles_a_cell
         for axis, field in enumerate(self.velocity):
             speed = np.where(padded >= 0, velocities[padded, axis], np.nan)
             both = np.stack([speed, np.roll(speed, 1, axis=2 - axis)])
             known = np.isfinite(both)
             field.assign((np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)).astype(np.float32))
+        self._join(*self.velocity)
         self.interior = self._summed(grid.everywhere)
         return np.asarray(grid.interior(deep))
 
@@ -186,12 +188,13 @@ class NarrowBand:
         self._window = window
         grid, each = self.grid, self.particles_a_cell * self.density
         self._measure(window, kind, phi, contact)
-        depths = [self._now, self.depth]
+        depths, removed = [self._now, self.depth], 0
         if particles.count:
             marks = particles.marks
             flat = [depth.flatten() for depth in depths]
             wp.launch(kernels.leave_kernel, particles.count, [self.width, particles.key, *flat, marks], device=grid.device)
-            self.held += particles.remove(marks)
+            removed = particles.remove(marks)
+        self.held += self._of_all(removed)
         self._total.zero_()
         shift = (self._steps * step) % 1.0
         quota = [
@@ -204,12 +207,14 @@ class NarrowBand:
             *depths,
             self._total.reshape(grid.shape),
         ]
-        window.launch(kernels.quota_kernel, quota)
+        own = window.common(self._own)
+        if own is not None:
+            own.launch(kernels.quota_kernel, quota)
         wp.utils.array_scan(self._total, self._total, inclusive=True)
         self.fresh = int(self._total[-1:].numpy()[0])
-        if self.fresh:
-            self._seed(particles, window, shift, saved)
-            self.held -= self.fresh
+        if own is not None and self.fresh:
+            self._seed(particles, own, shift, saved)
+        self.held -= self._of_all(self.fresh)
 
     def carry(self, velocity: list[wp.array], dt: float) -> None:
         """Carry depth and velocity along for a time step, in the window of the last exchange.
@@ -220,11 +225,12 @@ class NarrowBand:
         """
         window = self._window
         self.depth.zero_()
-        more = {"level": self._now, "least": 0.0}
+        more = {"level": self._now, "least": 0.0, "before": self._before}
         carry_field(self.grid, window, velocity, dt, self._now, self.depth, axis=CENTERS, **more)
         for axis, (field, out) in enumerate(zip(velocity, self.velocity, strict=True)):
             out.zero_()
             carry_field(self.grid, window, velocity, dt, field, out, axis=axis, **more)
+        self._join(self.depth, *self.velocity)
         self.interior = self._summed(window)
 
     def with_interior(self, totals: ParticleTotals) -> ParticleTotals:
@@ -289,6 +295,11 @@ class NarrowBand:
         planes, most = self.grid.planes, self.width + BEYOND
         inputs = [planes, most, kind, phi, contact, self._keep, self.boundary.distance, self._now]
         self.grid.everywhere.launch(kernels.shore_kernel, inputs)
+        self._relax(window)
+
+    def _relax(self, window: Window) -> None:
+        """Let the depth of a window's cells fall to what their neighbors allow."""
+        planes, most = self.grid.planes, self.width + BEYOND
         last = window.high[0] - 1, window.high[1] - 1
         for number in range(math.ceil(most) + 1):
             if self.grid.device.is_cpu:
@@ -297,6 +308,13 @@ class NarrowBand:
             window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=planes, last_plane=plane, last_row=row)
             if self.grid.device.is_cpu and self._changed.numpy()[0] == 0:  # rows one after the other are done in three passes or so
                 break
+
+    def _of_all(self, count: int) -> int:
+        """Return how many there are of what this grid has so many of."""
+        return count
+
+    def _join(self, *fields: wp.array) -> None:
+        """Give fields what others who have parts of the grid know of them."""
 
     def _seed(self, particles: Particles, window: Window, shift: np.ndarray, saved: Sequence[wp.array]) -> None:
         """Put fresh particles behind the others."""
@@ -313,8 +331,9 @@ class NarrowBand:
         """Add up the cells without particles."""
         u, v, w = [*self.velocity, None][:3]
         inputs = [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums]
-        box = window.common(self.grid.domain)
-        assert box is not None, "windows reach into the domain"
+        box = window.common(self._own)
+        if box is None:
+            return ParticleTotals()
         box.launch_rows(kernels.sum_kernel, inputs)
         rows = box.rows_of(self._sums).reshape(-1, kernels.COLUMNS)
         cells, dx = int(rows[:, 0].sum()), self.grid.spacing

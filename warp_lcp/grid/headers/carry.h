@@ -1,12 +1,13 @@
 // A row's places with a mean level above `least`, which are few or all: their list, their way back, and the value there.
 typedef T Block[3][M];
-const int nx = given.u.shape[2] - 2, ny = given.u.shape[1] - 2, nz = given.u.shape[0] - 2;
-const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0, back = 0;
-const T lx = 1, ly = 1, lz = 1;
+// Places are those of a larger grid, so that they are rounded alike in all parts of it.
+const int nx = before_x + given.u.shape[2] - 2, ny = before_y + given.u.shape[1] - 2, nz = before_z + given.u.shape[0] - 2;
+const long long s2 = given.u.shape[2], s1 = s2*given.u.shape[1], up = planes == 2 ? s1 : 0, back = before_z*s1 + before_y*s2 + before_x;
+const T lx = before_x + 1, ly = before_y + 1, lz = before_z + 1;
 const long long below = AXIS == 0 ? 1 : AXIS == 1 ? s2 : AXIS == 2 ? s1 : 0;
 const T hx = AXIS == 0 ? (T)0 : (T)0.5, hy = AXIS == 1 ? (T)0 : (T)0.5, hz = AXIS == 2 ? (T)0 : (T)0.5;
 const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
-const T* g = given.field.data;
+const T* g = given.field.data - back;
 Block from, to, k1, k2, k3;
 int list[M];
 #include "sample.h"
@@ -18,7 +19,7 @@ for (int start = first; start < last; start += M) {
         n += (int)((T)0.5*(level[i] + level[i - below]) > least);
     }
     if (n == 0) continue;
-    for (int m = 0; m < n; ++m) { from[0][m] = (T)list[m] + hx; from[1][m] = (T)j + hy; from[2][m] = planes == 2 ? (T)k + hz : (T)1; }
+    for (int m = 0; m < n; ++m) { from[0][m] = (T)(before_x + list[m]) + hx; from[1][m] = (T)(before_y + j) + hy; from[2][m] = planes == 2 ? (T)(before_z + k) + hz : (T)1; }
     auto go = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C) {
         for (int d = 0; d <= planes; ++d) {
             SIMD for (int m = 0; m < n; ++m) to[d][m] = from[d][m] - (a*A[d][m] + b*B[d][m] + c*C[d][m]);
@@ -33,7 +34,7 @@ for (int start = first; start < last; start += M) {
     go((T)2/9*h, k1, (T)3/9*h, k2, (T)4/9*h, k3);
     for (int m = 0; m < n; ++m) {
         T x = to[0][m], y = to[1][m], z = to[2][m];
-        x = x > 1 ? x : (T)1; y = y > 1 ? y : (T)1; z = z > 1 ? z : (T)1;
+        x = x > lx ? x : lx; y = y > ly ? y : ly; z = z > lz ? z : lz;
         x = (x < ex ? x : ex) - hx; y = (y < ey ? y : ey) - hy; z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
         int a = (int)x, b = (int)y, c = (int)z;
         a = a < nx ? a : nx; b = b < ny ? b : ny; c = planes == 2 && c > nz ? nz : c;
@@ -57,12 +58,12 @@ if (planes == 2) weigh(fz, wz);
 const int near = planes == 2 ? 0 : 1, far = planes == 2 ? 4 : 2;
 auto row_of = [&](int C, int B) {
     int w = c + C - 1, v = b + B - 1;
-    w = w > 0 ? w : 0; w = w < nz + 1 ? w : nz + 1; v = v > 0 ? v : 0; v = v < ny + 1 ? v : ny + 1;
+    w = w > before_z ? w : before_z; w = w < nz + 1 ? w : nz + 1; v = v > before_y ? v : before_y; v = v < ny + 1 ? v : ny + 1;
     return g + (w*s1 + v*s2 + a);
 };
 T total = 0, low = g[c*s1 + b*s2 + a], high = low;
 #ifndef __CUDA_ARCH__
-if (a > 0 && a < nx) {
+if (a > before_x && a < nx) {
     typedef T Four __attribute__((vector_size(4*sizeof(T))));
     Four sum = {0, 0, 0, 0}, lows = {low, low, low, low}, highs = lows;
     for (int C = near; C < far; ++C) for (int B = 0; B < 4; ++B) {
@@ -80,7 +81,7 @@ if (a > 0 && a < nx) {
     continue;
 }
 #endif
-const long long l = a > 0 ? -1 : 0, r = a < nx ? 2 : 1;
+const long long l = a > before_x ? -1 : 0, r = a < nx ? 2 : 1;
 for (int C = near; C < far; ++C) for (int B = 0; B < 4; ++B) {
     const T* p = row_of(C, B);
     total += wz[C]*wy[B]*(wx[0]*p[l] + wx[1]*p[0] + wx[2]*p[1] + wx[3]*p[r]);
