@@ -61,7 +61,7 @@ class DistributedPressure(PressureProjection):
     def not_finite(self) -> np.ndarray:
         """Return the cells (x, y, z), counted from 0 in the whole domain, whose right-hand side is not finite, shape (n, 3)."""
         mine = np.argwhere(~np.isfinite(self.part.box_of(self._b.numpy())))[:, ::-1] + np.array(self.part.box.low)
-        return np.concatenate(self.part.ranks.comm.allgather(mine))
+        return np.concatenate(self.part.ranks.collect(mine))
 
     def _make_problem(self) -> None:
         self._copy_to_box()

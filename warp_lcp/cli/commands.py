@@ -16,6 +16,7 @@ from warp_lcp.cli.shown import export, looked_on, render, serve, view
 from warp_lcp.cli.solve_file import Outcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks
+from warp_lcp.distributed.watchdog import LIMIT
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.render.viewer import check_window
 from warp_lcp.rows.team import get_threads, set_threads
@@ -52,6 +53,12 @@ SceneArgument = Annotated[
 ]
 EngineOption = Annotated[
     Engine, typer.Option(help="single: this process; petsc: the ranks that `mpiexec -n N warp-lcp ...` starts (needs petsc4py and mpi4py).")
+]
+RankTimeout = Annotated[
+    float,
+    typer.Option(
+        min=0.0, metavar="S", help="End all ranks, and say which one was late, if one keeps the others waiting for S seconds; 0: wait."
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -110,12 +117,13 @@ def run(
     page: Annotated[bool, typer.Option("--serve", help="Show the run on a page in the browser while it lasts, as `serve` does.")] = False,
     window: Annotated[bool, typer.Option("--view", help="Show the run in a window, as `view` does.")] = False,
     engine: EngineOption = Engine.SINGLE,
+    rank_timeout: RankTimeout = LIMIT,
     threads: ThreadsOption = None,
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene into a folder that ParaView opens."""
     given = {"--out": out, "--device": device, "--frames": frames, "--resume": resume, "--force": force, "--force-memory": force_memory}
-    with wrong_input(), launcher_of(engine) as launcher:
+    with wrong_input(), launcher_of(engine, rank_timeout=rank_timeout) as launcher:
         _use_threads(threads)
         if resume and force:
             raise OutputError("--resume continues a run and --force deletes it: choose one")
@@ -251,12 +259,13 @@ def solve(
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where x goes: x.mtx, or x.npy of a grid.", show_default=False)] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda:N, or with --engine petsc cuda.")] = "cpu",
     engine: EngineOption = Engine.SINGLE,
+    rank_timeout: RankTimeout = LIMIT,
 ) -> None:
     """Solve a complementarity problem, y = A x + b, lower <= x <= upper: of a matrix and a vector, or one that a run has recorded."""
     options: dict[str, Any] = {
         "method": method, "tolerance": tolerance, "max_iterations": max_iterations, "max_seconds": max_seconds
     }  # fmt: skip
-    with wrong_input(), launcher_of(engine) as launcher:
+    with wrong_input(), launcher_of(engine, rank_timeout=rank_timeout) as launcher:
         launcher.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
         chosen = launcher.choose_device(device)
         if out is not None and not out.parent.is_dir():

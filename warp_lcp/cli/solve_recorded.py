@@ -159,9 +159,12 @@ def _bound(values: np.ndarray) -> float | np.ndarray:
 
 def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decomposition: Decomposition) -> None:
     """Write the ranks' boxes of x into one array, of which the root rank holds one box at a time."""
+    from warp_lcp.distributed.waiting import waiting
+
     comm, boxes = decomposition.ranks.comm, decomposition.boxes
     if not decomposition.ranks.is_root:
-        comm.Send(np.ascontiguousarray(x, dtype=np.float64), dest=0)
+        with waiting("the root rank, which writes"):
+            comm.Send(np.ascontiguousarray(x, dtype=np.float64), dest=0)
         return
     with replacing(path) as temporary:
         whole = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float64, shape=shape)
@@ -169,7 +172,8 @@ def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decompositio
             part = box.slices[-len(shape) :]
             mine = x if rank == 0 else np.empty([s.stop - s.start for s in part])
             if rank:
-                comm.Recv(mine, source=rank)
+                with waiting(f"the box of rank {rank}"):
+                    comm.Recv(mine, source=rank)
             whole[part] = mine
         whole.flush()
         del whole

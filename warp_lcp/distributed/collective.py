@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
+import math
 import socket
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -13,9 +13,10 @@ from types import SimpleNamespace
 from typing import Any
 
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.waiting import finish, waiting
+from warp_lcp.distributed.watchdog import Watchdog
 
-PATIENCE = 10.0  # seconds that a rank waits for the others after a failure: they may be inside MPI, from where nothing brings them back
-PAUSE = 0.005  # seconds between two looks
+PATIENCE = 5.0  # seconds that a rank waits for the others after a failure: they may be inside MPI, from where nothing brings them back
 SHOWN = 3  # failures in one message
 
 
@@ -56,6 +57,7 @@ class Collective:
 
     Attributes:
         failed: the ranks on which the last block failed.
+        watchdog: that sees to it that no rank waits for ever, where there is one.
 
     >>> alone = Collective.of_one()
     >>> with alone.together():
@@ -71,15 +73,16 @@ class Collective:
         self.ranks = ranks
         self.last_words = last_words
         self._planned = planned
-        self._comm: Any = ranks.comm.Dup() if ranks.size > 1 else ranks.comm
+        self._own = Ranks(ranks.comm.Dup()) if ranks.size > 1 else ranks
         self.failed: list[int] = []
+        self.watchdog: Watchdog | None = None
         self._depth = 0
         self._told: BaseException | None = None  # what a block has raised on all ranks
 
     @classmethod
     def of_one(cls) -> Collective:
         """Return that of a process that has no others, which needs no MPI."""
-        return cls(Ranks(SimpleNamespace(rank=0, size=1, allgather=lambda value: [value], bcast=lambda value: value)))
+        return cls(Ranks(SimpleNamespace(rank=0, size=1)))
 
     def together(self) -> AbstractContextManager[None]:
         """Return the context of what all ranks do."""
@@ -91,11 +94,11 @@ class Collective:
 
     def exchange(self, value: Any) -> list[Any]:
         """Return what each rank has given."""
-        return list(self._comm.allgather(value))
+        return self._own.collect(value)
 
     def share(self, value: Any) -> Any:
         """Return what the root rank has given."""
-        return self._comm.bcast(value)
+        return self._own.share(value)
 
     def share_of_device(self, device: str) -> float:
         """Return what part of the work is on this rank's device, which others of its machine may have too."""
@@ -158,30 +161,28 @@ class Collective:
         if self.ranks.size == 1:
             return [failure]
         while True:
-            request = self._comm.Ibarrier()
-            if error is None:
-                request.Wait()
-            elif not _done(request):
+            with waiting("the end of a block"):
+                met = finish(self._own.comm.Ibarrier(), math.inf if error is None else PATIENCE)
+            if error is not None and not met:
                 self._end_all(error)
-            found: list[tuple[int, Failure | None]] = self._comm.allgather((self._depth, failure))
+            found: list[tuple[int, Failure | None]] = self._own.collect((self._depth, failure))
             if max(depth for depth, _ in found) <= self._depth or failure is None:
                 return [other for _, other in found]
             # a rank that failed between two blocks meets those that were still inside one: they come again
 
     def _end_all(self, error: BaseException) -> None:
         text = str(error) if isinstance(error, self._planned) else "".join(traceback.format_exception(error)).rstrip()
-        self.last_words(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks end")
-        self._comm.Abort(1)
+        self.end_all(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks end")
 
+    def told_as(self, error: BaseException) -> BaseException:
+        """Return another error that is to take the place of what a block has raised; all ranks know of it."""
+        self._told = error
+        return error
 
-def _done(request: Any) -> bool:
-    """Wait for the other ranks, but not for ever."""
-    end = time.monotonic() + PATIENCE
-    while not request.Test():
-        if time.monotonic() > end:
-            return False
-        time.sleep(PAUSE)
-    return True
+    def end_all(self, text: str) -> None:
+        """End all processes, wherever they are, with a message."""
+        self.last_words(text)
+        self.ranks.comm.Abort(1)
 
 
 def _joined(failed: list[tuple[int, Failure]], named: bool) -> BaseException:

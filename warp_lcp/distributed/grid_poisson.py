@@ -96,7 +96,7 @@ class DistributedComponentFinder(ComponentFinder):
         fluid = (A.cells.numpy() == FLUID).ravel()
         node = np.where(number >= 0, number + first, np.where(fluid, GROUND, -1)).astype(np.int32)
         edges = np.concatenate([_edges(A, node), np.empty((0, 2), dtype=np.int32)])
-        everyone = np.concatenate(ranks.comm.allgather(edges))
+        everyone = np.concatenate(ranks.collect(edges))
         graph = scipy.sparse.coo_matrix((np.ones(len(everyone)), tuple(everyone.T)), shape=(nodes, nodes))
         component = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
         floating = component != component[GROUND]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.ranks import Ranks, petsc
+from warp_lcp.distributed.waiting import waiting
 
 
 class Halo:
@@ -145,12 +147,46 @@ def exchange(forest: Any, roots: np.ndarray, leaves: np.ndarray | None = None) -
 
 def exchange_all(forest: Any, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
     """Copy roots to leaves over a star forest, many of them at once: their messages are under way together."""
-    from mpi4py import MPI
-
-    units = {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}
-    for step in (forest.bcastBegin, forest.bcastEnd):
+    transport = _transport()
+    for roots, leaves in pairs:
+        forest.bcastBegin(transport.units[roots.dtype.itemsize], roots, leaves, transport.replace)
+    with waiting("an exchange of ghost cells"):
         for roots, leaves in pairs:
-            step(units[roots.dtype.itemsize], roots, leaves, MPI.REPLACE)
+            transport.end(forest, roots, leaves)
+
+
+class _Transport:
+    """PETSc's exchange over a star forest with MPI's types.
+
+    petsc4py lets no other thread of Python run while PETSc waits for other ranks, no watchdog either: `end` calls PETSc itself.
+    """
+
+    def __init__(self) -> None:
+        from mpi4py import MPI
+
+        def handle(of: Any) -> Any:  # Open MPI's are pointers, MPICH's numbers
+            kind = ctypes.c_int if MPI._sizeof(of) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
+            return kind.from_buffer_copy(ctypes.string_at(MPI._addressof(of), MPI._sizeof(of)))
+
+        self.units = {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}
+        self.replace = MPI.REPLACE
+        self._handles = {size: handle(unit) for size, unit in self.units.items()}
+        self._replace = handle(MPI.REPLACE)
+        self._end = ctypes.CDLL(petsc().__file__).PetscSFBcastEnd
+
+    def end(self, forest: Any, roots: np.ndarray, leaves: np.ndarray) -> None:
+        """Wait for the leaves.
+
+        Raises:
+            RuntimeError: PETSc has failed.
+        """
+        where = (ctypes.c_void_p(array.ctypes.data) for array in (roots, leaves))
+        fault = self._end(ctypes.c_void_p(forest.handle), self._handles[roots.dtype.itemsize], *where, self._replace)
+        if fault:
+            raise RuntimeError(f"PetscSFBcastEnd: error {fault}")
+
+
+_transport = cache(_Transport)
 
 
 def star_forest(

@@ -233,7 +233,7 @@ class SharedParticleSimulation(ParticleSimulation):
 
     def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
         """Return what the root rank says on whose part something is wrong."""
-        told = self.part.ranks.comm.allgather(super()._trouble(totals, end))
+        told = self.part.ranks.collect(super()._trouble(totals, end))
         return next((text for text in told if text), "")
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:

@@ -17,6 +17,7 @@ import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import launch, particle_pass
@@ -69,12 +70,14 @@ class MpiPost:
         sizes = np.array([[len(outgoing[rank]) for rank in neighbors], [0] * len(neighbors)], dtype=np.int64)
         requests = [comm.Irecv(sizes[1, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
         requests += [comm.Isend(sizes[0, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
-        MPI.Request.Waitall(requests)
+        with waiting("how many particles come"):
+            MPI.Request.Waitall(requests)
         kind = outgoing[neighbors[0]].dtype if neighbors else np.dtype(np.int64)
         incoming = [np.empty(int(size), dtype=kind) for size in sizes[1]]
         requests = [comm.Irecv([a.view(np.uint8), MPI.BYTE], rank, DATA) for a, rank in zip(incoming, neighbors, strict=True) if a.size]
         requests += [comm.Isend([outgoing[rank].view(np.uint8), MPI.BYTE], rank, DATA) for rank in neighbors if outgoing[rank].size]
-        MPI.Request.Waitall(requests)
+        with waiting("particles"):
+            MPI.Request.Waitall(requests)
         return incoming
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.launch import find_petsc
+from warp_lcp.distributed.waiting import waiting
 
 HOW_TO_INSTALL = (
     "the PETSc engine needs petsc4py and mpi4py: pip install 'warp-lcp[distributed]', or on Debian and Ubuntu apt-get install "
@@ -63,8 +64,23 @@ class Ranks:
         if self.size == 1:
             return mine[None].copy()
         everyone = np.empty((self.size, *mine.shape), dtype=mine.dtype)
-        self.comm.Allgather(mine, everyone)
+        with waiting("a gather"):
+            self.comm.Allgather(mine, everyone)
         return everyone
+
+    def collect(self, value: Any) -> list[Any]:
+        """Return what each rank has given, of any type that can be pickled."""
+        if self.size == 1:
+            return [value]
+        with waiting("a gather"):
+            return list(self.comm.allgather(value))
+
+    def share(self, value: Any) -> Any:
+        """Return what the root rank has given, of any type that can be pickled."""
+        if self.size == 1:
+            return value
+        with waiting("a broadcast"):
+            return self.comm.bcast(value)
 
     def sum(self, values: Any) -> Any:
         """Return sums over the ranks of a number or an array."""
@@ -166,7 +182,8 @@ def device_of_rank(ranks: Ranks, name: str | None = None) -> str:
     Raises:
         ValueError: the machine of this rank has no such device; the message names the rank.
     """
-    of_machine = ranks.comm.Split_type(_shared())
+    with waiting("what finds the ranks of a machine"):
+        of_machine = ranks.comm.Split_type(_shared())
     number = int(of_machine.rank)
     of_machine.Free()
     found = [device.alias for device in wp.get_cuda_devices()]

@@ -40,7 +40,7 @@ class SharedSources(Sources):
         k, j, i = (self._cells + np.array(self.part.grid.origin)[::-1]).T.astype(np.int64)
         cells = (k * ny + j) * nx + i
         found = np.flatnonzero(mine)
-        everyone = np.concatenate(self.part.ranks.comm.allgather(np.stack([cells[found], mine[found]])), axis=1)
+        everyone = np.concatenate(self.part.ranks.collect(np.stack([cells[found], mine[found]])), axis=1)
         order = np.argsort(cells)
         place = np.searchsorted(cells[order], everyone[0])
         known = place < len(cells)

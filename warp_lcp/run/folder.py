@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from warp_lcp.distributed.collective import Collective, on_root
+from warp_lcp.distributed.watchdog import POST
 from warp_lcp.files.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
 from warp_lcp.files.claims import one_line
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
@@ -41,7 +42,7 @@ SCENE = "scene.toml"
 ROUNDING = 1e-9
 BEFORE = "before its first step had ended"
 LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
-OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd")
+OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd|{POST}")
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
 CHECKPOINTS = "checkpoints"
 STORED_STATE = re.compile(f"{CHECKPOINT_FILE.pattern}|{REFUSED_FILE.pattern}")
@@ -344,6 +345,8 @@ class RunFolder:
         with self.collective.together():
             if not (self.path / RECORD).is_file():
                 raise OutputError(f"{self.path}: is not the folder that rank 0 writes; choose one that all machines share")
+            if self.collective.watchdog:
+                self.collective.watchdog.post_in(self.path)
 
     def _check_run(self) -> None:
         if not holds_run(self.path):

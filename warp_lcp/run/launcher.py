@@ -106,8 +106,12 @@ def default_folder(scene: Scene) -> Path:
 
 
 @contextmanager
-def launcher_of(engine: Engine) -> Iterator[Launcher]:
+def launcher_of(engine: Engine, *, rank_timeout: float) -> Iterator[Launcher]:
     """Give the launcher of a command.
+
+    Args:
+        engine: what carries it.
+        rank_timeout: seconds that one of several ranks may keep the others waiting; 0: any.
 
     Raises:
         EngineError: the engine cannot be used here.
@@ -117,5 +121,5 @@ def launcher_of(engine: Engine) -> Iterator[Launcher]:
         return
     from warp_lcp.run.rank_launcher import ranks_together  # needs MPI and PETSc
 
-    with ranks_together() as launcher:
+    with ranks_together(rank_timeout) as launcher:
         yield launcher

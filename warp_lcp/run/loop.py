@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import errno
 import time as clock
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import ExitStack, closing, nullcontext
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from warp_lcp.distributed.collective import Collective
+from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.frames.frames import FrameWriter, frame_bytes
 from warp_lcp.run.check import check_memory, check_ranks, start
 from warp_lcp.run.checkpoint import PIECES, Checkpoint
@@ -260,7 +260,7 @@ class RunLoop:
         start = self._frame()
         self._check_space(last, start)
         try:
-            with ExitStack() as stack:
+            with self.folder.collective.together(), ExitStack() as stack:  # what is caught here was raised on all ranks
                 stack.enter_context(self.writer)
                 log = stack.enter_context(closing(self._resume(start) if resumed else self._start(last, start)))
                 self._open_tables(stack, self._first_step if resumed else None)
@@ -282,6 +282,9 @@ class RunLoop:
         except OSError as error:
             full = "the disk is full: " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
             self._fail(f"{full}{error}; what was written before is intact")
+        except Exception as error:  # it is raised again
+            self._fail(str(error) if isinstance(error, RankFailed) else f"{type(error).__name__}: {error}")
+            raise
         finally:
             if self.record.status == "running":
                 self._fail("the program ended unexpectedly")
@@ -340,23 +343,42 @@ class RunLoop:
             yield self
         while frame <= last:
             row = self._step(self.time.frame_time(frame))
-            log.append(row)
-            for name, table in self._tables.items():
-                table.append(cast(Measured, self.simulation).measured[name])
-            self.observer.step(row)
-            if missed(row):
-                self._missed.append((residual_of(row) or 0.0, self.simulation.step_count))
-            self.writer.check()
-            if self._frames_done() >= frame:
-                self._write_frame(frame, last, self._frame())
+            done = self._frames_done() >= frame
+            with self._keeping_step(log):
+                log.append(row)
+                for name, table in self._tables.items():
+                    table.append(cast(Measured, self.simulation).measured[name])
+                self.observer.step(row)
+                if missed(row):
+                    self._missed.append((residual_of(row) or 0.0, self.simulation.step_count))
+                self.writer.check()
+                if done:
+                    self._write_frame(frame, last, self._frame())
+            if done:
                 yield self
                 frame += 1
             if self._checkpoint_is_due():
                 self._write_checkpoint(log, beside=True)
             asked = stop()
             if self._somewhere(bool(asked)) and frame <= last:
-                return f"interrupted by {asked}" if isinstance(asked, str) and asked else "interrupted"  # "": another rank was asked
+                return self._interrupted(asked)
         return ""
+
+    @contextmanager
+    def _keeping_step(self, log: Log) -> Iterator[None]:
+        """Give the time after a step: what goes wrong there, on any rank, leaves a checkpoint of it where the disk allows."""
+        try:
+            with self.folder.collective.together():
+                yield
+        except Exception:  # it is raised again
+            self._try_to(partial(self._write_checkpoint, log))
+            raise
+
+    def _interrupted(self, asked: bool | str) -> str:
+        """Return by what some rank was asked to stop."""
+        names = [name if isinstance(name, str) else "" for name in self.folder.collective.exchange(asked)]
+        rank = next((rank for rank, name in enumerate(names) if name), 0)
+        return f"interrupted by {names[rank]}{f' on rank {rank}' if rank else ''}" if names[rank] else "interrupted"
 
     def _step(self, end: float) -> dict[str, Value]:
         """Take a step towards a time [s] and return its row of the log."""

@@ -16,6 +16,7 @@ import warp as wp
 from warp_lcp.distributed import launch
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
+from warp_lcp.distributed.watchdog import Watchdog
 from warp_lcp.run.continuation import mesh_digests
 from warp_lcp.run.devices import DeviceError, EngineError, devices
 from warp_lcp.run.folder import OutputError, RunRecord, mark_ended
@@ -39,14 +40,16 @@ class RankLauncher(Launcher):
 
     Args:
         ranks: all of them.
+        rank_timeout: seconds that one of them may keep the others waiting; 0: any.
     """
 
-    def __init__(self, ranks: Ranks) -> None:
+    def __init__(self, ranks: Ranks, rank_timeout: float) -> None:
         """Have messages of the root rank alone."""
         super().__init__(Terminal(stderr=True, quiet=not ranks.is_root))
         if not ranks.is_root:
             wp.config.log_level = wp.LOG_ERROR
         self.collective: Collective = Collective(ranks, PLANNED, self._last_words)
+        self.watchdog = self.collective.watchdog = Watchdog(ranks, rank_timeout, self.collective.end_all)
         self._folder: Path | None = None
 
     def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
@@ -114,8 +117,11 @@ class RankLauncher(Launcher):
 
 
 @contextmanager
-def ranks_together() -> Iterator[RankLauncher]:
+def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
     """Give this process's part in what all ranks do; all but the root rank end silently, with its exit code.
+
+    Args:
+        rank_timeout: seconds that one of them may keep the others waiting; 0: any.
 
     Raises:
         EngineError: MPI or PETSc is missing, or of another kind than mpiexec.
@@ -134,8 +140,8 @@ def ranks_together() -> Iterator[RankLauncher]:
             "of the MPI that mpi4py was built with, or the --mpi of srun that it knows"
         )
     try:
-        launcher = RankLauncher(ranks)
-        with launcher.collective.together():
+        launcher = RankLauncher(ranks, rank_timeout)
+        with launcher.watchdog, launcher.collective.together():
             yield launcher
     except RankFailed as error:
         say(launcher.console, str(error))

@@ -84,7 +84,7 @@ class RankSimulation:
             with self._collective.together():
                 row = self._simulation.step(dt)
         except RankFailed as error:
-            raise SimulationFailed(str(error)) from error
+            raise self._collective.told_as(SimulationFailed(str(error))) from error
         except StepFailed as error:
             if len(self._collective.failed) < self._collective.ranks.size:  # the others have gone on: there is no state to try again from
                 raise SimulationFailed(f"{error} (but not on all ranks)") from error

@@ -1,0 +1,133 @@
+"""Ranks that wait for one that does not come end, and say which one that is and where it is."""
+
+import re
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from warp_lcp.distributed.waiting import Waiting, finish
+from warp_lcp.distributed.watchdog import Board, Post, place_of, verdict
+
+INSIDE, OUTSIDE = Post(9, 31, "a sum", 12.0, "solver:7"), Post(8, 30, "", 13.0, "build:3 from step:5")
+LATE, SILENT = "has been at build:3 from step:5 for 13 s", "told nothing: stopped, out of reach, or in a library that does not return"
+VERDICTS = [
+    ([OUTSIDE, OUTSIDE], ""),
+    ([INSIDE, OUTSIDE, INSIDE], f"rank 1 of 3 keeps the others waiting: rank 1 {LATE}; ranks 0, 2 in a sum (solver:7) for 12 s"),
+    ([INSIDE, None], f"rank 1 of 2 keeps the others waiting: rank 1 {SILENT}; rank 0 in a sum (solver:7) for 12 s"),
+    ([None, INSIDE, OUTSIDE, None], f"ranks 0, 2, 3 of 4 keep the others waiting: rank 2 {LATE}; ranks 0, 3 {SILENT}; rank 1 in a sum"),
+    ([None, OUTSIDE], f"rank 1 {LATE}; rank 0 {SILENT}"),
+    (
+        [INSIDE, Post(9, 29, "a broadcast", 14.0, "solver:8")],
+        "all ranks wait for each other, and not in the same operation: rank 0 in a sum (solver:7); rank 1 in a broadcast (solver:8)",
+    ),
+]
+ROOT = Path(__file__).parents[2]
+
+WAIT = """
+    import sys, time
+    from warp_lcp.distributed.collective import Collective
+    from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.distributed.watchdog import Watchdog
+
+    ranks = Ranks.world()
+    what = sys.argv[1]
+    collective = Collective(ranks, (), lambda text: sys.stderr.write(text + "\\n"))
+    other = Ranks(ranks.comm.Dup())
+    with Watchdog(ranks, 2.0, collective.end_all):
+        for _ in range(30):
+            ranks.sum(1)
+            time.sleep(0.1)  # longer than the limit in all
+        if what == "late" and ranks.rank == 2:
+            time.sleep(1000)
+        if what == "other" and ranks.rank == 1:
+            other.collect("this one")
+        ranks.sum(1)
+    print("done")
+"""
+
+
+@pytest.mark.parametrize(("posts", "expected"), VERDICTS)
+def test_the_late_one_is_named(posts, expected):
+    said = verdict(dict(enumerate(posts)))
+    assert said.startswith(expected)
+    assert bool(said) == bool(expected)
+
+
+def test_a_post_is_there_whole_or_not_at_all(tmp_path):
+    board = Board(tmp_path)
+    assert board.read(3) is None
+    board.write(3, INSIDE)
+    board.write(4, Post(1, 1, "x" * 50, 1.0, "y" * 5000))
+    assert board.read(3) == INSIDE
+    assert board.read(4) is not None
+    board.path(3).write_bytes(board.path(3).read_bytes()[:20])
+    assert board.read(3) is None
+    board.clear([3, 4, 5])
+    assert not list(tmp_path.iterdir())
+
+
+def test_where_a_rank_is():
+    here = place_of(sys._getframe())
+    assert re.fullmatch(rf"{__name__}:\d+", here)
+    assert place_of(None) == "its end"
+
+
+def test_a_long_wait_uses_no_core():
+    class Request:
+        asked = 0
+
+        def Test(self) -> bool:  # noqa: N802  # MPI's name
+            self.asked += 1
+            return time.monotonic() > self.end
+
+    request = Request()
+    request.end, begun = time.monotonic() + 0.3, time.process_time()
+    assert finish(request)
+    assert time.process_time() - begun < 0.1
+    request.end = time.monotonic() + 100.0
+    assert not finish(request, 0.02)
+
+
+def test_operations_are_counted_in_order():
+    waiting = Waiting()
+    with pytest.raises(KeyError), waiting("a sum"):
+        assert (waiting.name, waiting.count) == ("a sum", 1)
+        raise KeyError
+    assert (waiting.name, waiting.count) == ("", 2)
+
+
+ENDS = {
+    "late": r"rank 2 of 3 keeps the others waiting: rank 2 has been at __main__:\d+ for \d+ s; ranks 0, 1 in a gather \(__main__:\d+\)",
+    "other": r"all ranks wait for each other, and not in the same operation: ranks 0, 2 in a gather \(__main__:\d+\); rank 1 in a gather",
+}
+
+
+@pytest.mark.parametrize("what", ENDS)
+def test_waiting_ends(mpi, what):
+    """Where the program makes no folder known, ranks of one machine still hear of each other."""
+    done = mpi(3, WAIT, what, exit_code=None, seconds=60.0)
+    assert done.returncode != 0
+    assert "done" not in done.stdout
+    assert re.search(ENDS[what], done.stderr), done.stderr
+    assert "all ranks end: --rank-timeout 2" in done.stderr
+
+
+def test_no_operation_goes_unwatched():
+    """What waits for other ranks does so inside `waiting`, in the few places that call MPI."""
+    calls = re.compile(
+        r"\.(I?[Aa]ll\w+|I?[Bb]arrier|I?[Bb]cast|I?[Gg]ather\w*|I?[Ss]catter\w*|I?[Rr]educe\w*|[Ss]end|[Rr]ecv|Wait\w*|Split\w*|bcastEnd)\("
+    )
+    package = Path(__file__).parents[2] / "warp_lcp"
+    unwatched = []
+    for file in [*package.rglob("*.py"), *(package.parent / "fluids").rglob("*.py"), *(package.parent / "granular").rglob("*.py")]:
+        lines = file.read_text().splitlines()
+        for number, line in enumerate(lines):
+            if (
+                "comm." in line
+                and calls.search(line)
+                and not any("with waiting(" in before for before in lines[max(0, number - 2) : number + 1])
+            ):
+                unwatched.append(f"{file.name}:{number + 1}: {line.strip()}")
+    assert not unwatched

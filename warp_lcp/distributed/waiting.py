@@ -1,0 +1,59 @@
+"""What this process waits in for other ranks, and how it waits."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, Self
+
+AWAKE = 1e-3  # seconds that a wait spends asking: between two operations ranks rarely differ by more
+SHARE = 1 / 16  # of a wait's length so far, which a rank that has nothing to do sleeps at a time
+LONGEST = 5e-3  # seconds of such a sleep
+
+
+class Waiting:
+    """Tells others, such as a `Watchdog`, whether this process is inside an operation that other ranks take part in.
+
+    Attributes:
+        name: of the operation, "" outside.
+        count: of entries and exits so far.
+
+    >>> waiting = Waiting()
+    >>> with waiting("a sum"):
+    ...     waiting.name, waiting.count
+    ('a sum', 1)
+    >>> waiting.name, waiting.count
+    ('', 2)
+    """
+
+    def __init__(self) -> None:
+        self.name, self.count, self._next = "", 0, ""
+
+    def __call__(self, name: str) -> Self:
+        """Return the context of an operation of this name."""
+        self._next = name
+        return self
+
+    def __enter__(self) -> Self:
+        self.name = self._next
+        self.count += 1
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.name = ""
+        self.count += 1
+
+
+waiting = Waiting()  # MPI's world is one a process, and its main thread alone is in it
+
+
+def finish(request: Any, seconds: float = math.inf) -> bool:
+    """Wait for a request of MPI without using up a core, and return whether it has ended within some seconds."""
+    begun = time.monotonic()
+    while not request.Test():
+        waited = time.monotonic() - begun
+        if waited > seconds:
+            return False
+        if waited > AWAKE:
+            time.sleep(min(SHARE * waited, LONGEST))
+    return True

@@ -1,0 +1,221 @@
+"""A thread on each rank that sees when ranks wait for one that does not come, and ends all with its name."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import secrets
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Self
+
+from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.waiting import Waiting, waiting
+from warp_lcp.files.atomic import SUFFIX
+
+LIMIT = 600.0  # seconds: kernels that are compiled, and the largest frames, take less
+BEATS = 20  # of the thread within the limit; it looks at the clock no more often
+LONGEST_BEAT = 30.0  # seconds
+SILENT, SILENCE = 4, 2.0  # beats, and seconds, after which a rank that has told nothing new cannot: stopped, or its machine is gone
+POST = r"waits_\d{4,}"  # names of the files
+FIRST = 5  # ranks that look one beat after another, so that one of them speaks; later ones only if those cannot
+GRACE = 5.0  # seconds that it may take to end all ranks before this one ends itself, which mpiexec notices
+ROOM = 512  # bytes of a post: written over in place, which a full disk allows
+OWN = "warp_lcp."
+PASSING = {"contextlib", *(f"{OWN}distributed.{name}" for name in ("waiting", "ranks", "collective", "halo"))}  # wait for whom calls them
+
+
+@dataclass(frozen=True)
+class Post:
+    """What a rank's thread tells of its main thread.
+
+    Args:
+        beat: a number that grows while the thread lives.
+        count: of entries into operations of all ranks, and exits.
+        name: of the operation that the rank waits in, "" outside.
+        seconds: since the count grew.
+        place: in the program.
+    """
+
+    beat: int
+    count: int
+    name: str
+    seconds: float
+    place: str
+
+
+class Board:
+    """Where ranks tell each other what they do while MPI cannot: a small file a rank.
+
+    Args:
+        folder: that all of them see; those that do not are not heard of.
+        label: tells the ranks of different programs apart in it.
+    """
+
+    def __init__(self, folder: Path, label: str = "") -> None:
+        self._folder, self._label = folder, label
+
+    def path(self, rank: int) -> Path:
+        """Return the file of a rank."""
+        return self._folder / f".{self._label}waits_{rank:04d}{SUFFIX}"
+
+    def write(self, rank: int, post: Post) -> None:
+        """Put up a post."""
+        line = (json.dumps({**asdict(post), "place": post.place[: ROOM // 2]}) + "\n").encode()
+        descriptor = os.open(self.path(rank), os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | getattr(os, "O_NOFOLLOW", 0), 0o600)
+        with open(descriptor, "wb") as file:  # closed each time: that is when other machines see it
+            file.write(line.ljust(ROOM))
+
+    def read(self, rank: int) -> Post | None:
+        """Return the post of a rank; None if there is none, or a half-written one."""
+        with suppress(OSError, ValueError, TypeError):
+            return Post(**json.loads(self.path(rank).read_bytes().split(b"\n")[0]))
+        return None
+
+    def clear(self, ranks: Sequence[int]) -> None:
+        """Take posts away."""
+        for rank in ranks:
+            with suppress(OSError):
+                self.path(rank).unlink()
+
+
+class Watchdog:
+    """A `with` block in which all ranks end, with a message, once one has kept the others waiting for too long.
+
+    On each rank a thread tells by a small file, some times within the limit, what its main thread does. A rank that has waited so long
+    reads what the others have told, and says who is late. Time in which processes are stopped, by Ctrl-Z or a batch system, does not count.
+    Before there is a folder that all see, ranks of one machine hear of each other.
+
+    Args:
+        ranks: all of them.
+        limit: seconds that a rank may keep the others waiting; 0: any.
+        end: takes the message, and ends all processes.
+        watched: what the main thread waits in.
+
+    >>> from types import SimpleNamespace
+    >>> with Watchdog(Ranks(SimpleNamespace(rank=0, size=1)), 600.0, print):  # one rank waits for nobody
+    ...     pass
+    """
+
+    def __init__(self, ranks: Ranks, limit: float, end: Callable[[str], object], *, watched: Waiting = waiting) -> None:
+        """Agree on a label; collective."""
+        self._ranks, self._limit, self._end, self._watched = ranks, limit, end, watched
+        self._beat = min(limit / BEATS, LONGEST_BEAT)
+        self._board = Board(Path(tempfile.gettempdir()), f"warp-lcp-{ranks.share(secrets.token_hex(8))}-")
+        self._posting = threading.Lock()
+        self._over = threading.Event()
+        self._main = threading.main_thread().ident
+        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self._seen: dict[int, tuple[Post | None, Post | None, int]] = {}  # of ranks: since when they stay, the last post, its age in beats
+
+    def __enter__(self) -> Self:
+        if self._limit and self._ranks.size > 1:
+            self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join(1.0)  # not longer: a file system may hang
+        self._board.clear([self._ranks.rank])
+
+    def post_in(self, folder: Path) -> None:
+        """Tell in a folder, which all ranks see, from now on."""
+        with self._posting:
+            self._board.clear([self._ranks.rank])
+            self._board = Board(folder)
+            if self._thread.is_alive():
+                self._board.write(self._ranks.rank, Post(0, 0, "", 0.0, "its beginning"))  # while the disk has room
+
+    def _watch(self) -> None:
+        beat, count, idle, then = 0, self._watched.count, 0.0, time.monotonic()
+        while not self._over.wait(self._beat):
+            now = time.monotonic()
+            beat, idle, then = beat + 1, idle + min(now - then, 2 * self._beat), now  # longer if the process was stopped
+            if count != self._watched.count:
+                count, idle = self._watched.count, 0.0
+            mine = Post(beat, count, self._watched.name, idle, place_of(sys._current_frames().get(self._main or 0)))
+            with self._posting:
+                if self._over.is_set():
+                    return
+                with suppress(OSError):  # a disk that takes no file: the others will say that this rank tells nothing
+                    self._board.write(self._ranks.rank, mine)
+            if idle < self._limit + min(self._ranks.rank, FIRST) * self._beat:
+                self._seen.clear()
+            elif text := self._look(mine):
+                threading.Timer(GRACE, os._exit, [1]).start()
+                self._board.clear(range(self._ranks.size))
+                self._end(f"{text}\nall ranks end: --rank-timeout {self._limit:g}")
+                return
+
+    def _look(self, mine: Post) -> str:
+        """Return what is wrong; "" while ranks go on, or have not yet told twice that they do not."""
+        patience = max(SILENT, math.ceil(SILENCE / self._beat), 0 if mine.name else BEATS)  # a rank that computes waits for nobody
+        posts: dict[int, Post | None] = {self._ranks.rank: mine}
+        certain = True
+        for rank in (rank for rank in range(self._ranks.size) if rank != self._ranks.rank):
+            post = self._board.read(rank)
+            first, last, age = self._seen.get(rank, (post, post, 0))
+            if post and first and post.count != first.count:
+                first = post  # it goes on
+            age = 0 if post and last and post.beat != last.beat else age + 1
+            self._seen[rank] = first or post, post or last, age
+            posts[rank] = None if age > patience else post or last
+            certain = certain and (age > patience or (post is not None and first is not None and post.beat != first.beat))
+        return verdict(posts) if certain else ""
+
+
+def verdict(posts: Mapping[int, Post | None]) -> str:
+    """Return which ranks keep the others waiting, in a line; "" if none does.
+
+    Args:
+        posts: of all ranks, which have not gone on for long; None: it tells nothing.
+    """
+    inside = {rank: post for rank, post in posts.items() if post and post.name}
+    outside = {rank: post for rank, post in posts.items() if post and not post.name}
+    silent = sorted(rank for rank, post in posts.items() if post is None)
+    if not inside and not silent:
+        return ""  # all compute
+    waits = _grouped({rank: f"{post.name} ({post.place})" for rank, post in inside.items()})
+    if not outside and not silent:
+        return f"all ranks wait for each other, and not in the same operation: {waits}"
+    late = [f"rank {rank} has been at {post.place} for {post.seconds:.0f} s" for rank, post in outside.items()]
+    late += [f"{_named(silent)} told nothing: stopped, out of reach, or in a library that does not return"] * bool(silent)
+    if not inside:
+        return "; ".join(late)
+    who, seconds = sorted([*outside, *silent]), max(post.seconds for post in inside.values())
+    keeps = "keep" if len(who) > 1 else "keeps"
+    return f"{_named(who)} of {len(posts)} {keeps} the others waiting: {'; '.join(late)}; {waits} for {seconds:.0f} s"
+
+
+def place_of(frame: FrameType | None) -> str:
+    """Return where a thread is: in which line of ours, and of the module that this has called."""
+    found = list[str]()
+    while frame is not None:
+        name, line = str(frame.f_globals.get("__name__", "")), frame.f_lineno
+        if name not in PASSING and (name.startswith(OWN) or not found):
+            found.append(f"{name}:{line}")
+            if name.startswith(OWN):
+                break
+        frame = frame.f_back
+    return " from ".join(found) or "its end"
+
+
+def _named(ranks: Sequence[int]) -> str:
+    return f"rank {ranks[0]}" if len(ranks) == 1 else f"ranks {', '.join(map(str, ranks))}"
+
+
+def _grouped(texts: dict[int, str]) -> str:
+    """Return who waits in what."""
+    ranks: dict[str, list[int]] = {}
+    for rank, text in texts.items():
+        ranks.setdefault(text, []).append(rank)
+    return "; ".join(f"{_named(those)} in {text}" for text, those in ranks.items())
