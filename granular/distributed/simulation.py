@@ -73,7 +73,7 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
             return 0.0, 0.0
         first = max(len(position) - beyond, 0)
         farthest = np.partition(position, first, axis=0)[first:] if len(position) else position
-        everyone = np.concatenate(ranks.comm.allgather(farthest))
+        everyone = np.concatenate(ranks.collect(farthest))
         x, y = np.partition(everyone, len(everyone) - beyond, axis=0)[len(everyone) - beyond]
         return float(x), float(y)
 

@@ -151,7 +151,7 @@ class Balance:
             return None
         edge = edge_of_blocks(now.counts, part.ranks.size)
         load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
-        everyone = part.ranks.comm.allgather(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
+        everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
         least, cut = min(found for found in everyone if found is not None)
         gains = cut != now.parts and max(work) + fixed > self.bound * (least + fixed)
         return now.cut_anew(cut) if gains else None

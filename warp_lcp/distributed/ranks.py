@@ -89,7 +89,8 @@ class Ranks:
     def total(self, counts: np.ndarray) -> np.ndarray:
         """Return sums over the ranks of an array of integers, whose order does not matter."""
         everyone = np.empty_like(counts)
-        self.comm.Allreduce(counts, everyone)
+        with waiting("a sum"):
+            self.comm.Allreduce(counts, everyone)
         return everyone
 
     def max(self, values: Any) -> Any:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import pickle
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,6 +35,7 @@ from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 PLANNED = (OSError, InputError, StepFailed, SimulationFailed)
 SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")  # how many processes mpiexec or srun has started, as it tells them
 SHOWN = 4  # differences in one message
+PARTING = 60  # seconds in which a process that has done its part ends, while PETSc and MPI meet the others for the last time
 
 
 class RankLauncher(Launcher):
@@ -139,6 +142,8 @@ def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
             f"--engine petsc: {started} processes were started, but mpi4py knows only one: they are of different MPIs; use the mpiexec "
             "of the MPI that mpi4py was built with, or the --mpi of srun that it knows"
         )
+    if ranks.size > 1:
+        atexit.register(signal.alarm, PARTING)  # Python's threads have ended by then: the system's own clock ends what does not
     try:
         launcher = RankLauncher(ranks, rank_timeout)
         with launcher.watchdog, launcher.collective.together():
