@@ -77,4 +77,4 @@ class SharedNarrowBand(NarrowBand):
         self.part.fill(*fields)
 
     def _summed(self, window: Window) -> ParticleTotals:
-        return reduce(ParticleTotals.joined, self.part.ranks.comm.allgather(super()._summed(window)))
+        return reduce(ParticleTotals.joined, self.part.ranks.collect(super()._summed(window)))

@@ -157,7 +157,8 @@ def _in_rows(handle: int, count: int) -> Ranks:
     from mpi4py import MPI
 
     comm = MPI.Comm.f2py(handle)
-    return Ranks(comm.Split(comm.rank // count, comm.rank))
+    with waiting("a communicator of some ranks"):
+        return Ranks(comm.Split(comm.rank // count, comm.rank))
 
 
 @cache

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.halo import exchange_all, star_forest
+from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.staggered import StaggeredGrid
 
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
@@ -186,7 +187,8 @@ class Subdomain:
 
         Collective.
         """
-        everyone = [box] if self.ranks.size == 1 else self.ranks.comm.gather(box)
+        with waiting("a gather"):
+            everyone = [box] if self.ranks.size == 1 else self.ranks.comm.gather(box)
         if everyone is None:
             return None
         whole = np.empty(self.decomposition.counts[::-1], dtype=box.dtype)
