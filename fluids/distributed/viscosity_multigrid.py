@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.hierarchy import GATHERED
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.viscosity_multigrid import LEAST, VectorLevel, VectorMultigrid
 from warp_lcp.fluids.viscosity_passes import SHIFT
@@ -21,7 +22,6 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows.program import Launch, perform
 
 KNOWN = 3  # layers of ghost cells that sweeps need: rows of the second color look at those of the first, where odd cells look at even ones
-GATHERED = 4096  # cells from which on a level is gathered: exchanges would take as long as its cells
 
 
 class SharedVectorLevel(VectorLevel):
@@ -57,7 +57,8 @@ class SharedVectorLevel(VectorLevel):
         if launch is None:
             self.part.fill(*fields)
         else:
-            perform(partial(self.part.fill, *fields, width=KNOWN), launch)
+            memory = fields if self.grid.device.is_cuda else [field.numpy() for field in fields]
+            perform(partial(self.part.fill, *memory, width=KNOWN), launch)
 
     def halved(self, window: Window) -> Window:
         """Return the cells that this rank is the one to know."""

@@ -13,7 +13,7 @@ from small_liquids import box
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.fluids.distributed import create
+from warp_lcp.fluids.distributed import create, viscosity_multigrid
 from warp_lcp.frames.pieces import one_mesh
 from warp_lcp.frames.vtu import Mesh
 from warp_lcp.material.particle_scene import ParticleScene
@@ -21,6 +21,7 @@ from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
+viscosity_multigrid.GATHERED = 1024  # cells of a level that is not shared, so that others are
 EAGER = Balance(every=2, bound=1.0, fixed=0.0)  # cuts boxes anew whenever others are better
 DT = 0.01  # the longest step [s]
 STEPS = 10

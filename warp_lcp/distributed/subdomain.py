@@ -114,24 +114,24 @@ class Subdomain:
             high[axis] += box.high[axis] == self.decomposition.counts[axis]
         return CellBox.of(low, high)
 
-    def fill(self, *fields: wp.array, width: int | None = None, parts: int = 1, forest: Any = None) -> None:
+    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: Any = None) -> None:
         """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
 
         Args:
-            fields: any types, the last axes z, y, x.
+            fields: any types, the last axes z, y, x; or the host's views of their memory, which cost less to fill often.
             width: how far from the box; None: all.
             parts: the fields are of `grid.refined(parts)`.
             forest: of `forest`, for such fields; None: one that is made once.
         """
         if self.ranks.size == 1:
             return
-        hosts = [field.numpy() for field in fields]
+        hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
         if forest is None:
             kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
             forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
         exchange_all(forest, [(host, host) for host in hosts])
         for field, host in zip(fields, hosts, strict=True):
-            if field.device.is_cuda:
+            if isinstance(field, wp.array) and field.device.is_cuda:
                 field.assign(host)
 
     def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:
