@@ -11,7 +11,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,7 @@ class Traffic:
         self.times[kind] += 1
 
 
+@cache
 def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
     """Return how many ghost cells are filled."""
     if isinstance(owner, Subdomain):
