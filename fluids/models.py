@@ -63,6 +63,13 @@ def pressure_settings(scene: LiquidScene, surface: FreeSurface, weights: list[wp
     return {"tolerance": settings.tolerance, "max_iterations": settings.max_iterations, "gravity": gravity} | resting
 
 
+def unilateral_settings(scene: LiquidScene, surface: GhostFluidSurface, weights: list[wp.array]) -> dict[str, Any]:
+    """Return what a scene sets of `UnilateralPressure`; arguments as of `pressure_settings`."""
+    settings = pressure_settings(scene, surface, weights)
+    shared = {name: settings[name] for name in ("tolerance", "max_iterations", "gravity")}
+    return shared | {"level_set": surface.level_set, "weights": weights}
+
+
 def make_pressure(
     scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array], bodies: RigidBodies | None
 ) -> PressureProjection:
@@ -81,9 +88,8 @@ def make_pressure(
     if bodies is not None:
         assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
         coupling = BodyCoupling(grid, boundary, bodies, scene.physics.density)
-    if isinstance(surface, GhostFluidSurface) and scene.pressure.model == "unilateral":
-        settings = {name: settings[name] for name in ("tolerance", "max_iterations", "gravity")} | {"level_set": surface.level_set}
-        return UnilateralPressure(grid, boundary, solver, weights=weights, coupling=coupling, **settings)
+    if scene.pressure.model == "unilateral" and isinstance(surface, GhostFluidSurface):
+        return UnilateralPressure(grid, boundary, solver, coupling=coupling, **unilateral_settings(scene, surface, weights))
     return PressureProjection(grid, boundary, solver, coupling=coupling, **settings)
 
 

@@ -88,7 +88,6 @@ class UnilateralPressure(PressureProjection):
         least = SHIFT if self.boundary.open else 0.0
         fields = [self.pressure, self._ratio, least, self._b, self._start, self._shift]
         self.grid.domain.launch(kernels.prepare_kernel, [self._at(velocity), self.kind, *fields])
-        self._solved = self.grid.domain
         self._count.take(self._solved, kind=self._unknown)
         unknowns = self.counted()
         if unknowns and self._problem is None:
@@ -106,11 +105,11 @@ class UnilateralPressure(PressureProjection):
             inputs = [self._setting, axis, self.pressure, open_, self._weights[axis], field, self.known[axis]]
             window.launch(kernels.push_kernel, inputs)
         inputs = [self._at(velocity), self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
-        self.grid.domain.launch_rows(kernels.contact_kernel, inputs)
+        self._solved.launch_rows(kernels.contact_kernel, inputs)
         return Projection(result, self.counted(), self._found)
 
     def _found(self) -> tuple[float, float]:
-        rows = self.grid.domain.rows_of(self._sums)
+        rows = self._solved.rows_of(self._sums)
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
     def fluid_cells(self) -> np.ndarray:

@@ -58,5 +58,4 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
 
 def refusals(scene: LiquidScene) -> list[str]:
     """Return the keys of a scene that ask for what runs on ranks have not."""
-    asked = {'pressure.model = "unilateral"': scene.pressure.model == "unilateral"}
-    return [*refusals_of_all(scene), *(key for key, wanted in asked.items() if wanted)]
+    return refusals_of_all(scene)

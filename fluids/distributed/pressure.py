@@ -33,17 +33,23 @@ class DistributedPressure(PressureProjection):
         settings: others, as of `PressureProjection`.
     """
 
+    shares_pockets = False  # whether pockets between solids add to the diagonal
+
     def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
         super().__init__(part.grid, boundary, solver, **settings)
         self.part, self._solved = part, part.owned
-        if self._phi is None and not part.ranks.any(bool(boundary.open_sides & ~part.cuts)):
+        if self._phi is None and not (self.shares_pockets or part.ranks.any(bool(boundary.open_sides & ~part.cuts))):
             self._shift = None  # sides at cuts are open, but not the domain's
-        self._boxes: list[Any] = [
-            None if f is None else self.part.box_like(f) for f in (self.kind, self._b, self._start, self._lower, self._shift)
-        ]
+        self._boxes: list[Any] = [None if f is None else self.part.box_like(f) for f in self._shared]
         _, self._rhs, self._guess, _, _ = self._boxes
         if settings["tolerance"] == "auto":
             self.automatic = TimeErrorTolerance(self._rhs.size, part.grid.device, part.ranks)
+
+    @property
+    def _shared(self) -> list[wp.array | None]:
+        """What a whole grid's problem has in cells."""
+        lower = self._least if isinstance(self._least, wp.array) else None
+        return [self._unknown, self._b, self._start, lower, self._shift]
 
     def _look(self, window: Window | None) -> None:
         """Solve for the cells of the box, whatever the window."""
@@ -71,7 +77,7 @@ class DistributedPressure(PressureProjection):
         kind, _, _, lower, shift = self._boxes
         cells, decomposition = kind.numpy()[1:-1, 1:-1, 1:-1], self.part.decomposition
         self._operator = DistributedGridPoisson(decomposition, cells, shift=shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._operator, self._rhs, -np.inf if lower is None else lower, np.inf)
+        self._problem = wl.LCP(self._operator, self._rhs, self._least if lower is None else lower, np.inf)
         self._work = self.solver.init(self._problem)
 
     def _update(self) -> None:
@@ -86,7 +92,7 @@ class DistributedPressure(PressureProjection):
         super()._support(velocity, window)
 
     def _copy_to_box(self) -> None:
-        for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), self._boxes, strict=True):
+        for field, box in zip(self._shared, self._boxes, strict=True):
             if box is not None:
                 self.part.copy_to_box(field, box)
 

@@ -11,13 +11,14 @@ from warp_lcp.fluids.distributed.pressure import DistributedPressure
 from warp_lcp.fluids.distributed.probes import SharedProbes
 from warp_lcp.fluids.distributed.surface import SharedSurface
 from warp_lcp.fluids.distributed.tension import SharedSurfaceTension
+from warp_lcp.fluids.distributed.unilateral import SharedUnilateralPressure
 from warp_lcp.fluids.distributed.viscosity import SharedViscosity
-from warp_lcp.fluids.models import make_surface, make_tension, make_viscosity, pressure_settings
+from warp_lcp.fluids.models import make_surface, make_tension, make_viscosity, pressure_settings, unilateral_settings
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation
-from warp_lcp.fluids.surface import FreeSurface
+from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface
 from warp_lcp.fluids.surface_tension import SurfaceTension
 from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.grid.staggered import Window
@@ -31,6 +32,7 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
     scene: LiquidScene
     particles: SharedParticles
     projection: DistributedPressure
+    surface: SharedSurface
 
     def _surface(self) -> FreeSurface:
         part = self.part
@@ -41,6 +43,9 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
 
     def _pressure(self) -> PressureProjection:
         solver = wl.METHODS[self.scene.solver.method](precision=self.scene.solver.precision)
+        if self.scene.pressure.model == "unilateral" and isinstance(self.surface.surface, GhostFluidSurface):
+            settings = unilateral_settings(self.scene, self.surface.surface, self.weights)
+            return SharedUnilateralPressure(self.part, self.boundary, solver, **settings)
         return DistributedPressure(self.part, self.boundary, solver, **pressure_settings(self.scene, self.surface, self.weights))
 
     def _probes(self) -> Probes | None:

@@ -18,21 +18,24 @@ class SharedSurface:
     Args:
         part: where this rank works; its particles come with ghosts.
         surface: on that part, its volume counted in the box.
+
+    Attributes:
+        surface: as given; others as of `FreeSurface`.
     """
 
     def __init__(self, part: Subdomain, surface: FreeSurface) -> None:
-        self.phi, self.density, self.complete, self._part, self._surface = surface.phi, surface.density, surface.complete, part, surface
+        self.phi, self.density, self.complete, self._part, self.surface = surface.phi, surface.density, surface.complete, part, surface
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds, those of the ghost layers and what they come from by other ranks."""
-        self._surface.mark(particles, window, kind)
+        self.surface.mark(particles, window, kind)
         self._part.fill(kind, *([] if self.phi is None else [self.phi]))
 
     def measure(self) -> None:
         """Find the volume of this rank's liquid."""
-        self._surface.measure()
+        self.surface.measure()
 
     def volume(self, cells: int) -> float:
         """Return the volume of all ranks' liquid, given the number of all FLUID cells."""
-        mine = self._surface.volume(cells)
-        return mine if isinstance(self._surface, WholeCellSurface) else float(self._part.ranks.sum(mine))
+        mine = self.surface.volume(cells)
+        return mine if isinstance(self.surface, WholeCellSurface) else float(self._part.ranks.sum(mine))

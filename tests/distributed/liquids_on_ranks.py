@@ -76,6 +76,7 @@ SCENES = {
     "thick and thin": DEEP | THICK | {"source": [SPOUT], "solid": [PLUNGER], "output": {"forces": True}},
     "thick letting go": FLAT | {"viscosity": {"value": 30.0, "slip_length": 0.02}, "liquid": [box([0.3, 0.1], [0.7, 0.5])]},
     "banded": POOL | {"particles": {"narrow_band": {"width": 3.0}, "reseed": {}, "transfer": "flip"}, "solver": {"precision": "double"}},
+    "unilateral": FLAT | {"pressure": {"model": "unilateral"}, "solid": [DISC], "domain": OPEN, "solver": {"precision": "double"}},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 

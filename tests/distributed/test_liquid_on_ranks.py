@@ -68,7 +68,7 @@ def alone(model_, **options):
 ONE_RANK = ("flat", "cut", "voxel", "turning", "river", "whole-cell river", "drops", "crowded", "reseeded", "thick and thin", "banded")
 
 
-@pytest.mark.parametrize("name", [*ONE_RANK, *SANDS])
+@pytest.mark.parametrize("name", [*ONE_RANK, "unilateral", *SANDS])
 def test_one_rank_is_one_process_bit_for_bit(name):
     one, shared = single(model(name)), alone(model(name))
     assert advance(shared, 6) == advance(one, 6)
@@ -231,7 +231,6 @@ def test_pieces_of_something_else_are_refused(change, message):
 @pytest.mark.parametrize(
     ("tables", "key"),
     [
-        (FLAT | {"pressure": {"model": "unilateral"}}, 'pressure.model = "unilateral"'),
         (FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], mass=10.0)]}, r"solid\[0\].mass"),
         (COLUMN | {"periodic": [False, False, True]}, "domain.periodic"),
     ],
