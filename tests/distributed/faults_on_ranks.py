@@ -52,6 +52,7 @@ class Fault:
             os.kill(os.getpid(), SIGNALS[self.kind])
         elif self.kind in TO_ALL:
             os.kill(os.getppid(), TO_ALL[self.kind])
+            time.sleep(0.5)  # mpiexec takes a while to hand it on
         elif self.kind == "late":
             time.sleep(1e4)
         elif self.kind == "bug":

@@ -42,7 +42,7 @@ def wait_for_ranks(folder):
 FAULTS = {  # on two ranks, with how run.json says that it ended, what is said, and the step that others go on from
     "1 killed step 70": ("running", "", "noticed that process rank 1", 68),
     "1 late wait 300": ("failed", "rank 1 of 2 keeps the others waiting: ", "rank 1 has been at __main__:", 12),
-    "0 Ctrl-C step 30": ("stopped", "interrupted by SIG", "stopping after this step", None),
+    "0 Ctrl-C step 30": ("stopped", "interrupted by SIG", "", None),
     "1 bug step 30": ("failed", "rank 1", "KeyError: 'no such key'", 28),
     "1 small-files step 30": ("failed", "rank 1: [Errno 27] File too large", "File too large", 28),
 }
