@@ -137,6 +137,7 @@ def run(ranks: Ranks, folder: Path) -> None:
         assert len(np.unique(cells, axis=0)) == len(cells)
         box_ = simulation.part.box
         assert ((everyone[ranks.rank][1].index >= box_.low) & (everyone[ranks.rank][1].index < box_.high)).all()
+        assert everyone[ranks.rank][1].box == (box_.low, box_.high)
         pressure = np.concatenate([cells.fields["pressure"] for _, cells in everyone])
         if ranks.is_root:
             order = np.lexsort(cells.T)

@@ -152,7 +152,7 @@ class Balance:
         edge = edge_of_blocks(now.counts, part.ranks.size)
         load = Load(now.counts, layers, edge, blocks(part, particles, edge) / a_cell)
         everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
-        least, cut = min(found for found in everyone if found is not None)
+        least, cut = min((found for found in everyone if found is not None), default=(math.inf, now.parts))  # none end between blocks
         gains = cut != now.parts and max(work) + fixed > self.bound * (least + fixed)
         return now.cut_anew(cut) if gains else None
 
