@@ -11,7 +11,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.fluids import coupling_kernels as kernels
 from warp_lcp.fluids.forces import walls_of
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns
 from warp_lcp.rigid.bodies import RigidBodies
@@ -37,17 +37,23 @@ class BodyCoupling:
         bodies: the bodies.
         density: of the liquid [kg/m^3].
         share: factor on U V in the outflow, where the problem is one of masses, see `fluids.unilateral`.
+        solved: cells that the problem is of, whose fields have a ring around them; None: all of the grid's domain.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, *, share: float = 1.0) -> None:
-        self.grid, self.boundary, self.bodies = grid, boundary, bodies
+    def __init__(
+        self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, *, share: float = 1.0,
+        solved: Window | None = None,
+    ) -> None:  # fmt: skip
+        self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, solved or grid.domain
         self._scale, self._share = density * grid.cell_volume, share
         self.width = 3 if grid.dimension == 2 else 6
-        self.columns = BlockColumns(grid.size, len(bodies.bodies), self.width, wp.float64, grid.device)
+        low, high = np.array(self._solved.low) - 1, np.array(self._solved.high) + 1
+        self.columns = BlockColumns(int(np.prod(high - low)), len(bodies.bodies), self.width, wp.float64, grid.device)
         body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
         body[bodies.numbers] = np.arange(len(bodies.bodies))
         S = kernels.Solids()
         S.walls, S.bodies = walls_of(grid, boundary), len(bodies.bodies)
+        S.low, S.rows, S.row = wp.vec3i(*low.tolist()), int((high - low)[1]), int((high - low)[2])
         S.body = wp.array(body, dtype=wp.int32, device=grid.device)
         S.center = wp.zeros(len(bodies.bodies), dtype=wp.vec3d, device=grid.device)
         self._solids = S
@@ -69,16 +75,16 @@ class BodyCoupling:
         grid, S = self.grid, self._solids
         S.center.assign(np.array([body.position for body in self.bodies.bodies]))
         block = self.boundary.cut.moving_block()
+        window = None if block is None else grid.window(*block).common(self._solved)
         self._counts.zero_()
         total = 0
-        if block is not None:
-            window = grid.window(*block)
+        if window is not None:
             window.launch_rows(kernels.enter_kernel, [S, kind, self._counts, None, None, None, None])
             wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
             total = int(self._offsets.numpy()[-1]) + int(self._counts.numpy()[-1])
         if total > self.columns.capacity:
             self.columns.reserve(round(SPARE * total))
-        if total:
+        if total and window is not None:
             entries = [self.columns.rows, self.columns.blocks, self.columns.values]
             window.launch_rows(kernels.enter_kernel, [S, kind, self._counts, self._offsets, *entries])
         self.columns.count.fill_(total)

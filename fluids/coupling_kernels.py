@@ -20,6 +20,9 @@ class Solids:
     bodies: int
     body: _I32  # of a wall's number; -1: it is none
     center: wp.array(dtype=wp.vec3d)  # of mass of each body [m]
+    low: wp.vec3i  # first (k, j, i) of what is stored of the problem's fields
+    rows: int  # of a plane of those
+    row: int  # their length
 
 
 @wp.func
@@ -99,7 +102,7 @@ def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _
                                 normal[axis] = share * wp.float64(2 * high - 1)
                                 move += normal
                                 turn += wp.cross(r, normal)
-                        index[e] = (k * kind.shape[1] + j) * kind.shape[2] + i
+                        index[e] = ((k - S.low[0]) * S.rows + j - S.low[1]) * S.row + i - S.low[2]
                         block[e] = least
                         at = e * wp.where(S.walls.planes == 1, 3, 6)
                         values[at] = move[0]

@@ -216,9 +216,13 @@ class LiquidSimulation(ParticleSimulation):
                 if forces is not None and dragged is not None:
                     forces.add(dragged)
                 if self.bodies is not None and dragged is not None:
-                    SolidForces.push(self.bodies, dragged)
+                    SolidForces.push(self.bodies, self._of_all(dragged))
                     self.boundary.begin_step(self.time, dt)  # their velocities are others now
         return row
+
+    def _of_all(self, impulses: np.ndarray) -> np.ndarray:
+        """Return what all parts of the liquid have given the solids, of what this one has."""
+        return impulses
 
     def known_density(self) -> wp.array | None:
         """Return the density that the surface lies in, if it is made of one."""

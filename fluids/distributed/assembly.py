@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from warp_lcp.distributed.bodies import SharedBodies
 from warp_lcp.distributed.narrow_band import SharedNarrowBand
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
-from warp_lcp.distributed.particle_assembly import refusals as refusals_of_all
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.sources import SharedSources
@@ -15,7 +15,7 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed.simulation import DistributedLiquid
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.grid.sides import side_bits
-from warp_lcp.material.particle_assembly import Parts, make_narrow_band, make_outlets, make_sources, placed_solids
+from warp_lcp.material.particle_assembly import Parts, make_bodies, make_narrow_band, make_outlets, make_sources, placed_solids
 from warp_lcp.scene.scene import Scene
 
 METHODS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks
@@ -38,7 +38,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     check_shared(scene, ranks, refusals(scene), METHODS)
     part = part_of(scene, ranks, device, smoothing=scene.pressure.smoothing)
     solids, domain = placed_solids(scene, folder), scene.domain
-    warnings: list[str] = []
+    bodies, warnings = make_bodies(scene, solids, partial(SharedBodies, ranks)), list[str]()
 
     def make_parts(part: Subdomain) -> Parts:
         boundary, warnings[:] = boundary_of_part(
@@ -51,11 +51,16 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     parts = make_parts(part)
     particles, notes = particles_of_part(scene, part, parts, folder)
     return DistributedLiquid(
-        scene, part.grid, parts, particles, make_parts=make_parts, solids=solids, outlets=make_outlets(scene, part.grid, folder),
-        notes=[*warnings, *notes],
+        scene, part.grid, parts, particles, make_parts=make_parts, solids=solids, bodies=bodies,
+        outlets=make_outlets(scene, part.grid, folder), notes=[*warnings, *notes],
     )  # fmt: skip
 
 
 def refusals(scene: LiquidScene) -> list[str]:
     """Return the keys of a scene that ask for what runs on ranks have not."""
-    return refusals_of_all(scene)
+    bodies = any(solid.is_body for solid in scene.solid)
+    asked = {
+        "viscosity around rigid bodies": bodies and scene.viscosity is not None,
+        'pressure.model = "unilateral" around rigid bodies': bodies and scene.pressure.model == "unilateral",
+    }
+    return [key for key, wanted in asked.items() if wanted]

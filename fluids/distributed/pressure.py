@@ -77,7 +77,7 @@ class DistributedPressure(PressureProjection):
         kind, _, _, lower, shift = self._boxes
         cells, decomposition = kind.numpy()[1:-1, 1:-1, 1:-1], self.part.decomposition
         self._operator = DistributedGridPoisson(decomposition, cells, shift=shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._operator, self._rhs, self._least if lower is None else lower, np.inf)
+        self._problem = wl.LCP(self._joined(), self._rhs, self._least if lower is None else lower, np.inf)
         self._work = self.solver.init(self._problem)
 
     def _update(self) -> None:
@@ -85,6 +85,8 @@ class DistributedPressure(PressureProjection):
         if self.boundary.moves:
             self._copy_open()
         self._operator.update(self._boxes[0])
+        if self.coupling is not None:
+            self.coupling.take(self.kind)
 
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface, beside projected faces of other ranks too."""

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from functools import partial
 
+import numpy as np
+
 import warp_lcp as wl
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.fluids.distributed.coupling import SharedBodyCoupling
 from warp_lcp.fluids.distributed.pressure import DistributedPressure
 from warp_lcp.fluids.distributed.probes import SharedProbes
 from warp_lcp.fluids.distributed.surface import SharedSurface
@@ -22,6 +25,7 @@ from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface
 from warp_lcp.fluids.surface_tension import SurfaceTension
 from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.grid.staggered import Window
+from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.material.particle_log import Row
 from warp_lcp.simulation import Part
 
@@ -46,7 +50,11 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
         if self.scene.pressure.model == "unilateral" and isinstance(self.surface.surface, GhostFluidSurface):
             settings = unilateral_settings(self.scene, self.surface.surface, self.weights)
             return SharedUnilateralPressure(self.part, self.boundary, solver, **settings)
-        return DistributedPressure(self.part, self.boundary, solver, **pressure_settings(self.scene, self.surface, self.weights))
+        settings = pressure_settings(self.scene, self.surface, self.weights)
+        if self.bodies is not None:
+            assert isinstance(self.boundary, CutBoundary), "a scene with bodies has cut cells"
+            settings["coupling"] = SharedBodyCoupling(self.part, self.boundary, self.bodies, self.scene.physics.density)
+        return DistributedPressure(self.part, self.boundary, solver, **settings)
 
     def _probes(self) -> Probes | None:
         return SharedProbes(self.part, self.scene.probe, self.gravity, self.part.dimension) if self.scene.probe else None
@@ -88,8 +96,11 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
             self.part.fill(*self.velocity)
         return {name: float(self.part.ranks.sum(value)) for name, value in row.items()}
 
+    def _of_all(self, impulses: np.ndarray) -> np.ndarray:
+        return np.asarray(self.part.ranks.sum(impulses))
+
     def _measure(self) -> None:
         """Fill the rows of the tables by what all ranks have found."""
         if self.forces is not None and self.scene.output.forces:
-            self.forces.impulses = self.part.ranks.sum(self.forces.impulses)
+            self.forces.impulses = self._of_all(self.forces.impulses)
         super()._measure()

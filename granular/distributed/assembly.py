@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
-from warp_lcp.distributed.particle_assembly import refusals as refusals_of_all
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.sources import SharedSources
@@ -59,4 +58,5 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
 
 def refusals(scene: SandScene) -> list[str]:
     """Return the keys of a scene that ask for what runs on ranks have not."""
-    return [*refusals_of_all(scene), *(["domain.periodic"] if scene.endless else [])]
+    bodies = [f"solid[{n}].mass" for n, solid in enumerate(scene.solid) if solid.is_body]
+    return [*bodies, *(["domain.periodic"] if scene.endless else [])]

@@ -38,11 +38,6 @@ def check_shared(scene: ParticleScene, ranks: Ranks, refused: Sequence[str], met
         raise ValueError("; ".join(told))
 
 
-def refusals(scene: ParticleScene) -> list[str]:
-    """Return the keys of a scene that ask for what no material has on ranks."""
-    return [f"solid[{n}].mass" for n, solid in enumerate(scene.solid) if solid.is_body]
-
-
 def part_of(scene: ParticleScene, ranks: Ranks, device: str, *, smoothing: int = 0) -> Subdomain:
     """Return where this rank works: all have about as much material, at the start and when it has come to rest.
 

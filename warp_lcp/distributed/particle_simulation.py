@@ -172,6 +172,7 @@ class SharedParticleSimulation(ParticleSimulation):
             yield
         except (StepFailed, SimulationFailed):
             self.particles.drop_ghosts()
+            self.restore_bodies()
             raise
 
     def bring_to_faces(self, window: Window) -> None:
@@ -250,14 +251,18 @@ class SharedParticleSimulation(ParticleSimulation):
             *self._notes,
         ]
 
+    def body_surfaces(self) -> list[Surface]:
+        """Return the rigid bodies as a frame shows them, on the root rank alone."""
+        return super().body_surfaces() if self.part.ranks.is_root else []
+
     def piece_state(self) -> dict[str, np.ndarray]:
         """Return this rank's part of the state, without pickles, in the whole domain's coordinates.
 
         Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's;
         `time`, `step_count`, `last_dt`, `signature` as of `state`; particles: `position`, `velocity`, `affine_0` ... float32 (n, 3) and
         `place` int64 (n,), their order; of the box, shape (..., nz, ny, nx): `cells` int8, the other fields of `own_state` and those of a
-        narrow band, and once particles were moved apart `density_correction` float64; the numbers of `own_state` and of a band, the same on
-        all ranks.
+        narrow band, and once particles were moved apart `density_correction` float64; the numbers of `own_state`, of a band and of
+        bodies, the same on all ranks.
         """
         box, own = self.part.box, self._own_fields()
         fields = {name: np.ascontiguousarray(self.part.box_of(field)) for name, field in self._cell_fields(own).items()}
@@ -268,7 +273,8 @@ class SharedParticleSimulation(ParticleSimulation):
         return where | clock | numbers | particles | {"place": self.particles.place.copy()} | fields
 
     def _own_fields(self) -> dict[str, np.ndarray]:
-        return self.own_state() | (self.band.state() if self.band is not None else {})
+        parts = (part.state() for part in (self.band, self.bodies) if part is not None)
+        return self.own_state() | {name: values for part in parts for name, values in part.items()}
 
     def _cell_fields(self, own: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         return fields_of(own) | self.rearrangement.state()
@@ -312,6 +318,8 @@ class SharedParticleSimulation(ParticleSimulation):
         if self.band is not None:
             self.band.restore(found)
         self.time, self.step_count, self.last_dt = float(numbers["time"]), int(numbers["step_count"]), float(numbers["last_dt"])
+        if self.bodies is not None:
+            self.bodies.restore(numbers)
         self.boundary.place(self.time)
 
     def state(self) -> dict[str, np.ndarray]:

@@ -51,12 +51,13 @@ def placed_solids(scene: ParticleScene, folder: Path) -> list[PlacedSolid]:
     return placed
 
 
-def make_bodies(scene: ParticleScene, placed: Sequence[PlacedSolid]) -> RigidBodies | None:
+def make_bodies(scene: ParticleScene, placed: Sequence[PlacedSolid], make: Callable[..., RigidBodies] = RigidBodies) -> RigidBodies | None:
     """Return the rigid bodies among a scene's solids, if there are any, among its walls and the other solids.
 
     Args:
         scene: the scene.
         placed: its solids, of `placed_solids`: the boundary must be of the same.
+        make: makes them of what `RigidBodies` takes.
 
     Raises:
         ValueError: a body overlaps a wall, a solid or another body, or its center lies outside the domain.
@@ -71,7 +72,7 @@ def make_bodies(scene: ParticleScene, placed: Sequence[PlacedSolid]) -> RigidBod
         if not ((body.position >= 0.0) & (body.position <= np.array(_vector(scene.domain.size)))).all():
             raise ValueError(f"{body.name} has its center of mass at {body.position.round(6).tolist()} m, outside the domain")
     shapes = [placed[number - 1].geometry for number in motions]
-    return RigidBodies(bodies, shapes, list(motions), (walls, *others), scene.dimension)
+    return make(bodies, shapes, list(motions), (walls, *others), scene.dimension)
 
 
 def make_boundary(

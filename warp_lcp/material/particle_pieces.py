@@ -10,6 +10,7 @@ from warp_lcp.material.particle_rearrangement import STATE
 
 Piece = Mapping[str, np.ndarray]  # what one rank has of a simulation's state; the last axes of what lies in cells are z, y, x
 
+ALIKE = ("bodies", "body_contacts")  # tables of what all ranks have
 LATER = {STATE: np.float64}  # there once particles have been moved apart
 
 
@@ -53,7 +54,7 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
     for name, values in like.items():
         if name in fields:
             whole[name] = np.array(values)
-        elif values.ndim == 2:
+        elif values.ndim == 2 and name not in ALIKE:
             whole[name] = np.concatenate([piece[name] for piece in pieces])[order]
         else:
             whole[name] = np.asarray(pieces[0][name])

@@ -192,8 +192,11 @@ class RigidBodies:
         if states.shape != (len(self.bodies), STATE):
             raise ValueError(f"the state's bodies have shape {states.shape}: this scene has {(len(self.bodies), STATE)}")
         self._begun = None
+        self._take(state)
+
+    def _take(self, state: Mapping[str, np.ndarray]) -> None:
         self._solve.memory.restore(state.get("body_contacts", np.zeros((0, 8))))
-        for body, values in zip(self.bodies, states, strict=True):
+        for body, values in zip(self.bodies, np.asarray(state["bodies"], dtype=np.float64), strict=True):
             body.restore(values)
 
     def columns(self) -> tuple[str, ...]:
