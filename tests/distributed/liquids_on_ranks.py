@@ -50,6 +50,20 @@ RIVER = {
     "solver": {"precision": "double"},
     "output": {"forces": True},
 }
+FLOATING = {  # at a cut, on the floor, in another rank's box and in the air
+    "solid": [
+        BALL | {"density": 300.0},
+        box([0.1, 0.001, 0.1], [0.3, 0.1, 0.3], density=2000.0),
+        {"shape": "capsule", "from": [0.8, 0.3, 0.2], "to": [0.9, 0.3, 0.3], "radius": 0.06, "density": 500.0, "velocity": [-1.0, 0, 0]},
+    ],
+    "wall_drag": {"coefficient": 0.1},
+    "solver": {"precision": "double"},
+    "output": {"forces": True},
+}
+RAFTS = [  # in contact at cuts
+    box([0.36, 0.2], [0.499, 0.3], density=500.0, angular_velocity=-90.0),
+    box([0.501, 0.21], [0.66, 0.29], mass=5.0, velocity=[-0.5, 0.0], wall="separating"),
+]
 COLUMN = {"size": DEEP["size"], "resolution": 24, "sand": [box([0.0, 0.0, 0.0], [0.4, 0.4, 0.5])]}
 HEAP = {"size": FLAT["size"], "resolution": 32, "sand": [box([0.3, 0.0], [1.0, 0.4])]}
 POURED = box([0.6, 0.35, 0.1], [0.8, 0.45, 0.4], velocity=[0.3, -1.0, 0.2])
@@ -77,6 +91,8 @@ SCENES = {
     "thick letting go": FLAT | {"viscosity": {"value": 30.0, "slip_length": 0.02}, "liquid": [box([0.3, 0.1], [0.7, 0.5])]},
     "banded": POOL | {"particles": {"narrow_band": {"width": 3.0}, "reseed": {}, "transfer": "flip"}, "solver": {"precision": "double"}},
     "unilateral": FLAT | {"pressure": {"model": "unilateral"}, "solid": [DISC], "domain": OPEN, "solver": {"precision": "double"}},
+    "floating": DEEP | FLOATING,
+    "rafts": FLAT | {"solid": RAFTS, "density_correction": {}, "solver": {"precision": "double", "method": "minimum-map-newton"}},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 
@@ -132,13 +148,15 @@ def run(ranks: Ranks, folder: Path) -> None:
         moved += [name] if simulation.part.decomposition.parts != cut else []
         ranks.agree("the log", rows)
         everyone = ranks.comm.allgather(list(simulation.frame()))
-        assert sum(len(points.points) for points, _ in everyone) == rows[-1]["particles"]
-        cells = np.concatenate([cells.index for _, cells in everyone])
+        assert sum(len(points.points) for points, *_ in everyone) == rows[-1]["particles"]
+        bodies = [part for _, _, *parts in everyone for part in parts]
+        assert [part.name for part in bodies] == ["bodies"] * (simulation.bodies is not None)  # of one rank
+        cells = np.concatenate([cells.index for _, cells, *_ in everyone])
         assert len(np.unique(cells, axis=0)) == len(cells)
         box_ = simulation.part.box
         assert ((everyone[ranks.rank][1].index >= box_.low) & (everyone[ranks.rank][1].index < box_.high)).all()
         assert everyone[ranks.rank][1].box == (box_.low, box_.high)
-        pressure = np.concatenate([cells.fields["pressure"] for _, cells in everyone])
+        pressure = np.concatenate([cells.fields["pressure"] for _, cells, *_ in everyone])
         if ranks.is_root:
             order = np.lexsort(cells.T)
             np.savez(folder / f"{name}_{ranks.size}.npz", cells=cells[order], pressure=pressure[order])
@@ -169,7 +187,7 @@ def wrap(ranks: Ranks, folder: Path) -> None:
                 np.savez(folder / f"{name}_{step}_{ranks.size}.npz", points=mesh.points, corners=mesh.corners, **found)
 
 
-RESUMED = ("cut", "river", "crowded", "thick and thin", "banded", "sand", "stirred sand")
+RESUMED = ("cut", "river", "crowded", "floating", "thick and thin", "banded", "sand", "stirred sand")
 
 
 def keep(ranks: Ranks, folder: Path) -> None:
