@@ -15,17 +15,14 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import SurfaceMesh
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.grid.vicinity import Vicinity
-from warp_lcp.material.coverage import Coverage, box_of, carry_over, cells_between, pace_of, travel
+from warp_lcp.material.coverage import Coverage, carry_over, cells_between, pace_of, travel
 from warp_lcp.material.flight import Flights
-from warp_lcp.material.narrow_band import without_band
 from warp_lcp.material.particle_assembly import Parts, make_particle_volume, make_surface_mesh
-from warp_lcp.material.particle_frames import ParticleFrames
+from warp_lcp.material.particle_checkpoints import ParticleCheckpoints
 from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
-from warp_lcp.material.particle_pieces import Piece, state_of
 from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
-from warp_lcp.material.resample import resampled, resampling_notes
+from warp_lcp.material.particle_state import particle_trouble
 from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.material.spray import Spray
 from warp_lcp.material.wall import Join
@@ -33,7 +30,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, Stopwatch
 
 
-class ParticleSimulation(ParticleFrames):
+class ParticleSimulation(ParticleCheckpoints):
     """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
 
     Particles have the velocities of the middle of the last step, the grid in a step those of its middle: forces act for `kick_dt`, half of
@@ -79,7 +76,6 @@ class ParticleSimulation(ParticleFrames):
     """
 
     shared = False  # whether others have parts of the grid
-    added = 0  # particles, by a program
     vicinity: Vicinity | None = None
 
     def __init__(
@@ -136,10 +132,6 @@ class ParticleSimulation(ParticleFrames):
         s = self.scene
         return Flights(self.grid, self.boundary, coheres=s.coheres, settles=s.speeds_up) if s.flies else None
 
-    @abstractmethod
-    def mark(self) -> None:
-        """Find the material's cells from the sorted particles, as frames show them before the first step."""
-
     def known_density(self) -> wp.array | None:
         """Return the particles' density in units of that at rest, if a step has found it before anything moves."""
         return None
@@ -151,14 +143,6 @@ class ParticleSimulation(ParticleFrames):
     @abstractmethod
     def own_columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns that the material's own models fill."""
-
-    @abstractmethod
-    def own_state(self) -> dict[str, np.ndarray]:
-        """Return copies of what the next solve starts from and a frame shows; `cells`, int8 of AIR, FLUID, SOLID, must be among them."""
-
-    @abstractmethod
-    def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from the arrays of `own_state`, whose shapes, types and values have been checked."""
 
     def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
         """Go on on another grid of the same domain.
@@ -386,115 +370,6 @@ class ParticleSimulation(ParticleFrames):
             "departed": bool(self.scene.domain.open),
         }
         return columns(self.own_columns(), told, self.bodies.columns() if self.bodies is not None else ())
-
-    def _fields(self) -> dict[str, np.ndarray]:
-        """Return copies of what of the state lies on the grid, with the numbers that belong to it."""
-        band = self.band.state() if self.band is not None else {}
-        return self.own_state() | band | self.rearrangement.state()
-
-    def _take_fields(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from the arrays of `_fields`."""
-        self.restore_own({name: np.asarray(state[name]) for name in self.own_state()})
-        self.rearrangement.restore(state)
-        if self.band is not None:
-            self.band.restore(state)
-
-    def _particle_arrays(self) -> dict[str, np.ndarray]:
-        """Return copies of the particles' arrays by name, those of the spray at the end."""
-        return {name: self.spray.behind(name, array.numpy()) for name, array in self.particles.arrays().items()}
-
-    def _assign(self, arrays: Mapping[str, np.ndarray], flying: int = 0) -> None:
-        """Take other particles, of which the last ones fly."""
-        on_grid = len(arrays["position"]) - (flying if self.spray.active else 0)
-        self.particles.assign({name: arrays[name][:on_grid] for name in self.particles.arrays()})
-        self.spray.particles.assign({name: arrays[name][on_grid:] for name in self.spray.particles.arrays()})
-        self._faces_know = False
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too."""
-        flying = self.spray.particles.count
-        counts = {"spray": flying, "added": self.added}
-        particles = self._particle_arrays() | {name: np.array(count) for name, count in counts.items() if count}
-        clock = {name: np.array(getattr(self, name)) for name in ("time", "step_count", "last_dt")}
-        bodies = self.bodies.state() if self.bodies is not None else {}
-        return clock | {"signature": signature(self.scene, self.grid)} | particles | self._fields() | bodies | box_of(self.grid)
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from `state`.
-
-        Raises:
-            ValueError: the arrays do not belong to this scene.
-        """
-        state = self._on_this_grid(state)
-        self.rearrangement.expect(state)
-        expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
-        self.added = int(state.get("added", 0))
-        varies = bool(self.sources or self.outlets or self.band or self.added)
-        check_state(state, expected, changing=[*self.particles.arrays()] if varies else [], solids_move=self.boundary.moves)
-        self._assign(state, int(state.get("spray", 0)))
-        self._take_fields(state)
-        self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
-        if self.bodies is not None:
-            self.bodies.restore(state)
-        self.boundary.place(self.time)
-
-    def restore_pieces(self, pieces: Sequence[Piece]) -> None:
-        """Continue from the pieces of all ranks of a run on several, see `warp_lcp.distributed.particle_simulation`.
-
-        Raises:
-            ValueError: the pieces do not belong to this scene.
-        """
-        if self.grid.whole is not None and self._coverage is not None:
-            self.cover(self._coverage.domain)
-        self.restore(state_of(pieces, self.state()))
-
-    def _on_this_grid(self, state: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        """Lay the grid of a state if the scene allows that, else bring the state to this one's.
-
-        Raises:
-            ValueError: its box is not in this domain.
-        """
-        same = np.array_equal(state.get("signature", ()), signature(self.scene, self.grid))
-        grid = self._coverage.at(state.get("box")) if self._coverage is not None and same else self.grid
-        if grid != self.grid and self.scene.domain.follow:
-            self.cover(grid, state)
-        if grid == self.grid:
-            return state
-        self.rearrangement.expect(state)
-        return carry_over(state, grid, self.grid, self._fields())
-
-    def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
-        """Continue from the state of the same scene on another grid: with other particles, and without a solution to start from.
-
-        Raises:
-            ValueError: the state differs in more than the grid, or no particle is left.
-        """
-        spacing = other_spacing(state, self.scene, self.grid)
-        self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
-        if self.bodies is not None:
-            if "bodies" not in state:
-                raise ValueError("the state has no bodies: it does not belong to this scene")
-            self.bodies.restore(state)
-        self.boundary.place(self.time)
-        settings, wanted = self.scene.particles, self.particles.arrays().keys()
-        state = without_band(state, spacing, settings.seed)
-        arrays, moved = resampled(
-            {name: np.asarray(state[name]) for name in wanted}, self.grid, self.admits, spacing=spacing,
-            per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
-        )  # fmt: skip
-        self._assign(arrays)
-        if self.band is not None:
-            self.band.forget()
-        self.particles.sort()
-        self.mark()
-        return resampling_notes(len(state["position"]), self.particles.count, moved, spacing, self.grid)
-
-    def add(self, position: np.ndarray, velocity: np.ndarray) -> None:
-        """Add particles between two steps; positions [m] and velocities [m/s] of shape (n, 3), where the material may be."""
-        self.particles.append(position, velocity)
-        self.added += len(position)
-        self._faces_know = False
-        self.particles.sort()
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
