@@ -91,7 +91,7 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
 
     def _meet_walls(self, window: Window, dt: float) -> Row:
         """Collect what the projection has done to solids in this rank's box, and let walls drag there."""
-        row = super()._meet_walls(self.part.owned, dt)
+        row = super()._meet_walls(self.part.own_faces, dt)
         if self.wall_drag is not None:
             self.part.fill(*self.velocity)
         return {name: float(self.part.ranks.sum(value)) for name, value in row.items()}

@@ -43,6 +43,7 @@ CAPILLARY = {"surface_tension": {"coefficient": 0.5, "contact_angle": 60.0}, "so
 TILTED = {"physics": {"gravity": [3.0, -8.0, 2.0]}}
 RIVER = {
     "domain": OPEN,
+    "liquid": [*FLAT["liquid"], box([0.85, 0.0], [1.0, 0.3], velocity=[1.0, 0.0])],  # out of the open side, along the floor
     "source": [box([0.0, 0.2], [0.1, 0.4], velocity=[1.5, 0.2], stop=0.08)],
     "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.02)],
     "solid": [box([0.6, 0.0], [0.7, 0.2], motion={"kind": "translation", "velocity": [-0.4, 0.1]})],

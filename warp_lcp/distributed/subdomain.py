@@ -50,6 +50,7 @@ class Subdomain:
         grid: the part as a grid, whose coordinates and positions are those of the whole domain.
         cuts: has bit n set if side n of the part, see `warp_lcp.grid.sides`, is a cut.
         owned: the cells of the box.
+        own_faces: those whose lower faces belong to the box: its cells, and the ring beyond the domain's upper sides that it touches.
 
     Raises:
         ValueError: a box has fewer cells along a cut axis than layers; on all ranks.
@@ -71,6 +72,8 @@ class Subdomain:
         self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts)
         inner = self.box.moved(cells.low, -1)
         self.owned = self.grid.window([low + 1 for low in inner.low], inner.high)
+        last = [high == count for high, count in zip(self.box.high, decomposition.counts, strict=True)]
+        self.own_faces = self.grid.window([low + 1 for low in inner.low], [high + end for high, end in zip(inner.high, last, strict=True)])
         self.cuts = 0
         for axis in range(dimension):
             for side in range(2):
