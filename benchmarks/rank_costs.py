@@ -62,8 +62,8 @@ class Traffic:
 def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
     """Return how many ghost cells are filled."""
     if isinstance(owner, Subdomain):
-        return len(owner.forest(width=width).getGraph()[2]) if owner.ranks.size > 1 else 0
-    return 0 if owner._forest is None else len(owner._forest.getGraph()[2])
+        return len(owner.forest(width=width).made.getGraph()[2]) if owner.ranks.size > 1 else 0
+    return 0 if owner._forest is None else len(owner._forest.made.getGraph()[2])
 
 
 def _item(field: wp.array | np.ndarray) -> int:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.halo import StarForest
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import SandReport
@@ -39,14 +40,14 @@ class SharedPacking(Packing):
 
     def __init__(self, part: Subdomain, base: wp.array, capacity: wp.array, **more: Any) -> None:
         self._part = part
-        self._forest: Any = None  # of this step's sand
+        self._forest: StarForest | None = None  # of this step's sand
         super().__init__(part.grid, base, capacity, counted=part.owned, **more)
 
     def update(self, *arguments: Any) -> None:
         """Take sand as it is now, see the base class."""
         super().update(*arguments)
         if self._forest is not None:
-            self._forest.destroy()
+            self._forest.free()
             self._forest = None
 
     def join(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:

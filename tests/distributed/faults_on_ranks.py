@@ -28,6 +28,7 @@ SIGNALS = {"killed": signal.SIGKILL, "stopped": signal.SIGSTOP, "crashed": signa
 TO_ALL = {"Ctrl-C": signal.SIGINT, "ended": signal.SIGTERM, "launcher-killed": signal.SIGKILL, "stop": signal.SIGUSR1}  # to mpiexec
 KINDS = (*SIGNALS, *TO_ALL, "late", "bug", "disk", "disk-full", "small-files")
 PLACES = ("file", "wait", "wait-end", "step")
+HEARD = threading.Event()  # a signal that this process handles
 
 
 class Fault:
@@ -52,7 +53,7 @@ class Fault:
             os.kill(os.getpid(), SIGNALS[self.kind])
         elif self.kind in TO_ALL:
             os.kill(os.getppid(), TO_ALL[self.kind])
-            time.sleep(0.5)  # mpiexec takes a while to hand it on
+            HEARD.wait(5.0)  # mpiexec takes a while to hand it on
         elif self.kind == "late":
             time.sleep(1e4)
         elif self.kind == "bug":
@@ -61,6 +62,20 @@ class Fault:
             resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
         else:
             raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def listen() -> None:
+    """Note when handlers of signals are called that are set from here on."""
+    real = signal.signal
+
+    def hearing(number: int, handler: Any) -> Any:
+        def handled(*arguments: Any) -> None:
+            HEARD.set()
+            handler(*arguments)
+
+        return real(number, handled if callable(handler) else handler)
+
+    signal.signal = hearing  # type: ignore[assignment]
 
 
 def lay_in_wait(place: str, fault: Fault) -> None:
@@ -88,6 +103,7 @@ def main(words: list[str]) -> None:
     """Run a command of the command line."""
     rank, kind, place, number = os.environ["FAULT"].split()
     if launch.rank_here() == int(rank):
+        listen()
         lay_in_wait(place, Fault(kind, int(number)))
     if "dots.toml" in words:
         dots_on_ranks.main(words)

@@ -23,3 +23,24 @@ PROGRAM = """
 
 def test_a_rank_without_objects_makes_the_next_one(mpi):
     assert sorted(mpi(2, PROGRAM, seconds=30.0).stdout.split()) == ["made0", "made1"]
+
+
+ENDED = """
+    import gc
+    from warp_lcp.distributed.decomposition import CellBox
+    from warp_lcp.distributed.halo import star_forest
+    from warp_lcp.distributed.ranks import Ranks
+
+    ranks = Ranks.world()
+    boxes = [CellBox((0, 0, rank), (1, 1, rank + 1)) for rank in range(2)]
+    forests = [star_forest(ranks, boxes, [box.grown(1) for box in boxes])]
+    if ranks.is_root:
+        forests.append(forests)
+    del forests
+    gc.collect()
+    print(f"ended{ranks.rank} ", end="")
+"""
+
+
+def test_a_rank_that_found_no_garbage_ends_with_the_others(mpi):
+    assert sorted(mpi(2, ENDED, seconds=30.0).stdout.split()) == ["ended0", "ended1"]

@@ -39,7 +39,7 @@ class SharedBodies(RigidBodies):
     def _take_root(self) -> None:
         """Take the bodies, what holds them and the memory of contacts from the root rank."""
         mine = self.state(), [body.hold for body in self.bodies], self.contacts, self.contact_residual
-        state, holds, self.contacts, self.contact_residual = self._ranks.of_root(mine)
+        state, holds, self.contacts, self.contact_residual = self._ranks.share(mine)
         self._take(state)
         for body, hold in zip(self.bodies, holds, strict=True):
             body.hold = hold

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import sys
+import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -148,10 +149,12 @@ class Decomposition:
     def dmda(self) -> Any:
         """The same as a DMDA of PETSc: one number a cell, 7-point stencils."""
         PETSc = petsc()
-        return PETSc.DMDA().create(
+        made = PETSc.DMDA().create(
             dim=3, dof=1, sizes=self.counts, proc_sizes=self.processes, ownership_ranges=self.parts, stencil_width=1,
             stencil_type=PETSc.DMDA.StencilType.STAR, comm=self.ranks.comm,
         )  # fmt: skip
+        weakref.finalize(self, made.destroy)  # as of `halo.StarForest`
+        return made
 
 
 def parts(n: int, p: int) -> list[int]:

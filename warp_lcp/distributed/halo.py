@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import weakref
 from collections.abc import Sequence
 from functools import cache, cached_property
 from typing import Any
@@ -89,6 +90,7 @@ class Halo:
 
     def _fill_through_host(self, field: wp.array[Any]) -> None:
         """Fill a field on a device: what lies within the width of the cuts goes through the host's memory, PETSc needs no CUDA then."""
+        assert self._forest is not None
         host = self._staging.setdefault(field.dtype, np.zeros(self.shape, dtype=wp.dtype_to_numpy(field.dtype)))
         for inner in self._slabs(ghost=False):
             host[inner] = field[inner].numpy()
@@ -140,16 +142,30 @@ class Gathering:
             target.numpy()[...] = source.numpy()
 
 
-def exchange(forest: Any, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
+class StarForest:
+    """A star forest of PETSc that is freed with the last reference to it.
+
+    What Python frees as a part of a cycle petsc4py keeps for PETSc's own end, for which ranks wait for ever unless all have kept equally
+    much; but each looks for cycles at another time.
+
+    Args:
+        made: the forest, which nobody else has.
+    """
+
+    def __init__(self, made: Any) -> None:
+        self.made, self.free = made, weakref.finalize(self, made.destroy)
+
+
+def exchange(forest: StarForest, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
     """Copy roots to leaves over a star forest; leaves may lie in the same array."""
     exchange_all(forest, [(roots, roots if leaves is None else leaves)])
 
 
-def exchange_all(forest: Any, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
     """Copy roots to leaves over a star forest, many of them at once: their messages are under way together."""
     transport = _transport()
     for roots, leaves in pairs:
-        forest.bcastBegin(transport.units[roots.dtype.itemsize], roots, leaves, transport.replace)
+        forest.made.bcastBegin(transport.units[roots.dtype.itemsize], roots, leaves, transport.replace)
     with waiting("an exchange of ghost cells"):
         for roots, leaves in pairs:
             transport.end(forest, roots, leaves)
@@ -174,14 +190,14 @@ class _Transport:
         self._replace = handle(MPI.REPLACE)
         self._end = ctypes.CDLL(petsc().__file__).PetscSFBcastEnd
 
-    def end(self, forest: Any, roots: np.ndarray, leaves: np.ndarray) -> None:
+    def end(self, forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> None:
         """Wait for the leaves.
 
         Raises:
             RuntimeError: PETSc has failed.
         """
         where = (ctypes.c_void_p(array.ctypes.data) for array in (roots, leaves))
-        fault = self._end(ctypes.c_void_p(forest.handle), self._handles[roots.dtype.itemsize], *where, self._replace)
+        fault = self._end(ctypes.c_void_p(forest.made.handle), self._handles[roots.dtype.itemsize], *where, self._replace)
         if fault:
             raise RuntimeError(f"PetscSFBcastEnd: error {fault}")
 
@@ -192,7 +208,7 @@ _transport = cache(_Transport)
 def star_forest(
     ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox], *, filled: CellBox | None = None, layers: int = 1,
     whole: CellBox | None = None, which: np.ndarray | None = None,
-) -> Any:  # fmt: skip
+) -> StarForest:  # fmt: skip
     """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
 
     Args:
@@ -220,7 +236,7 @@ def star_forest(
                 remotes.append(_remote(rank, there + layer * remote.cells))
     forest = petsc().SF().create(comm=ranks.comm)
     forest.setGraph(roots, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
-    return forest
+    return StarForest(forest)
 
 
 def _elements(box: CellBox, within: CellBox) -> np.ndarray:

@@ -105,10 +105,6 @@ class Ranks:
         """Return whether it holds on some rank."""
         return bool(self.gather(np.uint8(bool(condition))).any())
 
-    def of_root(self, value: Any) -> Any:
-        """Return what the root rank has given, of a type that can be pickled."""
-        return value if self.size == 1 else self.comm.bcast(value)
-
     def join(self, key: bytes) -> bytes:
         """Return a key of 16 bytes that stands for those of all ranks."""
         mine = np.frombuffer(hashlib.blake2b(key, digest_size=16).digest(), dtype=np.uint8)

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
-from warp_lcp.distributed.halo import exchange_all, star_forest
+from warp_lcp.distributed.halo import StarForest, exchange_all, star_forest
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.staggered import StaggeredGrid
 
@@ -59,7 +59,7 @@ class Subdomain:
     def __init__(self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int) -> None:
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box = decomposition.ranks, decomposition.box
-        self._forests: dict[tuple[int, int | None, int], Any] = {}
+        self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
         for axis in decomposition.cut_axes:
             least, most = min(decomposition.parts[axis]), max(decomposition.counts[axis] // layers, 1)
@@ -88,7 +88,7 @@ class Subdomain:
         """Return the cells of the part around a box, without its ring."""
         return box.grown(self.layers - 1).common(CellBox((0, 0, 0), self.decomposition.counts))
 
-    def forest(self, layers: int = 1, width: int | None = None, parts: int = 1, which: np.ndarray | None = None) -> Any:
+    def forest(self, layers: int = 1, width: int | None = None, parts: int = 1, which: np.ndarray | None = None) -> StarForest:
         """Return the star forest of several ranks that fills ghost cells and the rings beside them; collective.
 
         Args:
@@ -117,7 +117,7 @@ class Subdomain:
             high[axis] += box.high[axis] == self.decomposition.counts[axis]
         return CellBox.of(low, high)
 
-    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: Any = None) -> None:
+    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: StarForest | None = None) -> None:
         """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
 
         Args:
