@@ -42,6 +42,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch
+from warp_lcp.rows.vectors import Across
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a force, relative to the diagonal times the speed
 STIFF = 1.0  # of nu dt / dx^2: where it is less, faces without mass, which nobody reads, would decide by their error when a solve ends
@@ -87,6 +88,8 @@ class Viscosity:
         max_iterations: of conjugate gradients in a step; 200 unless given, 1000 where viscosities differ.
         bodies: those that the liquid moves, among the solids; None: there are none.
         sources: whether cells may turn SOLID, as those of sources do.
+        solved: cells whose faces have unknowns here; None: all of the grid's domain.
+        across: who has the other faces, for whom `solve` and `push_bodies` are collective then; None: nobody.
 
     Attributes:
         change: what the last step changed of each component [m/s].
@@ -97,7 +100,7 @@ class Viscosity:
     def __init__(
         self, grid: StaggeredGrid, boundary: Boundary, *, viscosity: float, density: float, slip_lengths: Sequence[float],
         phi: wp.array | None, tolerance: float, thickest: float | None = None, max_iterations: int | None = None, sources: bool = False,
-        bodies: RigidBodies | None = None,
+        bodies: RigidBodies | None = None, solved: Window | None = None, across: Across | None = None,
     ) -> None:  # fmt: skip
         self.grid, self.boundary, self.tolerance, self.max_iterations = (
             grid,
@@ -106,6 +109,7 @@ class Viscosity:
             max_iterations or (200 if thickest is None else 1000),
         )
         self._viscosity, self._density, self._phi = viscosity, density, phi
+        self._inner, self._across = solved or grid.domain, across
         self._passes = viscous_passes(grid.dimension, bool(boundary.open), phi is not None, bool(boundary.velocity), thickest is not None)
         self._thickest = thickest or 1.0
         slips = np.asarray(slip_lengths, dtype=np.float32) / np.float32(grid.spacing)
@@ -123,9 +127,8 @@ class Viscosity:
         self._bodies: BodyDrag | None = None
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
-            self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes)
+            self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes, self._inner, across)
         self._solver = self._krylov()
-        self._inner = grid.domain
         self._trail, self._sums = Trail(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
 
     def solve(
@@ -181,7 +184,7 @@ class Viscosity:
         return VectorMultigrid(self.grid)
 
     def _krylov(self) -> ConjugateGradient:
-        return ConjugateGradient(self._product, self.multigrid)
+        return ConjugateGradient(self._product, self.multigrid, across=self._across)
 
     def _boxes(self, window: Window) -> tuple[Window, Window | None]:
         """Return where something may differ from what the last step left, and which cells of these have unknowns; None: none has."""
@@ -190,10 +193,6 @@ class Viscosity:
 
     def _share(self, fields: Sequence[wp.array]) -> None:
         """Take what other parts of the grid know of fields, if there are any."""
-
-    def _of_all(self, found: np.ndarray) -> np.ndarray:
-        """Return sums over all parts of the grid."""
-        return found
 
     @property
     def _walls_of_faces(self) -> dict[str, Sequence[wp.array]]:
@@ -302,7 +301,8 @@ class Viscosity:
         if self._bodies is not None:
             self._bodies.answer(self.multigrid.r, self._change)
             found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
-        found = self._of_all(found)
+        if self._across is not None:
+            found = self._across.sum(found)
         return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]
 
 

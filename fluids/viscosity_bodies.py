@@ -15,6 +15,7 @@ from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.operators.low_rank import BlockColumns, weigh_kernel
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rows.program import Launch
+from warp_lcp.rows.vectors import Across
 
 SPARE = 1.5  # room for links, times those there are when there is none left
 
@@ -135,17 +136,23 @@ class BodyDrag:
         bodies: the bodies.
         density: of the liquid [kg/m^3].
         passes: of the viscous solve.
+        solved: cells whose faces the equations are of.
+        across: who has other faces, for whom all methods are collective then; None: nobody.
 
     Attributes:
         moved: whether the columns lie elsewhere since the last step.
         change: of the bodies' velocities in the step so far.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, passes: Any) -> None:
-        self.grid, self.boundary, self.bodies = grid, boundary, bodies
+    def __init__(
+        self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, passes: Any, solved: Window,
+        across: Across | None,
+    ) -> None:  # fmt: skip
+        self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, solved
         self._pull = WallPull(grid, boundary, bodies.numbers, 1 + len(boundary.cut.solids), passes)
         self._scale, self._width = density * grid.cell_volume, self._pull.width
         self.columns = BlockColumns(grid.dimension * grid.size, len(bodies.bodies), self._width, wp.float64, grid.device)
+        self.columns.across = across
         rank = self.columns.rank
         self._response = wp.zeros((rank, rank), dtype=wp.float64, device=grid.device)
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
@@ -155,10 +162,14 @@ class BodyDrag:
     ) -> None:
         """Find what pulls the bodies in a step, and how they answer to the liquid's velocity as it is; arguments as of `WallPull`."""
         block, bodies, dimension = self.boundary.cut.moving_block(), self.bodies.bodies, self.grid.dimension
-        window = None if block is None else self.grid.window(*block, grow=1).common(self.grid.domain)
+        window = None if block is None else self.grid.window(*block, grow=1).common(self._solved)
         points = np.array([body.position for body in bodies])
         self._pull.take(window, level, walls, where, points)
-        pulled, self._drag = self._pull.pulled(velocity, points)
+        pulled, drags = self._pull.pulled(velocity, points)
+        if self.columns.across is not None:
+            found = self.columns.across.sum(np.concatenate((pulled[:, None], drags), axis=1))
+            pulled, drags = found[:, 0], found[:, 1:]
+        self._drag = drags
         count = len(self._pull.rows)
         self.moved = count > self.columns.capacity
         if self.moved:

@@ -35,7 +35,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     """
     if not isinstance(scene, LiquidScene):
         raise ValueError("scene.simulator: fluids needs a scene of liquid")
-    check_shared(scene, ranks, refusals(scene), METHODS)
+    check_shared(scene, ranks, [], METHODS)
     part = part_of(scene, ranks, device, smoothing=scene.pressure.smoothing)
     solids, domain = placed_solids(scene, folder), scene.domain
     bodies, warnings = make_bodies(scene, solids, partial(SharedBodies, ranks)), list[str]()
@@ -54,13 +54,3 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
         scene, part.grid, parts, particles, make_parts=make_parts, solids=solids, bodies=bodies,
         outlets=make_outlets(scene, part.grid, folder), notes=[*warnings, *notes],
     )  # fmt: skip
-
-
-def refusals(scene: LiquidScene) -> list[str]:
-    """Return the keys of a scene that ask for what runs on ranks have not."""
-    bodies = any(solid.is_body for solid in scene.solid)
-    asked = {
-        "viscosity around rigid bodies": bodies and scene.viscosity is not None,
-        'pressure.model = "unilateral" around rigid bodies': bodies and scene.pressure.model == "unilateral",
-    }
-    return [key for key, wanted in asked.items() if wanted]

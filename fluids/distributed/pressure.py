@@ -86,7 +86,7 @@ class DistributedPressure(PressureProjection):
             self._copy_open()
         self._operator.update(self._boxes[0])
         if self.coupling is not None:
-            self.coupling.take(self.kind)
+            self.coupling.take(self._unknown)
 
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface, beside projected faces of other ranks too."""

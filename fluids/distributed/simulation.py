@@ -47,14 +47,15 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
 
     def _pressure(self) -> PressureProjection:
         solver = wl.METHODS[self.scene.solver.method](precision=self.scene.solver.precision)
-        if self.scene.pressure.model == "unilateral" and isinstance(self.surface.surface, GhostFluidSurface):
-            settings = unilateral_settings(self.scene, self.surface.surface, self.weights)
-            return SharedUnilateralPressure(self.part, self.boundary, solver, **settings)
-        settings = pressure_settings(self.scene, self.surface, self.weights)
+        coupling = None
         if self.bodies is not None:
             assert isinstance(self.boundary, CutBoundary), "a scene with bodies has cut cells"
-            settings["coupling"] = SharedBodyCoupling(self.part, self.boundary, self.bodies, self.scene.physics.density)
-        return DistributedPressure(self.part, self.boundary, solver, **settings)
+            coupling = SharedBodyCoupling(self.part, self.boundary, self.bodies, self.scene.physics.density)
+        if self.scene.pressure.model == "unilateral" and isinstance(self.surface.surface, GhostFluidSurface):
+            settings = unilateral_settings(self.scene, self.surface.surface, self.weights)
+            return SharedUnilateralPressure(self.part, self.boundary, solver, coupling=coupling, **settings)
+        settings = pressure_settings(self.scene, self.surface, self.weights)
+        return DistributedPressure(self.part, self.boundary, solver, coupling=coupling, **settings)
 
     def _probes(self) -> Probes | None:
         return SharedProbes(self.part, self.scene.probe, self.gravity, self.part.dimension) if self.scene.probe else None
@@ -64,7 +65,7 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
         return self.in_box(super().frame())
 
     def _viscosity(self) -> Viscosity | None:
-        return make_viscosity(self.scene, self.grid, self.boundary, self.surface, None, partial(SharedViscosity, self.part))
+        return make_viscosity(self.scene, self.grid, self.boundary, self.surface, self.bodies, partial(SharedViscosity, self.part))
 
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.subdomain import Subdomain
@@ -13,11 +12,12 @@ from warp_lcp.fluids.distributed.viscosity_multigrid import SharedVectorMultigri
 from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
 from warp_lcp.grid.staggered import Window
-from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 
 
 class SharedViscosity(Viscosity):
     """Take implicit steps of viscosity, all ranks together: `solve` is collective, and what it returns is of all ranks.
+
+    Each has the links of all bodies to the faces of its box, and what pulls a body is added up in the order of the ranks.
 
     Velocity, kinds of cells, contacts, surface and the liquid's own viscosities must be right in the ghost layers; velocity and change
     then are. `impulses` are those of this rank's faces.
@@ -29,14 +29,10 @@ class SharedViscosity(Viscosity):
 
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         self.part = part
-        super().__init__(*settings, **more)
-        self._inner = part.owned
+        super().__init__(*settings, solved=part.owned, across=part.ranks if part.ranks.size > 1 else None, **more)
 
     def _multigrid(self) -> VectorMultigrid:
         return SharedVectorMultigrid(self.part) if self.part.ranks.size > 1 else VectorMultigrid(self.grid)
-
-    def _krylov(self) -> ConjugateGradient:
-        return ConjugateGradient(self._product, self.multigrid, across=self.part.ranks if self.part.ranks.size > 1 else None)
 
     def _boxes(self, window: Window) -> tuple[Window, Window | None]:
         """Return all cells, and those of the box: others may have liquid where this rank has none."""
@@ -44,6 +40,3 @@ class SharedViscosity(Viscosity):
 
     def _share(self, fields: Sequence[wp.array]) -> None:
         self.part.fill(*fields)
-
-    def _of_all(self, found: np.ndarray) -> np.ndarray:
-        return np.asarray(self.part.ranks.sum(found))

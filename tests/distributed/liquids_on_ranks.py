@@ -94,6 +94,8 @@ SCENES = {
     "unilateral": FLAT | {"pressure": {"model": "unilateral"}, "solid": [DISC], "domain": OPEN, "solver": {"precision": "double"}},
     "floating": DEEP | FLOATING,
     "rafts": FLAT | {"solid": RAFTS, "density_correction": {}, "solver": {"precision": "double", "method": "minimum-map-newton"}},
+    "thick floating": DEEP | FLOATING | {"viscosity": {"value": 5.0}, "resolution": 24},
+    "unilateral rafts": FLAT | {"solid": RAFTS, "pressure": {"model": "unilateral"}, "solver": {"precision": "double"}},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
 }
 

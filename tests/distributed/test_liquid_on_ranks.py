@@ -72,6 +72,8 @@ def alone(model_, **options):
 ONE_RANK = (
     "floating",
     "rafts",
+    "thick floating",
+    "unilateral rafts",
     "flat",
     "cut",
     "voxel",
@@ -250,11 +252,6 @@ def test_pieces_of_something_else_are_refused(change, message):
     ("tables", "key"),
     [
         (HEAP | {"solid": [box([0.1, 0.1], [0.2, 0.2], mass=10.0)]}, r"solid\[0\].mass"),
-        (FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], mass=10.0)], "viscosity": {"value": 1.0}}, "viscosity around rigid bodies"),
-        (
-            FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], mass=10.0)], "pressure": {"model": "unilateral"}},
-            "unilateral. around rigid bodies",
-        ),
         (COLUMN | {"periodic": [False, False, True]}, "domain.periodic"),
     ],
 )
