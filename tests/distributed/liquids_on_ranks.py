@@ -39,6 +39,11 @@ PROBES = [
     for n, place in enumerate(([0.3, 0.1, 0.2], [0.26, 0.01, 0.4], [0.9, 0.05, 0.1], [0.51, 0.3, 0.25]))
     for what in ("pressure", "velocity", "level")
 ]
+THROWN = [  # a body that turns, in the boxes of up to four ranks, and one that it meets
+    box([0.35, 0.2, 0.1], [0.5, 0.4, 0.3], velocity=[1.0, 2.0, 0.0]),
+    box([0.5, 0.2, 0.1], [0.65, 0.4, 0.3], velocity=[1.0, 0.5, 1.0]),
+    {"shape": "sphere", "center": [0.85, 0.3, 0.3], "radius": 0.1, "velocity": [-2.0, 0.0, -0.5]},
+]
 CAPILLARY = {"surface_tension": {"coefficient": 0.5, "contact_angle": 60.0}, "solver": {"precision": "double"}}
 TILTED = {"physics": {"gravity": [3.0, -8.0, 2.0]}}
 RIVER = {
@@ -93,6 +98,7 @@ SCENES = {
     "banded": POOL | {"particles": {"narrow_band": {"width": 3.0}, "reseed": {}, "transfer": "flip"}, "solver": {"precision": "double"}},
     "unilateral": FLAT | {"pressure": {"model": "unilateral"}, "solid": [DISC], "domain": OPEN, "solver": {"precision": "double"}},
     "floating": DEEP | FLOATING,
+    "thrown": DEEP | {"liquid": THROWN, "particles": {"transfer": "flip"}, "solver": {"precision": "double"}},
     "rafts": FLAT | {"solid": RAFTS, "density_correction": {}, "solver": {"precision": "double", "method": "minimum-map-newton"}},
     "thick floating": DEEP | FLOATING | {"viscosity": {"value": 5.0}, "resolution": 24},
     "unilateral rafts": FLAT | {"solid": RAFTS, "pressure": {"model": "unilateral"}, "solver": {"precision": "double"}},
@@ -103,6 +109,7 @@ SCENES |= {
     "sand": COLUMN | {"solid": [BALL], "density_correction": {}, "gauge": {"height": 0.1}},
     "stirred sand": COLUMN | {"solid": [BLADE], "source": [POURED], "particles": {"reseed": {"min": 4, "max": 12}}},
     "voxel sand": COLUMN | {"solid": [BALL], "solids": "voxel", "friction": {"dynamic_angle": 40.0, "grain_size": 1e-3}},
+    "thrown sand": COLUMN | {"sand": THROWN},
     "trickling sand": HEAP | TRICKLING | {"particles": {"transfer": "flip"}, "friction": {"model": "box"}},
 }
 

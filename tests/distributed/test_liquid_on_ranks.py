@@ -58,10 +58,8 @@ def same(rows, expected, rel):
 
 
 def single(model_) -> ParticleSimulation:
-    """Return a simulation in one process that does what ranks do: nothing gives bodies in flight their momenta back."""
-    simulation = simulators()[model_.scene.simulator].create(model_, device="cpu", folder=Path())
-    simulation.flights = None
-    return simulation
+    """Return a simulation in one process."""
+    return simulators()[model_.scene.simulator].create(model_, device="cpu", folder=Path())
 
 
 def alone(model_, **options):

@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
+from warp_lcp.distributed.components import GROUND, joined, nodes_of
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
-
-GROUND = 0  # what holds a component, among the nodes of the components' graph
 
 
 class DistributedGridPoisson(GridPoisson):
@@ -91,14 +88,10 @@ class DistributedComponentFinder(ComponentFinder):
         if not ranks.any(bool(self._count.numpy()[0])):
             return None
         number = self._numbers(parent.numpy(), grounded.numpy())
-        counts = ranks.gather(int(number.max(initial=-1)) + 1)
-        first, nodes = 1 + int(counts[: ranks.rank].sum()), 1 + int(counts.sum())
+        first, nodes = nodes_of(ranks, ranks.gather(int(number.max(initial=-1)) + 1))
         fluid = (A.cells.numpy() == FLUID).ravel()
         node = np.where(number >= 0, number + first, np.where(fluid, GROUND, -1)).astype(np.int32)
-        edges = np.concatenate([_edges(A, node), np.empty((0, 2), dtype=np.int32)])
-        everyone = np.concatenate(ranks.collect(edges))
-        graph = scipy.sparse.coo_matrix((np.ones(len(everyone)), tuple(everyone.T)), shape=(nodes, nodes))
-        component = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+        component = joined(ranks, nodes, _edges(A, node))
         floating = component != component[GROUND]
         if not floating.any():
             return None

@@ -22,6 +22,7 @@ from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
 from warp_lcp.distributed.extension import Refill, too_far
+from warp_lcp.distributed.flight import SharedFlights
 from warp_lcp.distributed.migration import cuts_of, handed_over
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import SORTED, UNSORTED, SharedParticles
@@ -32,7 +33,8 @@ from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import SurfaceMesh
-from warp_lcp.material.particle_assembly import Parts, make_surface_mesh
+from warp_lcp.material.flight import Flights
+from warp_lcp.material.particle_assembly import Parts, make_flights, make_surface_mesh
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_pieces import Piece, fields_of, piece_of
 from warp_lcp.material.particle_rearrangement import Rearrangement
@@ -124,8 +126,8 @@ class SharedParticleSimulation(ParticleSimulation):
     def _fill(self, *fields: wp.array) -> None:
         self.part.fill(*fields)
 
-    def _flights(self) -> None:
-        """Bodies reach across the cuts between ranks, where none of them knows the whole of one."""
+    def _flights(self) -> Flights | None:
+        return make_flights(self.scene, self.grid, self.boundary, partial(SharedFlights, self.part))
 
     def _follow(self, totals: ParticleTotals, dt: float) -> None:
         """Cut the ranks' boxes anew in a step in which that pays."""

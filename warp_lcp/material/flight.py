@@ -57,12 +57,16 @@ class Flights:
 
     def find(self, window: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
         """Look for bodies, without waiting for their number; arguments as of `begin`, which does it where nobody has."""
+        self._grow(window, window, weights, kind)
+
+    def _grow(self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
+        """Grow the trees of a window's cells, and of those `around` it below whose faces they are."""
         named = {"parent": self._parent, "held": self._held, "several": self._several}
-        window.run(kernels.ALONE, kind=kind, **named)
+        around.run(kernels.ALONE, kind=kind, **named)
         window.run(kernels.UNITE, **dict(zip("uvw", [*weights, None], strict=False)), parent=self._parent)
         window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, **named)
         self._count.array.zero_()
-        window.run(kernels.NUMBER, kind=kind, **named, number=self._number, count=self._count.array)
+        around.run(kernels.NUMBER, kind=kind, **named, number=self._number, count=self._count.array)
         self._count.changed()
         self._found = True
 
@@ -81,19 +85,14 @@ class Flights:
         """
         if not self._found:
             self.find(window, weights, kind)
-        self._found, device = False, self.grid.device
-        bodies = int(self._count.numpy()[0])
+        self._found, bodies = False, self._bodies()
         self._before = np.zeros((bodies, kernels.COLUMNS))
         if bodies == 0:
             return 0
-        who, body = (wp.empty(particles.count, dtype=wp.int32, device=device) for _ in range(2))
-        listed = [particles.key, self._parent, self._number, who, body, self._count.array]
-        wp.launch(kernels.board_kernel, particles.count, listed, device=device)
-        self._count.changed()
-        flying = int(self._count.numpy()[1])
-        self._flight.who, self._flight.body, self._flight.rate = who[:flying], body[:flying], dt / self.grid.spacing
+        self._flight.who, self._flight.body = self._board(particles)
+        self._flight.rate = dt / self.grid.spacing
         self._take(particles)
-        self._start = wp.empty(flying, dtype=wp.vec3, device=device)
+        self._start = wp.empty(len(self._flight.who), dtype=wp.vec3, device=self.grid.device)
         self._launch(kernels.lift_kernel, [particles.position, self._start])
         self._before, self._change = self._sums(), change * self._flight.rate
         return bodies
@@ -132,6 +131,28 @@ class Flights:
         motion = self._motion(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
         self._carry(kernels.land_kernel, [motion, end, particles.position])
 
+    def _bodies(self) -> int:
+        """Return how many bodies were found."""
+        return int(self._count.numpy()[0])
+
+    def _board(self, particles: Particles) -> tuple[wp.array, wp.array]:
+        """Return the numbers of the bodies' particles, and the body of each, int32."""
+        who, body = (wp.empty(particles.count, dtype=wp.int32, device=self.grid.device) for _ in range(2))
+        listed = [particles.key, self._parent, self._number, who, body, self._count.array]
+        wp.launch(kernels.board_kernel, particles.count, listed, device=self.grid.device)
+        self._count.changed()
+        flying = int(self._count.numpy()[1])
+        nobody = wp.empty(0, dtype=wp.int32, device=self.grid.device)  # Warp's arrays have no empty slices
+        return (who[:flying], body[:flying]) if flying else (nobody, nobody)
+
+    def _everyone(self, particles: Particles) -> int:
+        """Return how many particles the material has."""
+        return particles.count
+
+    def _of_all(self, sums: np.ndarray) -> np.ndarray:
+        """Return sums over all particles of the bodies, int64 as given."""
+        return sums
+
     def _take(self, particles: Particles) -> None:
         """Point the kernels at the particles, and at sums of nothing."""
         flight = self._flight
@@ -139,11 +160,11 @@ class Flights:
         flight.gradient_u, flight.gradient_v, flight.gradient_w = [*particles.affine, None, None, None][:3]
         flight.sums = wp.zeros(self._before.shape, dtype=wp.int64, device=self.grid.device)
         # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
-        flight.quanta = 2.0 ** math.floor(60.0 - math.log2(particles.count * max(self.grid.domain_counts) ** 2))
+        flight.quanta = 2.0 ** math.floor(60.0 - math.log2(self._everyone(particles) * max(self.grid.domain_counts) ** 2))
 
     def _sums(self) -> Sums:
         """Return the sums of the last launch."""
-        sums = self._flight.sums.numpy().astype(np.float64)
+        sums = self._of_all(self._flight.sums.numpy()).astype(np.float64)
         sums[:, 1 : kernels.LEAVES] /= float(self._flight.quanta)
         return sums
 

@@ -21,6 +21,7 @@ from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxeliz
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.coverage import Coverage
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
+from warp_lcp.material.flight import Flights
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_volume import ParticleVolume
@@ -134,6 +135,11 @@ def make_spray(scene: ParticleScene, coverage: Coverage, placed: Sequence[Placed
     if not (coverage.active and scene.flies) or scene.output.surface or scene.output.volume:
         return None
     return Spray(coverage.domain, placed, side_bits(scene.domain.open), keeps=scene.kept(()) is not None)
+
+
+def make_flights(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., Flights] = Flights) -> Flights | None:
+    """Return what gives bodies in flight their momenta back, made by what takes the arguments of `Flights`, if any can be told."""
+    return make(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up) if scene.flies else None
 
 
 def make_surface_mesh(

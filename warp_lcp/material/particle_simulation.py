@@ -17,7 +17,7 @@ from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_
 from warp_lcp.grid.vicinity import Vicinity
 from warp_lcp.material.coverage import Coverage, carry_over, cells_between, pace_of, travel
 from warp_lcp.material.flight import Flights
-from warp_lcp.material.particle_assembly import Parts, make_particle_volume, make_surface_mesh
+from warp_lcp.material.particle_assembly import Parts, make_flights, make_particle_volume, make_surface_mesh
 from warp_lcp.material.particle_checkpoints import ParticleCheckpoints
 from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
 from warp_lcp.material.particle_rearrangement import Rearrangement
@@ -129,8 +129,7 @@ class ParticleSimulation(ParticleCheckpoints):
         return make_surface_mesh(self.scene, self.grid, self.boundary)
 
     def _flights(self) -> Flights | None:
-        s = self.scene
-        return Flights(self.grid, self.boundary, coheres=s.coheres, settles=s.speeds_up) if s.flies else None
+        return make_flights(self.scene, self.grid, self.boundary)
 
     def known_density(self) -> wp.array | None:
         """Return the particles' density in units of that at rest, if a step has found it before anything moves."""

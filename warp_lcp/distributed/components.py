@@ -1,0 +1,29 @@
+"""Components that may reach over several ranks: each finds the parts in its box, which are then joined as the nodes of a graph."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from warp_lcp.distributed.ranks import Ranks
+
+GROUND = 0  # what holds a component, among the nodes of the graph
+
+
+def nodes_of(ranks: Ranks, counts: np.ndarray) -> tuple[int, int]:
+    """Return the node of this rank's first part, and how many nodes there are, of how many parts each rank has."""
+    return 1 + int(counts[: ranks.rank].sum()), 1 + int(counts.sum())
+
+
+def joined(ranks: Ranks, nodes: int, edges: np.ndarray) -> np.ndarray:
+    """Return the number of each node's component, shape (nodes,); collective.
+
+    Args:
+        ranks: who have the parts.
+        nodes: how many.
+        edges: pairs of nodes that this rank knows to belong together, int32, shape (n, 2).
+    """
+    everyone = np.concatenate(ranks.collect(edges))
+    graph = scipy.sparse.coo_matrix((np.ones(len(everyone)), tuple(everyone.T)), shape=(nodes, nodes))
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1])
