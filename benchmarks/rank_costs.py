@@ -61,9 +61,8 @@ class Traffic:
 @cache
 def _ghosts(owner: Subdomain | Halo, width: int | None = None) -> int:
     """Return how many ghost cells are filled."""
-    if isinstance(owner, Subdomain):
-        return len(owner.forest(width=width).made.getGraph()[2]) if owner.ranks.size > 1 else 0
-    return 0 if owner._forest is None else len(owner._forest.made.getGraph()[2])
+    forest = owner._forest if isinstance(owner, Halo) else owner.forest(width=width) if owner.ranks.size > 1 else None
+    return 0 if forest is None else len(forest.made.getGraph()[2])
 
 
 def _item(field: wp.array | np.ndarray) -> int:

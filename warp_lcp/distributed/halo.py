@@ -149,7 +149,7 @@ class StarForest:
     much; but each looks for cycles at another time.
 
     Args:
-        made: the forest, which nobody else has.
+        made: the forest, of no use when this is gone.
     """
 
     def __init__(self, made: Any) -> None:
