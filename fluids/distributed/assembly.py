@@ -14,7 +14,6 @@ from warp_lcp.distributed.sources import SharedSources
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed.simulation import DistributedLiquid
 from warp_lcp.fluids.scene import LiquidScene
-from warp_lcp.grid.sides import side_bits
 from warp_lcp.material.particle_assembly import Parts, make_bodies, make_narrow_band, make_outlets, make_sources, placed_solids
 from warp_lcp.scene.scene import Scene
 
@@ -37,14 +36,11 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
         raise ValueError("scene.simulator: fluids needs a scene of liquid")
     check_shared(scene, ranks, [], METHODS)
     part = part_of(scene, ranks, device, smoothing=scene.pressure.smoothing)
-    solids, domain = placed_solids(scene, folder), scene.domain
+    solids = placed_solids(scene, folder)
     bodies, warnings = make_bodies(scene, solids, partial(SharedBodies, ranks)), list[str]()
 
     def make_parts(part: Subdomain) -> Parts:
-        boundary, warnings[:] = boundary_of_part(
-            part, solids, cut_cells=domain.solids == "cut-cell", wall_separating=domain.wall == "separating",
-            open_sides=side_bits(domain.open), sources=bool(scene.source),
-        )  # fmt: skip
+        boundary, warnings[:] = boundary_of_part(scene, part, solids)
         sources = make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part))
         return Parts(boundary, sources, make_narrow_band(scene, part.grid, boundary, folder, partial(SharedNarrowBand, part)))
 

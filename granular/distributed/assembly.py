@@ -13,7 +13,6 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.distributed.simulation import DistributedSand
 from warp_lcp.granular.distributed.solids import SharedSandSolids
 from warp_lcp.granular.scene import SandScene
-from warp_lcp.grid.sides import side_bits
 from warp_lcp.material.particle_assembly import Parts, make_outlets, make_sources, placed_solids
 from warp_lcp.scene.scene import Scene
 
@@ -36,14 +35,11 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
         raise ValueError("scene.simulator: granular needs a scene of sand")
     check_shared(scene, ranks, refusals(scene), METHODS)
     part = part_of(scene, ranks, device)
-    placed, domain = placed_solids(scene, folder), scene.domain
+    placed = placed_solids(scene, folder)
     warnings: list[str] = []
 
     def make_parts(part: Subdomain) -> Parts:
-        boundary, notes = boundary_of_part(
-            part, placed, cut_cells=domain.solids == "cut-cell", wall_separating=domain.wall == "separating",
-            open_sides=side_bits(domain.open), sources=bool(scene.source),
-        )  # fmt: skip
+        boundary, notes = boundary_of_part(scene, part, placed)
         solids = SharedSandSolids(part, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source), cuts=True)
         warnings[:] = [*notes, *solids.notes]
         return Parts(boundary, make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part)), solids=solids)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 import warp_lcp as wl
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.sides import side_bits
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.material.particle_scene import ParticleScene
 
 
 class CutBoundaryOfPart(CutBoundary):
@@ -33,21 +36,16 @@ class CutBoundaryOfPart(CutBoundary):
             self._part.fill(*self.placed())
 
 
-def boundary_of_part(
-    part: Subdomain, solids: Sequence[PlacedSolid], *, cut_cells: bool, wall_separating: bool, open_sides: int = 0, sources: bool = False
-) -> tuple[Boundary, list[str]]:
+def boundary_of_part(scene: ParticleScene, part: Subdomain, solids: Sequence[PlacedSolid]) -> tuple[Boundary, list[str]]:
     """Return the solids that meet a rank's part, and the domain's walls where it has them; collective.
 
     Each rank measures its part and takes what lies beyond its cuts from the ranks that have measured more of it. If no rank has cut cells
     all have whole ones.
 
     Args:
+        scene: says whether solids cut cells, the domain's wall separates, sides are open, and cells turn SOLID as those of sources do.
         part: of the grid.
         solids: in the order of their numbers.
-        cut_cells: whether solids cut through cells.
-        wall_separating: whether the domain's wall separates.
-        open_sides: of the domain, see `warp_lcp.grid.sides`.
-        sources: whether cells turn SOLID, and faces move, as those of sources do.
 
     Returns:
         The boundary and notes for the start of a run, the same on all ranks.
@@ -55,18 +53,20 @@ def boundary_of_part(
     Raises:
         ValueError: a solid lies wholly outside the domain, or no open cell is left; on all ranks.
     """
-    grid, ranks, ends = part.grid, part.ranks, part.cuts | open_sides
-    if cut_cells:
-        cut = CutCells(grid, solids, wall_separating=wall_separating, open_sides=ends, remarks=False)
+    grid, ranks, domain = part.grid, part.ranks, scene.domain
+    ends = part.cuts | side_bits(domain.open)
+    walls: dict[str, Any] = {"wall_separating": domain.wall == "separating", "open_sides": ends, "remarks": False}
+    if domain.solids == "cut-cell":
+        cut = CutCells(grid, solids, **walls)
         if ranks.any(not cut.whole_cells):
             boundary: Boundary = CutBoundaryOfPart(part, cut)
             _check_open(part, boundary)
             return boundary, list(cut.notes)
     notes = start_notes(solids, grid)
-    voxels = voxelize(grid, solids, wall_separating=wall_separating, open_sides=ends, remarks=False)
+    voxels = voxelize(grid, solids, **walls)
     notes += small_notes((solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing)
     part.fill(voxels.index)
-    still = np.zeros((1 + len(solids), 3)) if sources else None
+    still = np.zeros((1 + len(solids), 3)) if scene.source else None
     boundary = WholeCells(grid, voxels, still, open_sides=ends)
     part.fill(*boundary.placed())
     _check_open(part, boundary)
