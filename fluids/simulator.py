@@ -124,7 +124,7 @@ class LiquidSimulation(ParticleSimulation):
         super().bring_to_faces(window)
         if self.viscosity is not None and self.viscosity.relative:
             p, fields = self.particles, (self.viscosity.relative, self.weights)  # which stay what they are
-            particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets)
+            particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets, runs=p.runs)
 
     def stable_dt(self) -> float:
         """Return the longest step that advection and surface tension allow [s]."""

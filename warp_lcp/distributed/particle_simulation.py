@@ -163,6 +163,7 @@ class SharedParticleSimulation(ParticleSimulation):
     def with_ghosts(self, step: int = SORTED) -> Iterator[None]:
         """Let the particles around this rank's box be there, arranged as in a step of this number."""
         self.particles.arrange(step)
+        self.particles.lie_in_order()
         yield
         self.particles.drop_ghosts()
 

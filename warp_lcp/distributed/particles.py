@@ -1,9 +1,10 @@
 """Particles that belong to the rank whose box they are in: they move on to others, and cells at a cut know those beside them.
 
-In a step a rank has its own particles and copies of those within a cell of its box, ghosts; then its own alone. All are in one order that
-does not depend on the ranks, so that sums over the particles around a face have the same bits on any number of ranks: that of the last sort
-by cell, which a number stands for, the particle's `place`. Messages go from rank to rank: their lengths change from step to step, so that a
-star forest would have to be made anew each time.
+In a step a rank has its own particles and copies of those within a cell of its box, ghosts; then its own alone. Sums take all in one order
+that does not depend on the ranks, so that those around a face have the same bits on any number of ranks: that of the last sort by cell,
+which a number stands for, the particle's `place`. Until the next sort ghosts lie behind the others, and what comes takes the room of what
+goes: `runs` tell the order. Messages go from rank to rank: their lengths change from step to step, so that a star forest would have to be
+made anew each time.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ class SharedParticles(Particles):
         self.post = post or MpiPost(part.ranks.comm)
         self._take_part(part)
         self.place = np.arange(len(position), dtype=np.int64) if place is None else np.asarray(place, dtype=np.int64)
-        self._own: np.ndarray | None = None  # which particles are this rank's; None: all
+        self._own: np.ndarray | int | None = None  # which particles are this rank's, or how many of the first; None: all
         super().__init__(part.grid, position, velocity, affine=affine, kept=kept, indexed=indexed)
         self._record = np.dtype([("place", np.int64), ("values", np.float32, (len(self._names), 3))])
 
@@ -132,30 +133,46 @@ class SharedParticles(Particles):
         self.drop_ghosts()
         self.number()
         due = self.offsets is not None or step % SORT_EVERY == 0
-        if not self._neighbors:
-            if due:
-                self.sort()
-            return
-        border = np.flatnonzero(self._where() != INNER)
-        cells = self._cells(border)
-        keep = np.ones(self.count, dtype=bool)
-        keep[border[~_within(cells, self.part.box.grown(REACH))]] = False
-        places = self._receive(self.post.swap(self._outgoing(border, cells)))
-        places = np.concatenate([self.place[keep], places])
-        kept = np.concatenate([np.flatnonzero(keep).astype(np.int32), np.arange(len(self.place), self.count, dtype=np.int32)])
-        order = np.argsort(places, kind="stable").astype(np.int32)
-        self._take(kept[order], places[order])
+        if self._neighbors:
+            self._exchange()
         if due:
             self.sort()
-        else:
+        elif self._neighbors:
             self.number()
-        self._own = self._where() != OUTSIDE
+            order = np.argsort(self.place, kind="stable")
+            ends = np.flatnonzero(np.diff(order) != 1)
+            runs = np.stack([order[np.append(0, ends + 1)], order[np.append(ends, -1)] + 1], axis=1) if self.count else np.zeros(0)
+            self.runs = wp.array(runs.ravel(), dtype=wp.int32, device=self.grid.device)
+
+    def _exchange(self) -> None:
+        """Hand over and take in, and put ghosts behind the others."""
+        border = np.flatnonzero(self._where() != INNER)
+        cells = self._cells(border)
+        out, near = ~_within(cells, self.part.box), _within(cells, self.part.box.grown(REACH))
+        first = self.count
+        self._receive(self.post.swap(self._outgoing(border, cells)))
+        come = first + np.flatnonzero(self._where(first) == OUTSIDE)
+        others, ghosts = np.append(border[out], come), np.append(border[out & near], come)
+        count = self.count - len(others)
+        free, last = others[others < count], np.setdiff1d(np.arange(count, self.count), others)
+        self._move(np.append(last, ghosts), np.append(free, count + np.arange(len(ghosts))))
+        self._resize(count + len(ghosts))
+        self.place, self._own = self.place[: self.count], count
+
+    def lie_in_order(self) -> None:
+        """Bring the particles into the order in which sums take them, ghosts among them."""
+        if (self.place[1:] < self.place[:-1]).any():
+            order, self.runs = np.argsort(self.place, kind="stable"), None
+            self._take(order, self.place[order])
+            self.number()
+            self._own = None if self._own is None else self._where() != OUTSIDE
 
     def sort(self) -> None:
-        """Bring the particles, which are in the order of their places, into that of their cells, and give them new places."""
-        self.number()
-        self._take(np.argsort(self.key.numpy()[: self.count], kind="stable"), self.place)
-        self.number()
+        """Bring the particles into the order of their places, then into that of their cells, and give them new places."""
+        self.lie_in_order()
+        super().sort()
+        if self._own is not None:
+            self._own = self._where() != OUTSIDE
         nx, ny, _ = self.part.decomposition.counts
         key, begins = self.key.numpy()[: self.count], np.ones(self.count, dtype=bool)
         begins[1:] = key[1:] != key[:-1]
@@ -164,10 +181,6 @@ class SharedParticles(Particles):
         first = ((k * ny + j) * nx + i) * MOST_A_CELL
         self.place = np.repeat(first - starts, np.diff(starts, append=self.count))
         self.place += np.arange(self.count)
-        if self.offsets is not None and self.count:
-            wp.launch(kernels.offset_kernel, self.grid.size + 1, [self.key, self.count, self.offsets], device=self.grid.device)
-        elif self.offsets is not None:
-            self.offsets.zero_()
 
     def append(self, position: np.ndarray, velocity: np.ndarray, kept: np.ndarray | float | None = None) -> None:
         """Add particles behind the others, those of other ranks too; see the base class."""
@@ -185,10 +198,13 @@ class SharedParticles(Particles):
 
     def drop_ghosts(self) -> None:
         """Keep this rank's own particles alone."""
-        if self._own is not None:
-            mine = np.flatnonzero(self._own)
-            self._own = None
-            self._take(mine, self.place[mine])
+        mine, self._own, self.runs = self._own, None, None
+        if isinstance(mine, int):
+            self._resize(mine)
+            self.place = self.place[:mine]
+        elif mine is not None:
+            order = np.flatnonzero(mine)
+            self._take(order, self.place[order])
 
     def totals(self) -> ParticleTotals:
         """Return sums over all ranks' particles; there are no ghosts now."""
@@ -198,11 +214,11 @@ class SharedParticles(Particles):
         if ranks.size == 1:
             return mine
         n = mine.count
+        ends = mine.max_speed, *(-mine.low if n else [-np.inf] * 3), *(mine.high if n else [-np.inf] * 3)
         with np.errstate(invalid="ignore"):
             means = n * mine.mean_square_speed, *(n * mine.center), *(n * mine.velocity)
-            everyone = ranks.gather(np.array([n, mine.bad_positions, mine.bad_velocities, *means]))
-        sums, self.counts = everyone.sum(axis=0), everyone[:, 0].astype(np.int64).tolist()
-        most = ranks.max(np.array([mine.max_speed, *(-mine.low if n else [-np.inf] * 3), *(mine.high if n else [-np.inf] * 3)]))
+            everyone = ranks.gather(np.array([n, mine.bad_positions, mine.bad_velocities, *means, *ends]))
+        sums, most, self.counts = everyone.sum(axis=0), everyone[:, -7:].max(axis=0), everyone[:, 0].astype(np.int64).tolist()
         count = int(sums[0])
         if count == 0:
             return mine
@@ -223,15 +239,16 @@ class SharedParticles(Particles):
         self.assign({name: np.ascontiguousarray(values[order]) for name, values in arrays.items()})
         self.place = np.asarray(place, dtype=np.int64)[order]
 
-    def _where(self) -> np.ndarray:
-        """Return INNER, BORDER or OUTSIDE of each particle, uint8, shape (count,)."""
+    def _where(self, first: int = 0) -> np.ndarray:
+        """Return INNER, BORDER or OUTSIDE of each particle from a number on, uint8, shape (count - first,)."""
         part, grid = self.part, self.grid
         bits = [[part.cuts >> 2 * axis + side & 1 for axis in range(3)] for side in range(2)]
         low = [box + 1 if cut else -ENDLESS for box, cut in zip(part.box.low, bits[0], strict=True)]
         high = [box + 1 if cut else ENDLESS for box, cut in zip(part.box.high, bits[1], strict=True)]
         ends = dict(zip((f"{end}_{axis}" for end in ("low", "high") for axis in "xyz"), map(float, low + high), strict=True))
-        found = wp.empty(self.count, dtype=wp.uint8, device=grid.device)
-        launch(WHERE, self.count, grid, position=self.position, where=found, reach=float(REACH), **ends)
+        found = wp.empty(self.count - first, dtype=wp.uint8, device=grid.device)
+        if len(found):
+            launch(WHERE, len(found), grid, position=self.position[first:], where=found, reach=float(REACH), **ends)
         return np.asarray(found.numpy())
 
     def _cells(self, which: np.ndarray) -> np.ndarray:
@@ -253,14 +270,24 @@ class SharedParticles(Particles):
             found[rank] = records
         return found
 
-    def _receive(self, incoming: list[np.ndarray]) -> np.ndarray:
-        """Put what has come behind the particles, and return its places."""
+    def _receive(self, incoming: list[np.ndarray]) -> None:
+        """Put what has come behind the particles."""
         records = np.concatenate(incoming)
         first = self.make_room(len(records))
         for column, view in enumerate(self.arrays().values()):
             if len(records):
                 view[first:].assign(np.ascontiguousarray(records["values"][:, column]))
-        return np.asarray(records["place"])
+        self.place = np.append(self.place, records["place"])
+
+    def _move(self, sources: np.ndarray, targets: np.ndarray) -> None:
+        """Bring particles of some numbers to where others are, or what is no longer wanted."""
+        device = self.grid.device
+        if len(sources):
+            of, to = (wp.array(numbers, dtype=wp.int32, device=device) for numbers in (sources, targets))
+            for column in self._columns.values():
+                launch_list(kernels.reorder_kernel, len(sources), [of, column.view, self._spare.view], device=device, cost=4)
+                launch_list(kernels.put_kernel, len(targets), [to, self._spare.view, column.view], device=device, cost=4)
+            self.place[targets] = self.place[sources]
 
     def _take(self, order: np.ndarray, places: np.ndarray) -> None:
         """Keep the particles of these numbers, in this order."""

@@ -149,7 +149,7 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
     if particles.offsets is not None:
         window.run(kernels.GATHER, offsets=particles.offsets, **given, **on_grid(grid))
     else:
-        scatter(kernels.SCATTER, grid, touched=touched_planes(grid, particles.position), **given)
+        scatter(kernels.SCATTER, grid, touched=touched_planes(grid, particles.position), runs=particles.runs, **given)
 
 
 def whole_cell_capacity(grid: StaggeredGrid, base: wp.array, capacity: wp.array) -> None:

@@ -70,8 +70,9 @@ def scatter_pass(name: str, whole: Mapping[str, Any], *, real: Any = wp.float32,
         more: of the pass.
     """
     return RowPass(
-        name, HEADERS / f"{name.rpartition('.')[2]}.h", real, whole={**whole, "touched": wp.int32},
-        numbers={**_grid_numbers(real), **numbers, "count": int, "chunk": int}, optional=(*more.pop("optional", ()), "touched"), **more,
+        name, HEADERS / f"{name.rpartition('.')[2]}.h", real, whole={**whole, "touched": wp.int32, "runs": wp.int32},
+        numbers={**_grid_numbers(real), **numbers, "count": int, "chunk": int}, optional=("touched", "runs", *more.pop("optional", ())),
+        **more,
     )  # fmt: skip
 
 
@@ -90,7 +91,10 @@ def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[w
     return touched
 
 
-def scatter(passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], touched: wp.array[wp.int32] | None, **given: Any) -> None:
+def scatter(
+    passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], touched: wp.array[wp.int32] | None, *,
+    runs: wp.array[wp.int32] | None = None, **given: Any,
+) -> None:  # fmt: skip
     """Launch a pass in which particles add to a field: on the CPU each task has planes of its own (rows in 2-D).
 
     Args:
@@ -98,6 +102,7 @@ def scatter(passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], tou
         grid: of the particles.
         position: theirs.
         touched: what `touched_planes` returns for them.
+        runs: of `Particles`.
         given: what else the pass takes.
     """
     count, planes = len(position), grid.shape[3 - grid.dimension]
@@ -108,7 +113,7 @@ def scatter(passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], tou
     else:
         each = planes if touched is None else max(4, -(-planes // (SHARES * get_threads())))
         rows = Rows.listed(planes, grid.device, each, weight=1 << 20)  # a share is a piece
-    passed.bind(rows, **on_grid(grid), position=position, touched=touched, count=count, chunk=CPU_GRAIN, **given).launch()
+    passed.bind(rows, **on_grid(grid), position=position, touched=touched, runs=runs, count=count, chunk=CPU_GRAIN, **given).launch()
 
 
 def on_grid(grid: "StaggeredGrid") -> dict[str, Any]:

@@ -103,11 +103,13 @@ class Particles:
         count: particles.
         key: number of the stored cell of each particle when last numbered or sorted, shape (2 capacity,), the first `count` in use.
         offsets: first particle of each stored cell, int32, shape (cells + 1,), at the last sort; None unless `indexed`.
+        runs: begin and end of each run of particles that lie in the order in which sums take them, int32, shape (2 runs,); None: all do.
 
     Raises:
         ValueError: the shapes do not match.
     """
 
+    runs: wp.array | None = None
     room = 1.0  # of the storage over the particles that it is made for
     _order: wp.array  # scratch memory, as large as `key`
     _spare: Column  # where the next reordered column goes

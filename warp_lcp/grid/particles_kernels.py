@@ -37,6 +37,12 @@ def reorder_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp
     target[i] = source[order[i]]
 
 
+@list_kernel("warp_lcp.grid.particles")
+def put_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)):
+    """Put particles where they are wanted."""
+    target[order[i]] = source[i]
+
+
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
 def stays_kernel(marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32)):
     """Write 1 for a particle without a mark, 0 for others."""

@@ -70,7 +70,7 @@ def transfer_passes(real: Any) -> SimpleNamespace:
 
 def particles_to_faces(
     grid: StaggeredGrid, position: wp.array, velocity: wp.array, affine: list[wp.array], fields: list[wp.array], weights: list[wp.array], *,
-    window: Window | None = None, offsets: wp.array | None = None,
+    window: Window | None = None, offsets: wp.array | None = None, runs: wp.array | None = None,
 ) -> None:  # fmt: skip
     """Average the particles' velocities on the faces, all particles alike.
 
@@ -84,6 +84,7 @@ def particles_to_faces(
         window: faces that particles can reach; all of them if None.
         offsets: first particle of each stored cell, int32, shape (cells + 1,), of particles that are sorted by cell: faces gather.
             None: particles scatter, in any order; on CUDA the last bits then differ from run to run.
+        runs: of `Particles`.
     """
     passes = transfer_passes(fields[0].dtype)
     window = window or grid.everywhere
@@ -95,7 +96,7 @@ def particles_to_faces(
         if offsets is not None:
             window.run(passes.gather_weights, offsets=offsets, field=field, weight=weight, **particles, **on_grid(grid))
             continue
-        scatter(passes.scatter, grid, touched=touched, momentum=field, weight=weight, **particles)
+        scatter(passes.scatter, grid, touched=touched, runs=runs, momentum=field, weight=weight, **particles)
         window.launch(passes.normalize, [weight, field])
 
 

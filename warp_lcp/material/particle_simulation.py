@@ -241,8 +241,8 @@ class ParticleSimulation(ParticleCheckpoints):
         """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
         p = self.particles
         with self.watch.stage("particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights):
-            faces, offsets = (self.velocity, self.weights), p.offsets
-            particles_to_faces(self.grid, p.position, p.velocity, p.affine, *faces, window=window, offsets=offsets)
+            order = {"offsets": p.offsets, "runs": p.runs}
+            particles_to_faces(self.grid, p.position, p.velocity, p.affine, self.velocity, self.weights, window=window, **order)
             if self.band is not None:
                 self.band.blend(window, self.velocity, self.weights)
             for field, saved in zip(self.velocity, self._saved or (), strict=False):

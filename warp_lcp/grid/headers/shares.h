@@ -1,5 +1,6 @@
 // Particles add to fields around them. On CUDA a task has its own particles, on the CPU the planes of the fields (rows in 2-D) from P.first
-// on: all particles that touch those are added there in their order, so that each sum is the one that a single thread makes.
+// on: all particles that touch those are added there in their order, so that each sum is the one that a single thread makes. Where the
+// order is not that in which they lie, `runs` has the begin and the end of what lies in order, one run after another.
 // visit(begin, end, ours): `ours` tells of a plane whether it is the task's. Its arithmetic is EXACT_MATH with `fused`: else the compiler might
 // round in one form of it otherwise than in the other.
 const auto each_share = [&](auto visit) {
@@ -9,7 +10,9 @@ const auto each_share = [&](auto visit) {
 #else
     const int from = P.first, to = P.first + n;
     const auto ours = [=](int plane) { return plane >= from && plane < to; };
-    if (!touched) { visit(0LL, (long long)count, all); return; }
+    const int whole[2] = {0, (int)count}, *run = runs ? runs : whole, *end = run + (runs ? given.runs.shape[0] : 2);
+    if (!touched) { for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], all); return; }
+    if (runs) { for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], ours); return; }
     for (long long c = 0; c*chunk < count; ++c) {
         const int low = touched[2*c], high = touched[2*c + 1]; const long long begin = c*chunk, end = begin + chunk < count ? begin + chunk : count;
         if (low >= from && high <= to) visit(begin, end, all);
