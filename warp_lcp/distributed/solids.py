@@ -6,14 +6,89 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.node_distance import NodeDistances, nodes_near
+from warp_lcp.grid.node_distance_kernels import claim_nodes
 from warp_lcp.grid.sides import side_bits
+from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.grid.solids_kernels import block_of
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.particle_scene import ParticleScene
+
+NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) of the whole grid and one past the last
+
+
+class CutCellsOfPart(CutCells):
+    """What solids leave open of a rank's part; making it, and `place`, is collective where some move.
+
+    Distances to a mesh that moves, which take the most of the time, are measured by all ranks in layers of equally many nodes.
+
+    Args:
+        part: of the grid.
+        solids: in the order of their numbers.
+        settings: as of `CutCells`.
+    """
+
+    def __init__(self, part: Subdomain, solids: Sequence[PlacedSolid], **settings: Any) -> None:
+        self._part = part
+        super().__init__(part.grid, solids, **settings)
+
+    def _enter(self, placed: Sequence[tuple[int, Geometry]]) -> None:
+        ranks, grid = self._part.ranks, self.grid
+        whole = StaggeredGrid(grid.domain_counts, grid.spacing, grid.dimension, grid.device)
+        meshes = [(number, geometry) for number, geometry in placed if isinstance(geometry, TriangleMesh) and ranks.size > 1]
+        boxes = {number: box for number, geometry in meshes if (box := nodes_near(whole, geometry)) is not None}
+        mine = [self._layer(geometry, boxes[number]) for number, geometry in meshes if number in boxes]
+        everyone, first = ranks.gather(np.concatenate(mine)) if mine else np.empty((0, 0)), 0
+        for number, geometry in placed:
+            if number not in dict(meshes):
+                self._sampler.enter(self._nodes, number, geometry)
+            elif number in boxes:
+                layers = [_layer(boxes[number], rank, ranks.size) for rank in range(ranks.size)]
+                size = layers[0].cells
+                for layer, distances in zip(layers, everyone[:, first : first + size], strict=True):
+                    self._claim(number, layer, distances[: layer.cells].reshape(layer.counts[::-1]))
+                first += size
+
+    def _layer(self, geometry: Geometry, box: NodeBox) -> np.ndarray:
+        """Return the distances of a solid at this rank's layer of a box of nodes [cells], as many numbers as the thickest layer has."""
+        size, ranks, grid = _layer(box, 0, self._part.ranks.size).cells, self._part.ranks, self.grid
+        layer, found = _layer(box, ranks.rank, ranks.size), np.empty(size, dtype=np.float32)
+        if layer.cells:
+            nx, ny, nz = (max(n - 2, 1) for n in layer.counts)
+            before = (*layer.low[:2], layer.low[2] if grid.dimension == 3 else 0)
+            around = StaggeredGrid((nx, ny, nz), grid.spacing, grid.dimension, grid.device, before, grid.domain_counts)
+            nodes = NodeDistances(around, second=False)
+            self._sampler.enter(nodes, 1, geometry)
+            found[: layer.cells] = nodes.near.numpy()[layer.moved(before, -1).slices].ravel()
+        return found
+
+    def _claim(self, number: int, layer: CellBox, distances: np.ndarray) -> None:
+        """Enter distances of a solid [cells] at a layer of the whole grid's nodes where this part has them."""
+        grid = self.grid
+        shared = layer.common(CellBox((0, 0, 0), (*grid.shape[::-1],)).moved(grid.origin))
+        if shared.cells:
+            inside, here = shared.moved(layer.low, -1), shared.moved(grid.origin, -1)
+            given = wp.array(np.ascontiguousarray(distances[inside.slices]).ravel(), dtype=wp.float32, device=grid.device)
+            block = block_of(here.low, here.high, 1.0, grid.dimension, grid.origin)
+            wp.launch(claim_nodes, len(given), [block, given, 0.0, number, self._nodes.struct], device=grid.device)
+
+
+def _layer(box: NodeBox, rank: int, ranks: int) -> CellBox:
+    """Return the layer of a box of nodes that a rank measures: across its longest axis, the first one the thickest."""
+    low, high = (corner.copy() for corner in box)
+    axis = int(np.argmax(high - low))
+    thick, end = -(-int(high[axis] - low[axis]) // ranks), high[axis]
+    low[axis] = min(low[axis] + rank * thick, end)
+    high[axis] = min(low[axis] + thick, end)
+    return CellBox.of(low, high)
 
 
 class CutBoundaryOfPart(CutBoundary):
@@ -57,7 +132,7 @@ def boundary_of_part(scene: ParticleScene, part: Subdomain, solids: Sequence[Pla
     ends = part.cuts | side_bits(domain.open)
     walls: dict[str, Any] = {"wall_separating": domain.wall == "separating", "open_sides": ends, "remarks": False}
     if domain.solids == "cut-cell":
-        cut = CutCells(grid, solids, **walls)
+        cut = CutCellsOfPart(part, solids, **walls)
         if ranks.any(not cut.whole_cells):
             boundary: Boundary = CutBoundaryOfPart(part, cut)
             _check_open(part, boundary)

@@ -186,13 +186,17 @@ class CutCells:
     def _enter_moving(self, time: float) -> None:
         """Enter the solids that move into the distances, and mark again the cells that only their centers tell about."""
         placed = [(number, geometry.moved(motion.pose(time))) for number, geometry, motion in self._moving()]
-        for number, geometry in placed:
-            self._sampler.enter(self._nodes, number, geometry)
+        self._enter(placed)
         every = [s.geometry for s in self.solids if s.motion is None] + [geometry for _, geometry in placed]
         near = [nodes_near(self.grid, geometry) for _, geometry in placed]
         self._moved_to = [block for block in near if block is not None]
         for low, high in self._moved_to:
             self._sampler.look_at_centers(self._nodes, every, low, high, self.base)
+
+    def _enter(self, placed: Sequence[tuple[int, Geometry]]) -> None:
+        """Enter the distances of solids, with their numbers, where they are."""
+        for number, geometry in placed:
+            self._sampler.enter(self._nodes, number, geometry)
 
     def _refresh(self) -> None:
         """Fill everything that follows from the distances."""

@@ -91,17 +91,17 @@ class NodeSampler:
         """Enter a solid's distances.
 
         Args:
-            nodes: where to (updated).
+            nodes: where to (updated), of the sampler's grid or of another part of the same one.
             number: the solid's, > 0.
             geometry: the solid.
         """
-        near = nodes_near(self.grid, geometry)
+        near, before = nodes_near(nodes.grid, geometry), nodes.grid.origin
         if near is None:
             return
         # A mesh takes microseconds a node, most of them for the sign: the distance at the middle of a group of nodes tells whether the
         # others matter, and the sign of many.
         stride = COARSE if isinstance(geometry, TriangleMesh) else 1
-        for block, distances in self.measured(geometry, *near, stride=stride, offset=0.5 * (stride - 1)):
+        for block, distances in self.measured(geometry, *near, stride=stride, offset=0.5 * (stride - 1), before=before):
             if stride == 1:
                 inputs = [block, distances, self.snap, number, nodes.struct]
                 wp.launch(kernels.claim_nodes, len(distances), inputs, device=self.grid.device)
@@ -157,12 +157,13 @@ class NodeSampler:
             geometry.signed_distance(points, distances)
         return distances
 
-    def _block(self, low: np.ndarray, high: np.ndarray, **more: Any) -> Any:
-        return block_of(low, high, self.grid.spacing, self.grid.dimension, self.grid.origin, **more)
+    def _block(self, low: np.ndarray, high: np.ndarray, before: tuple[int, int, int] | None = None, **more: Any) -> Any:
+        return block_of(low, high, self.grid.spacing, self.grid.dimension, before or self.grid.origin, **more)
 
     def measured(
-        self, geometry: Geometry, low: np.ndarray, high: np.ndarray, *, stride: int = 1, offset: float
-    ) -> Iterator[tuple[Any, wp.array]]:
+        self, geometry: Geometry, low: np.ndarray, high: np.ndarray, *, stride: int = 1, offset: float,
+        before: tuple[int, int, int] | None = None,
+    ) -> Iterator[tuple[Any, wp.array]]:  # fmt: skip
         """Cut a box of nodes into blocks that fit, planes or else rows, and yield each with its distances [m].
 
         Args:
@@ -171,6 +172,7 @@ class NodeSampler:
             high: one past the last.
             stride: nodes along each axis for which one distance stands.
             offset: from the low one of them to where it is measured, in cells.
+            before: cells (x, y, z) of the whole grid before the first node's; None: those before the sampler's grid.
         """
         room = len(self._points) // stride**3
         across, rows, _ = (int(v) for v in -(-(high - low) // stride))
@@ -179,7 +181,7 @@ class NodeSampler:
             for front in range(int(low[1]), int(high[1]), height * stride):
                 begin = np.array([low[0], front, bottom])
                 end = np.minimum(begin + np.array([high[0] - low[0], height * stride, depth * stride]), high)
-                block = self._block(begin, end, stride=stride, offset=offset)
+                block = self._block(begin, end, before, stride=stride, offset=offset)
                 counts = block.counts
                 yield block, self._measure(geometry, counts[0] * counts[1] * counts[2], item_points, [block])
 
