@@ -21,10 +21,10 @@ from warp_lcp.granular.bodies_kernels import (
     respond_kernel,
     stiffness_kernel,
 )
-from warp_lcp.granular.body_faces import BodyFaces, entries_near, find_body_faces, unowned_copies
+from warp_lcp.granular.body_faces import BodyFaces, entries_near, find_body_faces, own_copies, unowned_copies, within
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.yield_set import F64, I32, U8, xyz
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import Rows
 from warp_lcp.rows.program import Launch
 
@@ -53,14 +53,19 @@ class SandBodies:
     Args:
         grid: the grid.
         numbers: the wall's number of each body, 1 + index of its solid.
+        counted: the cells whose stresses act on the bodies here; None: all.
+        own: of the faces and edges of these, those that no one else has; None: all.
 
     Attributes:
         freedoms: k, degrees of freedom of a body.
         velocity: V of each, float64, shape (bodies, k) [m/s, 1/s]; after `Stress.residual` that which the stresses leave.
     """
 
-    def __init__(self, grid: StaggeredGrid, numbers: Sequence[int]) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, numbers: Sequence[int], *, counted: Window | None = None, own: Window | None = None
+    ) -> None:  # fmt: skip
         """Allocate what does not depend on where the bodies are."""
+        self._counted, self._own = counted, own
         self.grid, self.numbers, self.freedoms = grid, tuple(numbers), NUMBERS[grid.dimension]
         count, k, device = len(self.numbers), self.freedoms, grid.device
         self.velocity, self._force, self._start, self._error = (wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4))
@@ -81,7 +86,7 @@ class SandBodies:
             walls: the faces between sand and solids, the same object as long as `index` is the same.
         """
         grid, device = self.grid, self.grid.device
-        found = find_body_faces(grid, index, self.numbers, centers)
+        found = find_body_faces(grid, index, self.numbers, centers, self._counted)
         if self.faces is not None and walls is self._walls:  # the same cells: what is recorded stays valid
             self.faces = found
             for places, rows in ((self._faces, found.face.row), (self._cells, found.cell.row), (self._edges, found.edge.row)):
@@ -97,6 +102,7 @@ class SandBodies:
         for places, part in ((self._faces, found.face), (self._cells, found.cell), (self._edges, found.edge)):
             places.at, places.axis, places.body = put(part.at, I32), put(part.axis, U8), put(part.body, I32)
             places.row = put(part.row, F64)
+        self._edges.copies = put(own_copies(grid, found.edge, self._counted), U8)
         copies, homes = unowned_copies(grid, index, found)
         self._unowned = put((FIRST[grid.dimension] + copies) * grid.size + homes, I32)
         self._trial = put(cells, I32)
@@ -125,9 +131,11 @@ class SandBodies:
         inputs = [self._faces, flat_vector(packing.mass), flat_vector(sand), flat_vector(weights), layer]
         wp.launch(layer_kernel, len(rows), inputs, device=self.grid.device)
         mass, speed = layer.numpy().T
+        mass = mass * within(self.grid, self.faces.face.at, self._own)
         count = len(self.numbers)
-        self._layer_mass = _products(mass, rows, owner, count)
-        self._layer_momentum = np.stack([np.bincount(owner, mass * speed * row, count) for row in rows[:, 0].T], axis=1)
+        self._layer_mass = self._of_all(_products(mass, rows, owner, count))
+        momentum = [np.bincount(owner, mass * speed * row, count) for row in rows[:, 0].T]  # integers where there is no face
+        self._layer_momentum = self._of_all(np.stack(momentum, axis=1).astype(float))
         alone = inverse_mass * self._scale
         heavier = np.linalg.inv(np.eye(self.freedoms) + alone @ self._layer_mass)
         self._host_response = heavier @ alone
@@ -172,7 +180,9 @@ class SandBodies:
         count = len(self.numbers)
         steepest = _products(pressure_step * pressure, along[:, None], cell.body, count)
         steepest += _products(factor * shear_step * shear, deviator, cell.body, count)
-        steepest += _products(shear_step * edges.numpy() * edge.share, edge.row, edge.body, count)
+        own = within(self.grid, edge.at, self._own)
+        steepest += _products(shear_step * edges.numpy() * edge.share * own, edge.row, edge.body, count)
+        steepest = self._of_all(steepest)
         identity = np.eye(self.freedoms)
         self._correction.assign(np.linalg.inv(identity + self._host_response @ steepest))
 
@@ -196,7 +206,7 @@ class SandBodies:
         inputs = [self._shape, self._spans, stress.flatten(), self._cells, self._edges, flat_vector(packing.share), self._partial]
         if self._spans.shape[0]:
             launch(force_kernel, self._spans.shape[0], inputs, device=device)
-        inputs = [int(implicit), self._owned, self._partial, self._start, self._response, self._correction]
+        inputs = [int(implicit), *self._parts_of_all(launch), self._start, self._response, self._correction]
         launch(respond_kernel, len(self.numbers), [*inputs, self._force, self._error, self.velocity], device=device)
 
     def search(
@@ -217,7 +227,7 @@ class SandBodies:
         faces = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p) | {"active": self._active}
         trials = [(kernels.trial, len(self._trial), cells), (kernels.trial_wall, len(self._entries), faces)]
         edges = [self._shape, self._edges, flat_vector(velocity.u), flat_vector(velocity.edge)]
-        for _ in range(ROUNDS if len(self._trial) else 0):
+        for _ in range(ROUNDS):
             for passed, count, fields in trials:
                 if count:
                     passed.bind(Rows.entries(count, device), **stress, **given, **fields).launch(launch)
@@ -225,6 +235,14 @@ class SandBodies:
             self.move(velocity, launch)
             if len(self._edges.at):
                 launch(kernels.strain, len(self._edges.at), edges, device=device)
+
+    def _of_all(self, found: np.ndarray) -> np.ndarray:
+        """Return sums over all parts of the grid."""
+        return found
+
+    def _parts_of_all(self, launch: Launch) -> tuple[wp.array, wp.array]:
+        """Return the runs of each body, first and last, and what stresses do to the body in these."""
+        return self._owned, self._partial
 
     def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
         """Return runs of the lists of cells and edges that a thread adds up, first and last of both, and each body's runs."""

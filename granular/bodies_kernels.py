@@ -49,6 +49,7 @@ class Places:
     axis: _BYTES
     body: _INTS
     row: _MATS
+    copies: _BYTES  # of an edge, a bit each: which of its cells' stresses act on the body here
 
 
 @wp.func
@@ -88,6 +89,12 @@ def stress_part(stress: _SINGLE, layer: int, cell: int, axis: int, dimension: in
     return wp.where(axis == 0, n, -n) - x
 
 
+@wp.func
+def copy_of(stress: _SINGLE, n: int, copies: int, q: int):
+    """The stress of an edge's copy, 0 where it acts on the body elsewhere."""
+    return wp.where((copies >> q) & 1 == 1, wp.float64(stress[n]), wp.float64(0.0))
+
+
 @wp.kernel(**options)
 def forget_kernel(slot: _INTS, now: _SINGLE, before: _SINGLE, point: _SINGLE):
     """No stress at the slots."""
@@ -118,8 +125,9 @@ def force_kernel(grid: FieldShape, spans: _SPANS, stress: _SINGLE, cells: Places
         weight = entry(share, d, at)
         if weight != 0.0:
             base = (first + 4 * d) * grid.layer + at
-            low = wp.float64(stress[base]) + wp.float64(stress[base + grid.layer - alpha])
-            high = wp.float64(stress[base + 2 * grid.layer - beta]) + wp.float64(stress[base + 3 * grid.layer - alpha - beta])
+            c = int(edges.copies[n])
+            low = copy_of(stress, base, c, 0) + copy_of(stress, base + grid.layer - alpha, c, 1)
+            high = copy_of(stress, base + 2 * grid.layer - beta, c, 2) + copy_of(stress, base + 3 * grid.layer - alpha - beta, c, 3)
             shear = wp.float64(wp.abs(weight)) * (low + high)
             for q in range(freedoms):
                 out[part, q] = out[part, q] - edges.row[n, 0, q] * shear

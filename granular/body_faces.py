@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from warp_lcp.granular.packing import SHEARS
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,10 @@ class Incidence:
     axis: np.ndarray
     share: np.ndarray
 
+    def where(self, wanted: np.ndarray) -> Incidence:
+        """Return the places that are wanted, bool, shape (n,)."""
+        return Incidence(*(getattr(self, name)[wanted] for name in self.__dataclass_fields__))
+
 
 @dataclass(frozen=True)
 class BodyFaces:
@@ -48,7 +52,9 @@ class BodyFaces:
     edge: Incidence
 
 
-def find_body_faces(grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[int], centers: np.ndarray) -> BodyFaces:
+def find_body_faces(
+    grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[int], centers: np.ndarray, counted: Window | None = None
+) -> BodyFaces:
     """Return where bodies meet open cells.
 
     A face between two solids belongs to that of the higher number.
@@ -58,14 +64,18 @@ def find_body_faces(grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[in
         index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
         numbers: the wall's number of each body.
         centers: of mass of each body [m], shape (bodies, 3).
+        counted: cells that are asked for, with their edges and all faces that strain these; None: all.
     """
     faces = [_faces(grid, index, axis, np.asarray(numbers, dtype=int)) for axis in range(grid.dimension)]
     rows = [_face_rows(grid, flat, axis, np.asarray(centers, dtype=float)[body]) for axis, (flat, body) in enumerate(faces)]
     axis_of = np.repeat(np.arange(grid.dimension), [len(flat) for flat, _ in faces])
     at, body, row = (np.concatenate(parts) for parts in zip(*((f, b, r) for (f, b), r in zip(faces, rows, strict=True)), strict=True))
+    here = within(grid, at, counted, below=1, above=1)
+    at, body, row, axis_of = at[here], body[here], row[here], axis_of[here]
     order = np.lexsort((at, axis_of, body))
     face = Incidence(at[order], body[order], row[order][:, None], axis_of[order], np.ones(len(at), dtype=int))
-    return BodyFaces(face, _cells(grid, index, face), _edges(grid, face))
+    cell, edge = _cells(grid, index, face), _edges(grid, face)
+    return BodyFaces(face, cell.where(within(grid, cell.at, counted)), edge.where(within(grid, edge.at, counted, above=1)))
 
 
 def entries_near(grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -106,6 +116,21 @@ def unowned_copies(grid: StaggeredGrid, index: np.ndarray, faces: BodyFaces) -> 
             copies.append(np.full(len(cell), 4 * d + q))
             cells.append(cell)
     return np.concatenate(copies), np.concatenate(cells)
+
+
+def own_copies(grid: StaggeredGrid, edge: Incidence, counted: Window | None) -> np.ndarray:
+    """Return which of an edge's four copies are of counted cells, a bit each, uint8, shape (n,); `counted`: None: all."""
+    strides, axes = np.array(_strides(grid)), np.array(SHEARS[grid.dimension])[edge.axis]
+    cells = [edge.at - (q & 1) * strides[axes[:, 0]] - (q >> 1) * strides[axes[:, 1]] for q in range(4)]
+    return np.packbits([within(grid, at, counted) for at in cells], axis=0, bitorder="little")[0]
+
+
+def within(grid: StaggeredGrid, flat: np.ndarray, window: Window | None, *, below: int = 0, above: int = 0) -> np.ndarray:
+    """Return which places, flat indices, are in a window, or so many layers below and above it; None: all are."""
+    if window is None:
+        return np.ones(len(flat), dtype=bool)
+    at = np.stack(np.unravel_index(flat, grid.shape), axis=-1)
+    return np.asarray(((at >= np.array(window.low) - below) & (at < np.array(window.high) + above)).all(axis=-1))
 
 
 def _strides(grid: StaggeredGrid) -> tuple[int, int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,11 +88,14 @@ class SandSimulation(ParticleSimulation):
         scene, self.solids, self.sides = self.scene, parts.solids, parts.boundary.sides
         self._base, self.density = grid.field(wp.int8), grid.field()
         self.packing = self._packing()
-        self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
+        self.carried = None if self.bodies is None else self._carried(self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress, self.outcome = self._stresses(box=box, rate=rate, bodies=self.carried)
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
+
+    def _carried(self, numbers: Sequence[int]) -> SandBodies:
+        return SandBodies(self.grid, numbers)
 
     def _packing(self) -> Packing:
         return Packing(self.grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)

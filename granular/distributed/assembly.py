@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from warp_lcp.distributed.bodies import SharedBodies
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
@@ -13,7 +14,7 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.distributed.simulation import DistributedSand
 from warp_lcp.granular.distributed.solids import SharedSandSolids
 from warp_lcp.granular.scene import SandScene
-from warp_lcp.material.particle_assembly import Parts, make_outlets, make_sources, placed_solids
+from warp_lcp.material.particle_assembly import Parts, make_bodies, make_outlets, make_sources, placed_solids
 from warp_lcp.scene.scene import Scene
 
 METHODS = ("accelerated-projection",)  # that solve problems of several ranks
@@ -36,7 +37,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     check_shared(scene, ranks, refusals(scene), METHODS)
     part = part_of(scene, ranks, device)
     placed = placed_solids(scene, folder)
-    warnings: list[str] = []
+    bodies, warnings = make_bodies(scene, placed, partial(SharedBodies, ranks)), list[str]()
 
     def make_parts(part: Subdomain) -> Parts:
         boundary, notes = boundary_of_part(scene, part, placed)
@@ -48,11 +49,10 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     particles, notes = particles_of_part(scene, part, parts, folder)
     outlets = make_outlets(scene, part.grid, folder)
     return DistributedSand(
-        scene, part.grid, parts, particles, make_parts=make_parts, outlets=outlets, notes=[*warnings, *notes]
+        scene, part.grid, parts, particles, make_parts=make_parts, bodies=bodies, outlets=outlets, notes=[*warnings, *notes]
     )  # fmt: skip
 
 
 def refusals(scene: SandScene) -> list[str]:
     """Return the keys of a scene that ask for what runs on ranks have not."""
-    bodies = [f"solid[{n}].mass" for n, solid in enumerate(scene.solid) if solid.is_body]
-    return [*bodies, *(["domain.periodic"] if scene.endless else [])]
+    return ["domain.periodic"] if scene.endless else []

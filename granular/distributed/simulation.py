@@ -11,6 +11,7 @@ import warp as wp
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.granular.distributed.bodies import SharedSandBodies
 from warp_lcp.granular.distributed.stress import SharedPacking, SharedReport, SharedStress
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation, percentile_place
@@ -33,6 +34,9 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
         """Allocate the fields and find the sand's cells."""
         super().__init__(*arguments, **more)
         self.balance = Balance(fixed=STEP)
+
+    def _carried(self, numbers: Sequence[int]) -> SharedSandBodies:
+        return SharedSandBodies(self.part, numbers)
 
     def _packing(self) -> SharedPacking:
         return SharedPacking(self.part, self._base, self.boundary.capacity, cut=self.solids.cut)

@@ -73,6 +73,14 @@ RAFTS = [  # in contact at cuts
 COLUMN = {"size": DEEP["size"], "resolution": 24, "sand": [box([0.0, 0.0, 0.0], [0.4, 0.4, 0.5])]}
 HEAP = {"size": FLAT["size"], "resolution": 32, "sand": [box([0.3, 0.0], [1.0, 0.4])]}
 POURED = box([0.6, 0.35, 0.1], [0.8, 0.45, 0.4], velocity=[0.3, -1.0, 0.2])
+SUNK = [  # in the sand at a cut, and in one rank's box
+    BALL | {"center": [0.35, 0.35, 0.25], "mass": 8.0, "velocity": [0.5, -1.0, 0.0]},
+    box([0.02, 0.41, 0.1], [0.17, 0.47, 0.3], density=900.0, angular_velocity=[0.0, 200.0, 0.0]),
+]
+DROPPED = [
+    DISC | {"center": [0.5, 0.42], "radius": 0.06, "density": 7000.0, "velocity": [0.0, -1.0]},
+    box([0.5, 0.1], [0.6, 0.2], density=900.0),
+]
 TRICKLING = {"open": ["right"], "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.01)], "material": {"cohesion": 50.0}}
 SPOUT = box([0.5, 0.45, 0.1], [0.7, 0.5, 0.3], velocity=[0.0, -0.8, 0.0], viscosity=0.5)
 PLUNGER = box([0.4, 0.0, 0.1], [0.55, 0.3, 0.3], wall="sticky", motion={"kind": "translation", "velocity": [0.3, 0.2, 0.0]})
@@ -110,6 +118,8 @@ SCENES |= {
     "stirred sand": COLUMN | {"solid": [BLADE], "source": [POURED], "particles": {"reseed": {"min": 4, "max": 12}}},
     "voxel sand": COLUMN | {"solid": [BALL], "solids": "voxel", "friction": {"dynamic_angle": 40.0, "grain_size": 1e-3}},
     "thrown sand": COLUMN | {"sand": THROWN},
+    "bodies in sand": COLUMN | {"solid": SUNK, "density_correction": {}},
+    "ball on sand": HEAP | {"solid": DROPPED, "density_correction": {"every": 2}},
     "trickling sand": HEAP | TRICKLING | {"particles": {"transfer": "flip"}, "friction": {"model": "box"}},
 }
 
@@ -197,7 +207,7 @@ def wrap(ranks: Ranks, folder: Path) -> None:
                 np.savez(folder / f"{name}_{step}_{ranks.size}.npz", points=mesh.points, corners=mesh.corners, **found)
 
 
-RESUMED = ("cut", "river", "crowded", "floating", "thick and thin", "banded", "sand", "stirred sand")
+RESUMED = ("cut", "river", "crowded", "floating", "thick and thin", "banded", "sand", "stirred sand", "bodies in sand")
 
 
 def keep(ranks: Ranks, folder: Path) -> None:

@@ -93,6 +93,7 @@ class ParticleSimulation(ParticleCheckpoints):
     ) -> None:
         """Allocate the fields, fill the sources that run at the start and sort the particles."""
         self.scene, self.particles, self.outlets, self.bodies = scene, particles, outlets, bodies
+        self._bodies_at_start = [body.state() for body in bodies.bodies] if bodies is not None else []
         self.time, self.step_count, self.last_dt, self.kick_dt = 0.0, 0, 0.0, 0.0
         self._velocity_before = np.zeros(3)  # mean of the particles at the start of the step [m/s]
         self.watch: Stopwatch = NoStopwatch()
@@ -161,7 +162,13 @@ class ParticleSimulation(ParticleCheckpoints):
         """Lay another grid, whose fields then hold nothing yet."""
         for name in self._laid - {"vicinity"}:  # so that their memory is there for what comes
             delattr(self, name)
+        bodies = self.bodies.bodies if self.bodies is not None else []
+        now = [body.state() for body in bodies]
+        for body, state in zip(bodies, self._bodies_at_start, strict=True):
+            body.restore(state)  # the cells of a source are those that are open at the start
         self.lay(grid, make_parts(grid))
+        for body, state in zip(bodies, now, strict=True):
+            body.restore(state)
         self.particles.move_to(grid)
         self.boundary.place(self.time)
 
