@@ -9,7 +9,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
-from warp_lcp.distributed.particles import UNSORTED, SharedParticles
+from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import Trail, Window
@@ -37,7 +37,7 @@ class SharedCrowding(Crowding):
 
     def _find(self, density: wp.array, particles: Particles, window: Window) -> None:
         assert isinstance(particles, SharedParticles), "particles of ranks"
-        particles.arrange(UNSORTED)
+        particles.look_around()
         super()._find(density, particles, window)
         particles.drop_ghosts()
         self.part.fill(density)
@@ -73,7 +73,7 @@ class SharedDensityCorrection(DensityCorrection):
 
     def _find_density(self, particles: Particles, window: Window) -> None:
         assert isinstance(particles, SharedParticles), "particles of ranks"
-        particles.arrange(UNSORTED)
+        particles.look_around()
         super()._find_density(particles, window)
         particles.drop_ghosts()
         self.part.fill(self.density)

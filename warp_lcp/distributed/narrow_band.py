@@ -68,7 +68,7 @@ class SharedNarrowBand(NarrowBand):
         x, y, z = (cells + before for cells, before in zip((i, j, k), self.grid.origin, strict=True))
         nx, ny, _ = (n + 2 for n in self.part.decomposition.counts)
         first = ((z * ny + y) * nx + x) * MOST_A_CELL - np.cumsum(counts) + counts
-        particles.place = np.concatenate([particles.place, self._first + np.repeat(first, counts) + np.arange(counts.sum())])
+        particles.add_places(self._first + np.repeat(first, counts) + np.arange(counts.sum()))
 
     def _of_all(self, count: int) -> int:
         return int(self.part.ranks.sum(count))

@@ -9,7 +9,7 @@ made anew each time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox
+from warp_lcp.distributed.place_order import PlaceOrder
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid import particles_kernels as kernels
@@ -114,8 +115,8 @@ class SharedParticles(Particles):
         self._take_part(part)
         self.place = np.arange(len(position), dtype=np.int64) if place is None else np.asarray(place, dtype=np.int64)
         self._own: np.ndarray | int | None = None  # which particles are this rank's, or how many of the first; None: all
+        self._lying: PlaceOrder | None = None  # of those of this rank; None: not known
         super().__init__(part.grid, position, velocity, affine=affine, kept=kept, indexed=indexed)
-        self._record = np.dtype([("place", np.int64), ("values", np.float32, (len(self._names), 3))])
 
     def _take_part(self, part: Subdomain) -> None:
         self.part, around = part, part.box.grown(REACH)
@@ -125,7 +126,7 @@ class SharedParticles(Particles):
 
     def work_on(self, part: Subdomain) -> None:
         """Belong to another box from now on; `assign_with_places` then brings what lies in it."""
-        self._own = None
+        self._own = self._lying = None
         self._take_part(part)
 
     def arrange(self, step: int) -> None:
@@ -139,18 +140,24 @@ class SharedParticles(Particles):
             self.sort()
         elif self._neighbors:
             self.number()
-            order = np.argsort(self.place, kind="stable")
-            ends = np.flatnonzero(np.diff(order) != 1)
-            runs = np.stack([order[np.append(0, ends + 1)], order[np.append(ends, -1)] + 1], axis=1) if self.count else np.zeros(0)
-            self.runs = wp.array(runs.ravel(), dtype=wp.int32, device=self.grid.device)
+            self._find_runs()
+
+    def look_around(self) -> None:
+        """Let ghosts be there with their positions alone; own particles stay this rank's, wherever they are."""
+        if self.offsets is not None:
+            self.arrange(UNSORTED)
+        elif self._neighbors:
+            self.drop_ghosts()
+            self.number()
+            self._own = self.count
+            self._swap(np.flatnonzero(self._where() != INNER), ["position"])
+            self._find_runs()
 
     def _exchange(self) -> None:
         """Hand over and take in, and put ghosts behind the others."""
-        border = np.flatnonzero(self._where() != INNER)
-        cells = self._cells(border)
+        first, border = self.count, np.flatnonzero(self._where() != INNER)
+        cells = self._swap(border, self._names)
         out, near = ~_within(cells, self.part.box), _within(cells, self.part.box.grown(REACH))
-        first = self.count
-        self._receive(self.post.swap(self._outgoing(border, cells)))
         come = first + np.flatnonzero(self._where(first) == OUTSIDE)
         others, ghosts = np.append(border[out], come), np.append(border[out & near], come)
         count = self.count - len(others)
@@ -158,14 +165,31 @@ class SharedParticles(Particles):
         self._move(np.append(last, ghosts), np.append(free, count + np.arange(len(ghosts))))
         self._resize(count + len(ghosts))
         self.place, self._own = self.place[: self.count], count
+        if self._lying is not None:
+            self._lying = self._lying.changed(free, first, count)
+
+    def _find_runs(self) -> None:
+        """Find the order in which sums take the particles, of which the first are this rank's."""
+        assert isinstance(self._own, int), "ghosts lie behind the others"
+        if self._lying is None:
+            self._order_first(self._own)
+            self._lying = PlaceOrder(self.place[: self._own].copy())
+        self.runs = wp.array(self._lying.runs(self.place, self._own), dtype=wp.int32, device=self.grid.device)
+
+    def _order_first(self, count: int) -> None:
+        """Bring the first particles into the order of their places, of which others have been added or gone."""
+        place = self.place[:count]
+        if (place[1:] < place[:-1]).any():
+            order = np.append(np.argsort(place, kind="stable"), np.arange(count, self.count))
+            self._take(order, self.place[order])
+            self.number()
 
     def lie_in_order(self) -> None:
         """Bring the particles into the order in which sums take them, ghosts among them."""
-        if (self.place[1:] < self.place[:-1]).any():
-            order, self.runs = np.argsort(self.place, kind="stable"), None
-            self._take(order, self.place[order])
-            self.number()
-            self._own = None if self._own is None else self._where() != OUTSIDE
+        self._order_first(self.count)
+        if self._own is not None:
+            self._own = self._where() != OUTSIDE
+        self._lying = self.runs = None
 
     def sort(self) -> None:
         """Bring the particles into the order of their places, then into that of their cells, and give them new places."""
@@ -186,14 +210,18 @@ class SharedParticles(Particles):
         """Add particles behind the others, those of other ranks too; see the base class."""
         super().append(position, velocity, kept)
         first = max(NEW, 1 + int(self.place.max(initial=0)))
-        self.place = np.concatenate([self.place, first + np.arange(len(position))])
+        self.add_places(first + np.arange(len(position)))
+
+    def add_places(self, places: np.ndarray) -> None:
+        """Give particles behind the others their places."""
+        self.place, self._lying = np.append(self.place, places), None
 
     def remove(self, marks: wp.array) -> int:
         """Remove particles of this rank; see the base class."""
         stays = marks.numpy()[: self.count] == 0
         removed = super().remove(marks)
         if removed:
-            self.place = self.place[stays]
+            self.place, self._lying = self.place[stays], None
         return removed
 
     def drop_ghosts(self) -> None:
@@ -205,6 +233,7 @@ class SharedParticles(Particles):
         elif mine is not None:
             order = np.flatnonzero(mine)
             self._take(order, self.place[order])
+            self._lying = PlaceOrder(self.place.copy())
 
     def totals(self) -> ParticleTotals:
         """Return sums over all ranks' particles; there are no ghosts now."""
@@ -234,7 +263,7 @@ class SharedParticles(Particles):
             arrays: float32 of shape (n, 3) for every name of `arrays`.
             place: int64, shape (n,).
         """
-        self._own = None
+        self._own = self._lying = None
         order = np.argsort(place, kind="stable")
         self.assign({name: np.ascontiguousarray(values[order]) for name, values in arrays.items()})
         self.place = np.asarray(place, dtype=np.int64)[order]
@@ -258,26 +287,33 @@ class SharedParticles(Particles):
         k, j = np.divmod(rows, ny)
         return np.stack([i, j, k], axis=1) + (np.array(self.grid.origin, dtype=np.int32) - 1)
 
-    def _outgoing(self, border: np.ndarray, cells: np.ndarray) -> dict[int, np.ndarray]:
-        """Return what each neighbor must know of: particles in its box and within a cell of it, out of some in these cells."""
-        hosts, found = [array.numpy() for array in self.arrays().values()], {}
+    def _swap(self, border: np.ndarray, names: Sequence[str]) -> np.ndarray:
+        """Exchange columns of what neighbors must know: particles in their boxes and within a cell of them.
+
+        Args:
+            border: numbers of particles that may be.
+            names: of the columns that come; what comes lies behind the others.
+
+        Returns:
+            The cells (x, y, z) of the whole domain that those of `border` lie in, shape (n, 3).
+        """
+        cells, hosts, outgoing = self._cells(border), [self._columns[name].view.numpy() for name in names], {}
         for rank in self._neighbors:
             which = border[_within(cells, self.part.decomposition.boxes[rank].grown(REACH))]
-            records = np.empty(len(which), dtype=self._record)
-            records["place"] = self.place[which]
-            for column, host in enumerate(hosts):
-                records["values"][:, column] = host[which]
-            found[rank] = records
-        return found
+            outgoing[rank] = np.concatenate([values[which].ravel().view(np.uint8) for values in (self.place, *hosts)])
+        incoming = self.post.swap(outgoing)
+        counts = [len(message) // (8 + 12 * len(names)) for message in incoming]
+        first = self.make_room(sum(counts))
 
-    def _receive(self, incoming: list[np.ndarray]) -> None:
-        """Put what has come behind the particles."""
-        records = np.concatenate(incoming)
-        first = self.make_room(len(records))
-        for column, view in enumerate(self.arrays().values()):
-            if len(records):
-                view[first:].assign(np.ascontiguousarray(records["values"][:, column]))
-        self.place = np.append(self.place, records["place"])
+        def come(begin: int, end: int) -> np.ndarray:  # bytes of each particle
+            return np.concatenate([message[begin * n : end * n] for message, n in zip(incoming, counts, strict=True)])
+
+        if sum(counts):
+            for column, name in enumerate(names):
+                values = come(8 + 12 * column, 20 + 12 * column).view(np.float32).reshape(-1, 3)
+                self._columns[name].view[first:].assign(values)
+        self.place = np.append(self.place, come(0, 8).view(np.int64))
+        return cells
 
     def _move(self, sources: np.ndarray, targets: np.ndarray) -> None:
         """Bring particles of some numbers to where others are, or what is no longer wanted."""

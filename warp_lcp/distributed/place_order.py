@@ -1,0 +1,47 @@
+"""In what order sums take particles of which most lie in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+def _none() -> np.ndarray:
+    return np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class PlaceOrder:
+    """Which of a list's particles lie in the order of their places.
+
+    Args:
+        places: of all particles when all lay in order.
+        loose: numbers of those that others have taken the place of, ascending.
+    """
+
+    places: np.ndarray
+    loose: np.ndarray = field(default_factory=_none)
+
+    def changed(self, numbers: np.ndarray, before: int, count: int) -> PlaceOrder:
+        """Return what is known when there are other particles of some numbers, and `count` instead of those there were `before`."""
+        loose = np.concatenate([self.loose, numbers, np.arange(before, count)])
+        return PlaceOrder(self.places, np.unique(loose[loose < count]))
+
+    def runs(self, place: np.ndarray, count: int) -> np.ndarray:
+        """Return begin and end of each run of particles in order, one run after another, shape (2 runs,).
+
+        Args:
+            place: of the particles as they are, and of others behind them that are in any order.
+            count: particles without the others.
+        """
+        end = min(count, len(self.places))
+        gaps, others = self.loose[self.loose < end], np.append(self.loose, np.arange(count, len(place)))
+        others = others[np.argsort(place[others], kind="stable")]
+        before = np.searchsorted(self.places[:end], place[others], side="right")  # which of those in order they belong
+        cuts = np.sort(np.concatenate([[0, end], before, gaps, gaps + 1]), kind="stable")
+        held = cuts[1:] > cuts[:-1]
+        held[held] = ~np.isin(cuts[:-1][held], gaps)
+        begins, ends = (np.append(others + last, cuts[last : len(cuts) - 1 + last][held]) for last in (0, 1))
+        order = np.argsort(np.append(before, cuts[:-1][held]), kind="stable")
+        return np.stack([begins[order], ends[order]], axis=1).ravel()
