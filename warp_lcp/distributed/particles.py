@@ -173,7 +173,7 @@ class SharedParticles(Particles):
         assert isinstance(self._own, int), "ghosts lie behind the others"
         if self._lying is None:
             self._order_first(self._own)
-            self._lying = PlaceOrder(self.place[: self._own].copy())
+            self._lying = PlaceOrder(self.place[: self._own])
         self.runs = wp.array(self._lying.runs(self.place, self._own), dtype=wp.int32, device=self.grid.device)
 
     def _order_first(self, count: int) -> None:
@@ -201,7 +201,7 @@ class SharedParticles(Particles):
         key, begins = self.key.numpy()[: self.count], np.ones(self.count, dtype=bool)
         begins[1:] = key[1:] != key[:-1]
         starts = np.flatnonzero(begins)
-        i, j, k = self._cells(starts).T.astype(np.int64)
+        i, j, k = self._cells(starts).astype(np.int64)
         first = ((k * ny + j) * nx + i) * MOST_A_CELL
         self.place = np.repeat(first - starts, np.diff(starts, append=self.count))
         self.place += np.arange(self.count)
@@ -233,7 +233,7 @@ class SharedParticles(Particles):
         elif mine is not None:
             order = np.flatnonzero(mine)
             self._take(order, self.place[order])
-            self._lying = PlaceOrder(self.place.copy())
+            self._lying = PlaceOrder(self.place)
 
     def totals(self) -> ParticleTotals:
         """Return sums over all ranks' particles; there are no ghosts now."""
@@ -281,11 +281,11 @@ class SharedParticles(Particles):
         return np.asarray(found.numpy())
 
     def _cells(self, which: np.ndarray) -> np.ndarray:
-        """Return the cell (x, y, z) of the whole domain that some particles were last numbered in, shape (n, 3)."""
+        """Return the cell (x, y, z) of the whole domain that some particles were last numbered in, shape (3, n)."""
         nx, ny, _ = (n + 2 for n in self.grid.counts)
         rows, i = np.divmod(self.key.numpy()[: self.count][which], nx)
         k, j = np.divmod(rows, ny)
-        return np.stack([i, j, k], axis=1) + (np.array(self.grid.origin, dtype=np.int32) - 1)
+        return np.stack([i, j, k]) + (np.array(self.grid.origin, dtype=np.int32) - 1)[:, None]
 
     def _swap(self, border: np.ndarray, names: Sequence[str]) -> np.ndarray:
         """Exchange columns of what neighbors must know: particles in their boxes and within a cell of them.
@@ -295,7 +295,7 @@ class SharedParticles(Particles):
             names: of the columns that come; what comes lies behind the others.
 
         Returns:
-            The cells (x, y, z) of the whole domain that those of `border` lie in, shape (n, 3).
+            The cells (x, y, z) of the whole domain that those of `border` lie in, shape (3, n).
         """
         cells, hosts, outgoing = self._cells(border), [self._columns[name].view.numpy() for name in names], {}
         for rank in self._neighbors:
@@ -338,5 +338,6 @@ class SharedParticles(Particles):
 
 
 def _within(cells: np.ndarray, box: CellBox) -> np.ndarray:
-    """Tell which cells (x, y, z), shape (n, 3), are in a box."""
-    return np.asarray(((cells >= np.array(box.low)) & (cells < np.array(box.high))).all(axis=1))
+    """Tell which cells (x, y, z), shape (3, n), are in a box."""
+    low, high = np.array([box.low, box.high], dtype=np.int32)[:, :, None]
+    return np.asarray(((cells >= low) & (cells < high)).all(axis=0))
