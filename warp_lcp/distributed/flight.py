@@ -62,13 +62,13 @@ class SharedFlights(Flights):
     def _bodies(self) -> int:
         """Join the trees of all ranks, and return how many bodies this rank knows: first those that several have trees of."""
         trees, part, ranks = super()._bodies(), self._part, self._part.ranks
-        fields = [field.numpy() for field in (self._parent, self._number, self._held)] if self._cuts else []
-        planes = [[self._nodes(plane, *fields) for plane in pair] for pair in self._cuts]
+        planes = self._nodes_at_cuts() if trees else []
         near = any(bool((nodes > GROUND).any()) for pair in planes for _, nodes in pair)
         everyone = ranks.gather(np.array([trees, near]))
         self._shared, self._row = 0, np.arange(trees, dtype=np.int32)
         if not everyone[:, 1].any():
             return trees
+        planes = planes or self._nodes_at_cuts()
         first, count = nodes_of(ranks, everyone[:, 0])
         grid = np.full(self.grid.shape, ALONE, dtype=np.int32)
         for pair in planes:
@@ -88,6 +88,11 @@ class SharedFlights(Flights):
         own = ~several[mine] & (mine != component[GROUND])
         self._row = np.where(own, self._shared + np.cumsum(own) - 1, np.where(several, np.cumsum(several) - 1, -1)[mine]).astype(np.int32)
         return self._shared + int(own.sum())
+
+    def _nodes_at_cuts(self) -> list[list[tuple[tuple[slice, ...], np.ndarray]]]:
+        """Return the nodes of the planes on both sides of each cut."""
+        fields = [field.numpy() for field in (self._parent, self._number, self._held)]
+        return [[self._nodes(plane, *fields) for plane in pair] for pair in self._cuts]
 
     def _nodes(self, plane: Window, parent: np.ndarray, number: np.ndarray, held: np.ndarray) -> tuple[tuple[slice, ...], np.ndarray]:
         """Return those of a plane's cells that were seen, and their nodes with this rank's first tree as 1, int32, in their shape."""

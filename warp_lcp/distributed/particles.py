@@ -160,10 +160,14 @@ class SharedParticles(Particles):
         out, near = ~_within(cells, self.part.box), _within(cells, self.part.box.grown(REACH))
         come = first + np.flatnonzero(self._where(first) == OUTSIDE)
         others, ghosts = np.append(border[out], come), np.append(border[out & near], come)
-        count = self.count - len(others)
-        free, last = others[others < count], np.setdiff1d(np.arange(count, self.count), others)
-        self._move(np.append(last, ghosts), np.append(free, count + np.arange(len(ghosts))))
-        self._resize(count + len(ghosts))
+        count, end = self.count - len(others), self.count - len(others) + len(ghosts)
+        own, there = np.ones(self.count - count, dtype=bool), np.zeros(len(ghosts), dtype=bool)  # of the numbers from `count` on
+        own[others[others >= count] - count] = False
+        stay = (ghosts >= count) & (ghosts < end)
+        there[ghosts[stay] - count] = True
+        free, last = others[others < count], count + np.flatnonzero(own)
+        self._move(np.append(last, ghosts[~stay]), np.append(free, count + np.flatnonzero(~there)))
+        self._resize(end)
         self.place, self._own = self.place[: self.count], count
         if self._lying is not None:
             self._lying = self._lying.changed(free, first, count)
