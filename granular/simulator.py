@@ -215,7 +215,7 @@ class SandSimulation(ParticleSimulation):
 
     def _sand_cells(self) -> np.ndarray:
         """Return where sand is that a frame shows, as (k, j, i) in the stored shape, shape (n, 3)."""
-        return np.argwhere(self.packing.kind.numpy() == FLUID)
+        return np.argwhere(self.grid.interior(self.packing.kind.numpy()) == FLUID) + 1
 
     def pressures(self) -> np.ndarray:
         """Return the pressure p = rho dx x / dt [Pa] of the last solve, in the stored shape; zeros before the first."""
@@ -358,7 +358,15 @@ class SandSimulation(ParticleSimulation):
             extend_velocity(window, self.velocity, self.weights, known, kind, contact, *walls, self.layers, join=join)
 
     def _layer_filled(self) -> Join | None:
-        return super()._layer_filled() if self.sides is None else self.sides.wrap
+        others, sides = super()._layer_filled(), self.sides
+        if others is None or sides is None:
+            return others if sides is None else sides.wrap
+
+        def join(marks: wp.array, field: wp.array) -> None:
+            others(marks, field)
+            sides.wrap(marks, field)
+
+        return join
 
     def _front(self) -> tuple[float, float]:
         """Return the 99th percentile of x and of y [m]."""

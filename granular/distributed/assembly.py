@@ -55,4 +55,5 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
 
 def refusals(scene: SandScene) -> list[str]:
     """Return the keys of a scene that ask for what runs on ranks have not."""
-    return ["domain.periodic"] if scene.endless else []
+    shown = [key for key in ("surface", "volume") if scene.endless and getattr(scene.output, key)]
+    return [f"output.{key} where an axis is periodic" for key in shown]  # they end at sides that ranks do not have

@@ -39,7 +39,7 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
         return SharedSandBodies(self.part, numbers)
 
     def _packing(self) -> SharedPacking:
-        return SharedPacking(self.part, self._base, self.boundary.capacity, cut=self.solids.cut)
+        return SharedPacking(self.part, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
 
     def _stresses(self, **settings: Any) -> tuple[SharedStress, SharedReport]:
         assert isinstance(self.packing, SharedPacking)
@@ -92,6 +92,9 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
 
     def _sum(self, count: int) -> int:
         return int(self.part.ranks.sum(count))
+
+    def _still_solids(self) -> wp.array:
+        return self.solids.base
 
     def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from the arrays of `own_state`, those of the ghost layers from other ranks."""

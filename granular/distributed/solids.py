@@ -14,7 +14,7 @@ from warp_lcp.material.boundary import Boundary
 
 
 class SharedSandSolids(SandSolids):
-    """Solids in a rank's part, whose walls are those of the cells of its box; making them, and `place`, is collective.
+    """Solids in a rank's part, whose walls are those of the cells of its box; making them, `place` and `begin_step` are collective.
 
     Args:
         part: where this rank works.
@@ -29,7 +29,14 @@ class SharedSandSolids(SandSolids):
         super().__init__(part.grid, placed, boundary, friction, counted=part.owned, **more)
 
     def _join(self, index: wp.array) -> None:
+        super()._join(index)
         self._part.fill(index)
+
+    def begin_step(self, time: float, dt: float) -> None:
+        """Find how fast the solids move, see the base class, also where an axis without an end has led them around."""
+        super().begin_step(time, dt)
+        if self.moves and self._part.decomposition.joined:
+            self._part.fill(*self.velocity)
 
     def _covers(self) -> list[int]:
         return list(self._part.ranks.sum([*super()._covers(), 0])[:-1])

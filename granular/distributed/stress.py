@@ -53,6 +53,7 @@ class SharedPacking(Packing):
     def join(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:
         """Fill the ghost cells of a field of stresses that hold sand; in others they are 0. Collective."""
         perform(partial(self._fill, stress), launch)
+        super().join(stress, launch=launch)
 
     def _fill(self, stress: wp.array) -> None:
         part = self._part

@@ -82,6 +82,12 @@ DROPPED = [
     box([0.5, 0.1], [0.6, 0.2], density=900.0),
 ]
 TRICKLING = {"open": ["right"], "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.01)], "material": {"cohesion": 50.0}}
+SLOPE = {"physics": {"gravity": [4.0, -8.0]}, "periodic": [True, False], "sand": [box([0.6, 0.0], [1.0, 0.3], velocity=[1.0, 0.0])]}
+ROUND = {  # along x and z, over a step that goes on at the other sides, around a wheel
+    "periodic": [True, False, True],
+    "sand": [box([0.0, 0.0, 0.0], [1.0, 0.2, 0.5], velocity=[-0.8, 0.0, 0.6])],
+    "solid": [box([-1.0, -1.0, -1.0], [2.0, 0.05, 2.0]), BLADE],
+}
 SPOUT = box([0.5, 0.45, 0.1], [0.7, 0.5, 0.3], velocity=[0.0, -0.8, 0.0], viscosity=0.5)
 PLUNGER = box([0.4, 0.0, 0.1], [0.55, 0.3, 0.3], wall="sticky", motion={"kind": "translation", "velocity": [0.3, 0.2, 0.0]})
 THICK = {"viscosity": {"value": 20.0}, "wall": "sticky", "solid": [BALL]}
@@ -118,6 +124,8 @@ SCENES |= {
     "stirred sand": COLUMN | {"solid": [BLADE], "source": [POURED], "particles": {"reseed": {"min": 4, "max": 12}}},
     "voxel sand": COLUMN | {"solid": [BALL], "solids": "voxel", "friction": {"dynamic_angle": 40.0, "grain_size": 1e-3}},
     "thrown sand": COLUMN | {"sand": THROWN},
+    "endless sand": HEAP | SLOPE | {"solid": [DISC]},
+    "endless sand, stirred": COLUMN | ROUND,
     "bodies in sand": COLUMN | {"solid": SUNK, "density_correction": {}},
     "ball on sand": HEAP | {"solid": DROPPED, "density_correction": {"every": 2}},
     "trickling sand": HEAP | TRICKLING | {"particles": {"transfer": "flip"}, "friction": {"model": "box"}},
@@ -207,7 +215,7 @@ def wrap(ranks: Ranks, folder: Path) -> None:
                 np.savez(folder / f"{name}_{step}_{ranks.size}.npz", points=mesh.points, corners=mesh.corners, **found)
 
 
-RESUMED = ("cut", "river", "crowded", "floating", "thick and thin", "banded", "sand", "stirred sand", "bodies in sand")
+RESUMED = ("cut", "river", "crowded", "floating", "thick and thin", "banded", "sand", "stirred sand", "bodies in sand", "endless sand")
 
 
 def keep(ranks: Ranks, folder: Path) -> None:

@@ -17,10 +17,10 @@ LAYERS = 5
 SPACING = 0.03
 
 
-def part_of(seat: Seat, counts: tuple[int, int, int]) -> Subdomain:
+def part_of(seat: Seat, counts: tuple[int, int, int], periodic: tuple[int, ...] = ()) -> Subdomain:
     """Return a rank's part of a grid."""
-    dimension = 2 if counts[2] == 1 else 3
-    return Subdomain(Decomposition(counts, Ranks(seat)), spacing=SPACING, dimension=dimension, device="cpu", layers=LAYERS)
+    dimension, boxes = 2 if counts[2] == 1 else 3, Decomposition(counts, Ranks(seat), periodic=periodic)
+    return Subdomain(boxes, spacing=SPACING, dimension=dimension, device="cpu", layers=LAYERS)
 
 
 def cells_of(position: np.ndarray) -> np.ndarray:
@@ -97,6 +97,43 @@ def test_particles_go_to_the_rank_of_their_cell_in_the_order_of_one_process(coun
             expected = where[near], how[near], where[own], how[own]
             for array, wanted in zip(found[rank][step], expected, strict=True):
                 np.testing.assert_array_equal(array, wanted)
+
+
+@pytest.mark.parametrize(("counts", "size", "periodic"), [((24, 12, 1), 2, (0,)), ((13, 12, 14), 4, (0, 2)), ((13, 12, 14), 8, (0,))])
+def test_particles_go_around(counts, size, periodic):
+    """What is near a box, also through sides that are one, is seen there once, where it continues the box."""
+    position, velocity = scattered(counts, 900)
+    position[:4, 0] = 0.0, 1e-9, (counts[0] - 1e-3) * SPACING, SPACING
+    domain = np.array([n * SPACING if axis in periodic else np.inf for axis, n in enumerate(counts)])
+
+    def work(seat: Seat) -> None:
+        part = part_of(seat, counts, periodic)
+        low, high = ((np.array(corner) - 0.5) * SPACING for corner in (part.box.low, part.box.high))
+        mine = part.owners(cells_of(position)) == seat.rank
+        particles = SharedParticles(part, position[mine], velocity[mine], affine=True, post=seat)
+        particles.sort()
+        for step in range(SORT_EVERY + 3):
+            everyone = np.concatenate(seat.allgather(particles.position.numpy().astype(float)))
+            assert len(everyone) == len(position)
+            particles.arrange(step)
+            found = particles.position.numpy().astype(float)
+            assert len(np.unique(particles.place)) == len(found)
+            images = [x + np.array(shift) * SPACING for shift in part.decomposition.shifts for x in everyone]
+            near = np.array([x for x in images if within(x, low, high)])
+            seen = found[within(found, low, high)]
+            assert len(seen) == len(near)
+            np.testing.assert_allclose(np.sort(seen[:, 1]), np.sort(near[:, 1]))
+            particles.drop_ghosts()
+            moves = particles.position.numpy() + np.float32(2.7 * SPACING) * np.sin(9137.0 * particles.velocity.numpy() + step)
+            inside = np.clip(moves, 0.01 * SPACING, (np.array(counts) - 0.01) * SPACING) * (np.array(counts) > 1)
+            particles.position.assign(np.where(np.isfinite(domain), np.mod(moves, domain), inside).astype(np.float32))
+
+    on_ranks(size, work)
+
+
+def within(x, low, high):
+    """Tell which points lie in a box; in 2-D none has a z."""
+    return ((x >= low) & (x < high))[..., :2].all(axis=-1) & ((x[..., 2] == 0.0) | ((x[..., 2] >= low[2]) & (x[..., 2] < high[2])))
 
 
 def test_gradients_travel_with_their_particles():

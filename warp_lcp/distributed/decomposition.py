@@ -72,6 +72,7 @@ class Decomposition:
         ranks: who share them.
         processes: ranks along x, y, z; None: those with the least cells at cuts.
         cuts: cells of each box along x, y, z; None: even ones, with cuts at multiples of a power of two.
+        periodic: axes without an end.
 
     Attributes:
         boxes: of all ranks.
@@ -81,9 +82,10 @@ class Decomposition:
     """
 
     def __init__(
-        self, counts: Triple, ranks: Ranks, *, processes: Triple | None = None, cuts: Sequence[Sequence[int]] | None = None
-    ) -> None:
-        self.counts, self.ranks = counts, ranks
+        self, counts: Triple, ranks: Ranks, *, processes: Triple | None = None, cuts: Sequence[Sequence[int]] | None = None,
+        periodic: Sequence[int] = (),
+    ) -> None:  # fmt: skip
+        self.counts, self.ranks, self.periodic = counts, ranks, tuple(periodic)
         self.processes = processes or _processes(counts, ranks.size)
         if math.prod(self.processes) != ranks.size:
             raise ValueError(f"processes = {self.processes}: their product must be the number of ranks, {ranks.size}")
@@ -95,7 +97,7 @@ class Decomposition:
     def cut_anew(self, cuts: Sequence[Sequence[int]]) -> Decomposition:
         """Return other boxes of the same cells and ranks, as many along x, y, z as there are cells of each in `cuts`."""
         px, py, pz = map(len, cuts)
-        other = Decomposition(self.counts, self.ranks, processes=(px, py, pz), cuts=cuts)
+        other = Decomposition(self.counts, self.ranks, processes=(px, py, pz), cuts=cuts, periodic=self.periodic)
         other.collective = self.collective  # a communicator of its own for each would use them up
         return other
 
@@ -114,10 +116,30 @@ class Decomposition:
         """Axes along which there is more than one rank."""
         return tuple(axis for axis, p in enumerate(self.processes) if p > 1)
 
+    @property
+    def joined(self) -> tuple[int, ...]:
+        """Axes without an end along which there is more than one rank: the boxes at their sides are neighbors."""
+        return tuple(axis for axis in self.cut_axes if axis in self.periodic)
+
+    @property
+    def shifts(self) -> list[Triple]:
+        """The cells along x, y, z by which other ranks' cells come again around a box: none first."""
+        return self._shifts(self.joined)
+
+    def _shifts(self, axes: Sequence[int]) -> list[Triple]:
+        each = [(0, n, -n) if axis in axes else (0,) for axis, n in enumerate(self.counts)]
+        return [(x, y, z) for x in each[0] for y in each[1] for z in each[2]]
+
+    def meet(self, box: CellBox, other: CellBox) -> bool:
+        """Tell whether two boxes have cells in common, also where axes without an end have led one of them around."""
+        return any(box.moved(shift).common(other).cells for shift in self._shifts(self.periodic))
+
     def neighbor(self, axis: int, side: int) -> int | None:
         """Return the rank beyond this one's lower (0) or upper (1) side along an axis; None where the domain ends."""
         place = list(self.place(self.ranks.rank))
         place[axis] += 2 * side - 1
+        if axis in self.joined:
+            place[axis] %= self.processes[axis]
         if not 0 <= place[axis] < self.processes[axis]:
             return None
         px, py, _ = self.processes
@@ -131,7 +153,7 @@ class Decomposition:
                 return None
             new.append([-(-m // factor) for m in part])
         nx, ny, nz = (-(-n // f) for n, f in zip(self.counts, factors, strict=True))
-        return Decomposition((nx, ny, nz), self.ranks, processes=self.processes, cuts=new)
+        return Decomposition((nx, ny, nz), self.ranks, processes=self.processes, cuts=new, periodic=self.periodic)
 
     @cached_property
     def halo(self) -> Any:

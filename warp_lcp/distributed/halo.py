@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import weakref
 from collections.abc import Sequence
 from functools import cache, cached_property
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import CellBox, Decomposition
+from warp_lcp.distributed.decomposition import CellBox, Decomposition, Triple
 from warp_lcp.distributed.ranks import Ranks, petsc
 from warp_lcp.distributed.waiting import waiting
 
@@ -44,7 +45,8 @@ class Halo:
         self.shape = nz, ny, nx
         boxes = decomposition.boxes
         stored = [box.grown(width) for box in boxes]
-        self._forest = star_forest(decomposition.ranks, boxes, stored) if decomposition.ranks.size > 1 else None
+        several, shifts = decomposition.ranks.size > 1, decomposition.shifts
+        self._forest = star_forest(decomposition.ranks, boxes, stored, shifts=shifts) if several else None
         self._staging: dict[Any, np.ndarray] = {}
         self._coarser: dict[tuple[int, int, int], Halo | None] = {}
 
@@ -207,7 +209,7 @@ _transport = cache(_Transport)
 
 def star_forest(
     ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox], *, filled: CellBox | None = None, layers: int = 1,
-    whole: CellBox | None = None, which: np.ndarray | None = None,
+    whole: CellBox | None = None, which: np.ndarray | None = None, shifts: Sequence[Triple] = ((0, 0, 0),),
 ) -> StarForest:  # fmt: skip
     """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
 
@@ -219,15 +221,16 @@ def star_forest(
         layers: of numbers of those cells, one behind the other.
         whole: the cells of other fields, in which what each rank knows is wanted, this one too; None: leaves lie among the roots.
         which: of the cells that this rank stores are wanted, bool of their shape (nz, ny, nx); None: all.
+        shifts: cells along x, y, z by which what ranks know lies around this one again.
     """
     mine, roots = ranks.rank, layers * stored[ranks.rank].cells
     around = whole or stored[mine]
     wanted = around if filled is None else around.common(filled)
     leaves, remotes = [np.empty(0, dtype=np.int64)], [np.empty((0, 2), dtype=np.int32)]
-    for rank, (box, remote) in enumerate(zip(owned, stored, strict=True)):
-        shared = wanted.common(box)
+    for (rank, (box, remote)), shift in itertools.product(enumerate(zip(owned, stored, strict=True)), shifts):
+        shared = wanted.common(box.moved(shift))
         if (whole or rank != mine) and shared.cells:
-            here, there = _elements(shared, around), _elements(shared, remote)
+            here, there = _elements(shared, around), _elements(shared.moved(shift, -1), remote)
             if which is not None:
                 chosen = which.ravel()[here]
                 here, there = here[chosen], there[chosen]

@@ -27,7 +27,7 @@ def handed_over(piece: Piece, particles: Sequence[str], before: Subdomain, now: 
     mine, old, new = now.ranks.rank, before.decomposition.boxes, now.decomposition.boxes
 
     def gives(giver: int, taker: int) -> bool:  # particles move on to their rank when a step begins
-        return old[giver].grown(before.layers).common(new[taker]).cells > 0
+        return now.decomposition.meet(old[giver].grown(before.layers), new[taker])
 
     others = [rank for rank in range(now.ranks.size) if rank != mine and (gives(mine, rank) or gives(rank, mine))]
     owner = now.owners(cells_of(now, piece["position"]))

@@ -61,7 +61,7 @@ def part_of(scene: ParticleScene, ranks: Ranks, device: str, *, smoothing: int =
     volume = sum(float(np.prod(high - low)) for low, high in start)
     rest = pool(counts, scene.dimension, volume, np.array(scene.physics.gravity))
     processes = balanced_processes(counts, ranks.size, layers=layers, states=[start, [rest]])
-    decomposition = Decomposition(counts, ranks, processes=processes)
+    decomposition = Decomposition(counts, ranks, processes=processes, periodic=scene.endless)
     return Subdomain(decomposition, spacing=scene.spacing, dimension=scene.dimension, device=device, layers=layers)
 
 

@@ -51,7 +51,7 @@ def take_pieces(
             covered += shared.cells
             for name, values in cells.items() if shared.cells else ():
                 values[..., *shared.moved(part.box.low, -1).slices] = piece[name][..., *shared.moved(box.low, -1).slices]
-            if box.grown(part.layers).common(part.box).cells:  # particles move on to their rank when the next step begins
+            if part.decomposition.meet(box.grown(part.layers), part.box):  # particles move on to their rank when the next step begins
                 inside = part.owners(cells_of(part, piece["position"])) == part.ranks.rank
                 found.append({name: np.asarray(piece[name])[inside] for name in own})
         own = {name: np.ascontiguousarray(np.concatenate([p[name] for p in found])) for name in own}

@@ -303,7 +303,7 @@ class SharedParticleSimulation(ParticleSimulation):
 
     def _take_pieces(self, pieces: Sequence[Piece]) -> None:
         own, names = self._own_fields(), list(self.particles.arrays())
-        base = None if self.boundary.moves else self.boundary.base
+        base = None if self.boundary.moves else self._still_solids()
         particles, cells, numbers = take_pieces(self.part, names, own, signature(self.scene, self.part.grid), pieces, base)
         everyone = int(self.part.ranks.sum(len(particles["place"]))) + (int(numbers["interior"][0]) if self.band is not None else 0)
         if everyone != self._everyone and not (self.sources or self.outlets):
@@ -324,6 +324,10 @@ class SharedParticleSimulation(ParticleSimulation):
         if self.bodies is not None:
             self.bodies.restore(numbers)
         self.boundary.place(self.time)
+
+    def _still_solids(self) -> wp.array:
+        """Return int8, SOLID where `cells` of a state are."""
+        return self.boundary.base
 
     def state(self) -> dict[str, np.ndarray]:
         """Return this rank's part of the state, see `piece_state`."""

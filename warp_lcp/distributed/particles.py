@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox
+from warp_lcp.distributed.particle_pieces import cells_of
 from warp_lcp.distributed.place_order import PlaceOrder
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.distributed.waiting import waiting
@@ -119,8 +120,9 @@ class SharedParticles(Particles):
         super().__init__(part.grid, position, velocity, affine=affine, kept=kept, indexed=indexed)
 
     def _take_part(self, part: Subdomain) -> None:
-        self.part, around = part, part.box.grown(REACH)
-        self._neighbors = [r for r, box in enumerate(part.decomposition.boxes) if r != part.ranks.rank and around.common(box).cells]
+        self.part, decomposition, around = part, part.decomposition, part.box.grown(REACH)
+        self._neighbors = [r for r, box in enumerate(decomposition.boxes) if r != part.ranks.rank and decomposition.meet(box, around)]
+        self._end = _beyond(decomposition.counts, part.grid.spacing)
         if self._neighbors:
             self.room = ROOM
 
@@ -205,7 +207,7 @@ class SharedParticles(Particles):
         key, begins = self.key.numpy()[: self.count], np.ones(self.count, dtype=bool)
         begins[1:] = key[1:] != key[:-1]
         starts = np.flatnonzero(begins)
-        i, j, k = self._cells(starts).astype(np.int64)
+        i, j, k = self._cells(starts).astype(np.int64) % np.array(self.part.decomposition.counts)[:, None]
         first = ((k * ny + j) * nx + i) * MOST_A_CELL
         self.place = np.repeat(first - starts, np.diff(starts, append=self.count))
         self.place += np.arange(self.count)
@@ -238,6 +240,15 @@ class SharedParticles(Particles):
             order = np.flatnonzero(mine)
             self._take(order, self.place[order])
             self._lying = PlaceOrder(self.place)
+
+    def cells_of(self, positions: np.ndarray) -> np.ndarray:
+        """Return the interior cells of positions, see the base class; along axes without an end those that are nearest to the box."""
+        cells, part = super().cells_of(positions), self.part
+        for axis in part.decomposition.joined:
+            count = part.decomposition.counts[axis]
+            first = part.owned.low[2 - axis] - 1 - (count - part.box.counts[axis]) // 2
+            cells[:, axis] = (cells[:, axis] - first) % count + first
+        return cells
 
     def totals(self) -> ParticleTotals:
         """Return sums over all ranks' particles; there are no ghosts now."""
@@ -301,11 +312,11 @@ class SharedParticles(Particles):
         Returns:
             The cells (x, y, z) of the whole domain that those of `border` lie in, shape (3, n).
         """
-        cells, hosts, outgoing = self._cells(border), [self._columns[name].view.numpy() for name in names], {}
-        for rank in self._neighbors:
-            which = border[_within(cells, self.part.decomposition.boxes[rank].grown(REACH))]
-            outgoing[rank] = np.concatenate([values[which].ravel().view(np.uint8) for values in (self.place, *hosts)])
-        incoming = self.post.swap(outgoing)
+        joined = self.part.decomposition.joined  # who has gone around has come far
+        cells = cells_of(self.part, self.position.numpy()[border]).T if joined else self._cells(border)
+        incoming = self.post.swap({rank: self._seen_by(rank, border, cells, names) for rank in self._neighbors})
+        if joined:
+            incoming.append(self._seen_by(self.part.ranks.rank, border, cells, names))
         counts = [len(message) // (8 + 12 * len(names)) for message in incoming]
         first = self.make_room(sum(counts))
 
@@ -318,6 +329,22 @@ class SharedParticles(Particles):
                 self._columns[name].view[first:].assign(values)
         self.place = np.append(self.place, come(0, 8).view(np.int64))
         return cells
+
+    def _seen_by(self, rank: int, border: np.ndarray, cells: np.ndarray, names: Sequence[str]) -> np.ndarray:
+        """Return what a rank must know of, as bytes; arguments as of `_swap`.
+
+        Where axes have no end, positions are those that continue what is in its box; of this rank, which has the others, those alone.
+        """
+        decomposition, columns = self.part.decomposition, [self._columns[name].view.numpy() for name in names]
+        shifts, seen = decomposition.shifts[rank == self.part.ranks.rank :], decomposition.boxes[rank].grown(REACH)
+        found = [border[_within(cells, seen.moved(shift, -1))] for shift in shifts]
+        which = np.concatenate(found)
+        columns = [column[which] for column in columns]
+        if decomposition.joined:
+            way, position = np.repeat(shifts, [len(part) for part in found], axis=0), columns[names.index("position")]
+            position += way * self.grid.spacing
+            np.maximum(position, self._end, out=position, where=way > 0)  # not inside by its rounding
+        return np.concatenate([values.ravel().view(np.uint8) for values in (self.place[which], *columns)])
 
     def _move(self, sources: np.ndarray, targets: np.ndarray) -> None:
         """Bring particles of some numbers to where others are, or what is no longer wanted."""
@@ -339,6 +366,15 @@ class SharedParticles(Particles):
                 self._columns[name], self._spare = self._spare, column
         self._resize(count)
         self.place = places
+
+
+def _beyond(counts: Sequence[int], spacing: float) -> np.ndarray:
+    """Return the least coordinates [m] for which kernels find the cell beyond the last along x, y, z, float32."""
+    one, inverse = np.float32(1.0), np.float32(1.0 / spacing)
+    end = np.array(counts, dtype=np.float32) * np.float32(spacing)
+    while (short := end * inverse + one < np.array(counts, dtype=np.float32) + one).any():
+        end[short] = np.nextafter(end[short], np.float32(np.inf))
+    return end
 
 
 def _within(cells: np.ndarray, box: CellBox) -> np.ndarray:

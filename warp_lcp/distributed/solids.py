@@ -14,12 +14,12 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.node_distance import NodeDistances, nodes_near
 from warp_lcp.grid.node_distance_kernels import claim_nodes
-from warp_lcp.grid.sides import side_bits
+from warp_lcp.grid.sides import PeriodicSides, side_bits, with_periodic
 from warp_lcp.grid.solids import Geometry, TriangleMesh
 from warp_lcp.grid.solids_kernels import block_of
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
-from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.material.boundary import CLOSE, Boundary, CutBoundary, WholeCells
 from warp_lcp.material.particle_scene import ParticleScene
 
 NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) of the whole grid and one past the last
@@ -28,16 +28,21 @@ NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) of the whole
 class CutCellsOfPart(CutCells):
     """What solids leave open of a rank's part; making it, and `place`, is collective where some move.
 
-    Distances to a mesh that moves, which take the most of the time, are measured by all ranks in layers of equally many nodes.
+    Distances to a mesh that moves, which take the most of the time, are measured by all ranks in layers of equally many nodes. Beyond the
+    sides of axes without an end that are cut, solids are those at the other sides, as ranks there have measured them.
 
     Args:
         part: of the grid.
         solids: in the order of their numbers.
         settings: as of `CutCells`.
+
+    Attributes:
+        unlikeness: by how much they differed there, of each such axis, as far as solids are near [cells].
     """
 
     def __init__(self, part: Subdomain, solids: Sequence[PlacedSolid], **settings: Any) -> None:
         self._part = part
+        self.unlikeness: dict[int, float] = {}
         super().__init__(part.grid, solids, **settings)
 
     def _enter(self, placed: Sequence[tuple[int, Geometry]]) -> None:
@@ -56,6 +61,17 @@ class CutCellsOfPart(CutCells):
                 for layer, distances in zip(layers, everyone[:, first : first + size], strict=True):
                     self._claim(number, layer, distances[: layer.cells].reshape(layer.counts[::-1]))
                 first += size
+
+    def _join(self) -> None:
+        axes, near = self._part.decomposition.joined, self._nodes.near
+        if not axes:
+            return
+        measured = np.clip(near.numpy(), -CLOSE, CLOSE)
+        self._part.fill(*self._nodes.arrays, self.base)
+        apart = np.abs(measured - np.clip(near.numpy(), -CLOSE, CLOSE))
+        for axis in axes:
+            end = self.grid.domain_counts[axis] + 1 - self.grid.origin[axis]  # the domain's upper side, where the part reaches it
+            self.unlikeness[axis] = float(np.moveaxis(apart, 2 - axis, 0)[end : end + 1].max(initial=0.0))
 
     def _layer(self, geometry: Geometry, box: NodeBox) -> np.ndarray:
         """Return the distances of a solid at this rank's layer of a box of nodes [cells], as many numbers as the thickest layer has."""
@@ -97,11 +113,12 @@ class CutBoundaryOfPart(CutBoundary):
     Args:
         part: of the grid.
         cut: the solids.
+        sides: as of `CutBoundary`.
     """
 
-    def __init__(self, part: Subdomain, cut: CutCells) -> None:
-        self._part = part
-        super().__init__(part.grid, cut)
+    def __init__(self, part: Subdomain, cut: CutCellsOfPart, sides: PeriodicSides | None) -> None:
+        self._part, self._unlike = part, cut.unlikeness
+        super().__init__(part.grid, cut, sides=sides)
         part.fill(*self.placed())
 
     def place(self, time: float) -> None:
@@ -109,6 +126,10 @@ class CutBoundaryOfPart(CutBoundary):
         super().place(time)
         if self.moves:
             self._part.fill(*self.placed())
+
+    def _unlikeness(self, axis: int) -> float:
+        mine = self._unlike[axis] if axis in self._unlike else super()._unlikeness(axis)
+        return float(self._part.ranks.max(mine))
 
 
 def boundary_of_part(scene: ParticleScene, part: Subdomain, solids: Sequence[PlacedSolid]) -> tuple[Boundary, list[str]]:
@@ -130,19 +151,20 @@ def boundary_of_part(scene: ParticleScene, part: Subdomain, solids: Sequence[Pla
     """
     grid, ranks, domain = part.grid, part.ranks, scene.domain
     ends = part.cuts | side_bits(domain.open)
-    walls: dict[str, Any] = {"wall_separating": domain.wall == "separating", "open_sides": ends, "remarks": False}
+    walls: dict[str, Any] = {"wall_separating": domain.wall == "separating", "remarks": False}
+    sides = PeriodicSides(grid, scene.endless, part.decomposition.joined) if scene.endless else None
     if domain.solids == "cut-cell":
-        cut = CutCellsOfPart(part, solids, **walls)
+        cut = CutCellsOfPart(part, solids, open_sides=ends, **walls)
         if ranks.any(not cut.whole_cells):
-            boundary: Boundary = CutBoundaryOfPart(part, cut)
+            boundary: Boundary = CutBoundaryOfPart(part, cut, sides)
             _check_open(part, boundary)
             return boundary, list(cut.notes)
     notes = start_notes(solids, grid)
-    voxels = voxelize(grid, solids, **walls)
+    voxels = voxelize(grid, solids, open_sides=with_periodic(ends, sides), **walls)
     notes += small_notes((solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing)
     part.fill(voxels.index)
     still = np.zeros((1 + len(solids), 3)) if scene.source else None
-    boundary = WholeCells(grid, voxels, still, open_sides=ends)
+    boundary = WholeCells(grid, voxels, still, open_sides=ends, sides=sides)
     part.fill(*boundary.placed())
     _check_open(part, boundary)
     return boundary, notes

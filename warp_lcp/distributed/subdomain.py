@@ -37,7 +37,8 @@ class Subdomain:
     """A rank's part of a grid: the cells of its box, and of those around it what lies in the domain within some layers.
 
     The outermost layer is the ring that every staggered grid has around its cells. At the domain's sides the ring is that of the whole
-    grid, at cuts it is the last of the ghost layers: there the sides of the part must be open, see `cuts`.
+    grid, at cuts it is the last of the ghost layers: there the sides of the part must be open, see `cuts`. Along an axis without an end
+    that is cut, the part goes on beyond the domain's sides, with the cells that lie there again.
 
     Args:
         decomposition: the boxes of all ranks.
@@ -72,7 +73,7 @@ class Subdomain:
         self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts)
         inner = self.box.moved(cells.low, -1)
         self.owned = self.grid.window([low + 1 for low in inner.low], inner.high)
-        last = [high == count for high, count in zip(self.box.high, decomposition.counts, strict=True)]
+        last = self._at_sides(self.box)[1]
         self.own_faces = self.grid.window([low + 1 for low in inner.low], [high + end for high, end in zip(inner.high, last, strict=True)])
         self.cuts = 0
         for axis in range(dimension):
@@ -86,7 +87,15 @@ class Subdomain:
 
     def _cells(self, box: CellBox) -> CellBox:
         """Return the cells of the part around a box, without its ring."""
-        return box.grown(self.layers - 1).common(CellBox((0, 0, 0), self.decomposition.counts))
+        counts, joined = self.decomposition.counts, self.decomposition.joined
+        more = [self.layers if axis in joined else 0 for axis in range(3)]
+        return box.grown(self.layers - 1).common(CellBox.of([-m for m in more], [n + m for n, m in zip(counts, more, strict=True)]))
+
+    def _at_sides(self, box: CellBox) -> list[list[bool]]:
+        """Tell whether a box ends at the domain's lower and upper sides along x, y, z, beyond which nothing goes on."""
+        counts, joined = self.decomposition.counts, self.decomposition.joined
+        ends = [[n == 0 for n in box.low], [n == count for n, count in zip(box.high, counts, strict=True)]]
+        return [[at and axis not in joined for axis, at in enumerate(end)] for end in ends]
 
     def forest(self, layers: int = 1, width: int | None = None, parts: int = 1, which: np.ndarray | None = None) -> StarForest:
         """Return the star forest of several ranks that fills ghost cells and the rings beside them; collective.
@@ -101,7 +110,8 @@ class Subdomain:
         owned = [self._with_sides(box, parts) for box in boxes]
         filled = None if width is None else self._refined(self.box.grown(width), parts)
         stored = [self._refined(self._cells(box), parts).grown(1) for box in boxes]
-        return star_forest(self.ranks, owned, stored, filled=filled, layers=layers, which=which)
+        shifts = [self._refined(CellBox(shift, shift), parts).low for shift in self.decomposition.shifts]
+        return star_forest(self.ranks, owned, stored, filled=filled, layers=layers, which=which, shifts=shifts)
 
     def _refined(self, box: CellBox, parts: int) -> CellBox:
         """Return a box in cells that are cut into so many along each axis."""
@@ -112,9 +122,10 @@ class Subdomain:
         """Return a box, refined, with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
         found = self._refined(box, parts)
         low, high = list(found.low), list(found.high)
+        at_low, at_high = self._at_sides(box)
         for axis in range(self.dimension):  # in 2-D one plane is used
-            low[axis] -= box.low[axis] == 0
-            high[axis] += box.high[axis] == self.decomposition.counts[axis]
+            low[axis] -= at_low[axis]
+            high[axis] += at_high[axis]
         return CellBox.of(low, high)
 
     def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: StarForest | None = None) -> None:

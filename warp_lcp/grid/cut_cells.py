@@ -198,8 +198,12 @@ class CutCells:
         for number, geometry in placed:
             self._sampler.enter(self._nodes, number, geometry)
 
+    def _join(self) -> None:
+        """Bring distances, and the marks in `base`, to where they are told by other nodes."""
+
     def _refresh(self) -> None:
         """Fill everything that follows from the distances."""
+        self._join()
         grid, nodes = self.grid, self._nodes
         planes = grid.planes
         faces = dict(zip(("ax", "ay", "az"), [*self.open, *self.open[1:2]], strict=False))  # in 2-D nothing is done to the third

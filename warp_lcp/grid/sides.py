@@ -142,14 +142,17 @@ class PeriodicSides:
 
     Args:
         grid: the grid.
-        axes: those without an end, of 0 and 2.
+        endless: axes without an end, of 0 and 2.
+        cut: those of them along which the grid is a part: what lies beyond its sides others bring there.
 
     Attributes:
-        bits: bit n is set if axis n has no end.
+        axes: those that the grid has from side to side.
+        bits: bit n is set if axis n is one of them.
     """
 
-    def __init__(self, grid: StaggeredGrid, axes: Sequence[int]) -> None:
-        self.grid, self.axes = grid, tuple(axes)
+    def __init__(self, grid: StaggeredGrid, endless: Sequence[int], cut: Sequence[int] = ()) -> None:
+        self.grid, self.endless = grid, tuple(endless)
+        self.axes = tuple(axis for axis in endless if axis not in cut)
         self.bits = sum(1 << axis for axis in self.axes)
 
     def wrap(self, *fields: wp.array, launch: Launch = wp.launch) -> None:
@@ -185,7 +188,7 @@ class PeriodicSides:
     def carry(self, position: wp.array) -> None:
         """Bring particles [m] that have gone out at a side in at the other; floor and ceiling stay what they are."""
         grid = self.grid
-        endless = wp.vec3i(*(int(axis in self.axes) for axis in range(3)))
+        endless = wp.vec3i(*(int(axis in self.endless) for axis in range(3)))
         size = wp.vec3(*(count * grid.spacing for count in grid.domain_counts))
         inputs = [endless, grid.dimension, size, grid.spacing, position]
         wp.launch(carry_kernel, len(position), inputs, device=grid.device)
@@ -193,7 +196,7 @@ class PeriodicSides:
     def widen(self, window: Window) -> Window:
         """Return a window of cells that reaches from ring to ring along the axes without an end."""
         low, high = list(window.low), list(window.high)
-        for axis in self.axes:
+        for axis in self.endless:
             low[2 - axis], high[2 - axis] = 0, self.grid.shape[2 - axis]
         return Window.of(low, high, window.device)
 

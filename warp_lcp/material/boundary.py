@@ -287,13 +287,16 @@ class CutBoundary:
             return
         if self.capacity is not None:
             self.sides.add(self.capacity)
-        distance = np.clip(self.distance.numpy(), -CLOSE, CLOSE)
-        for axis in self.sides.axes:
-            lines = np.moveaxis(distance, 2 - axis, 0)
-            if np.abs(lines[1] - lines[-1]).max() > ALIKE:
+        for axis in self.sides.endless:
+            if self._unlikeness(axis) > ALIKE:
                 raise ValueError(
                     f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: what reaches one must go on at the other"
                 )
+
+    def _unlikeness(self, axis: int) -> float:
+        """Return by how much the distances at the two sides of an axis differ, as far as solids are near [cells]."""
+        lines = np.moveaxis(np.clip(self.distance.numpy(), -CLOSE, CLOSE), 2 - axis, 0)
+        return float(np.abs(lines[1] - lines[-1]).max())
 
     def _find_walls(self) -> None:
         self.touch.zero_()

@@ -6,9 +6,11 @@ const int counts[3] = {nx, ny, nz};
 int begin[M], end[M], cells[M];
 auto prepare = [](int) {};
 // Move a particle from cell to cell along the straight line to its aim: a closed face stops it, it slides on along the face.
-auto cell_of = [](T x, T least, int count) { x = x > least ? x : least; const T e = count; return (int)(x < e ? x : e); };
+auto cell_of = [&](T x, int axis) {
+    const T least = first_cell[axis], e = counts[axis]; x = x > least ? x : least; return floor_of(x < e ? x : e, axis);
+};
 auto walk = [&](int m) {
-    int cell[3] = {cell_of(from[0][m], lx, nx), cell_of(from[1][m], ly, ny), planes == 2 ? cell_of(from[2][m], lz, nz) : 1};
+    int cell[3] = {cell_of(from[0][m], 0), cell_of(from[1][m], 1), planes == 2 ? cell_of(from[2][m], 2) : 1};
     T x[3], rest[3]; int stopped = 0;
     for (int d = 0; d < 3; ++d) { x[d] = from[d][m]; rest[d] = to[d][m] - x[d]; }
     // along each axis the walk goes one way only, so it crosses no more faces than this
@@ -59,10 +61,10 @@ auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, i
         const T Z = planes == 2 ? z + (a*A[2][m] + b*B[2][m] + c*C[2][m]) : (T)1.5;
         to[0][m] = X; to[1][m] = Y; to[2][m] = Z; hit[m] = 0;
         T p = x > lx ? x : lx, q = y > ly ? y : ly, r = z > lz ? z : lz;
-        const int i = (int)(p < (T)nx ? p : (T)nx), j = (int)(q < (T)ny ? q : (T)ny), k = (int)(r < (T)nz ? r : (T)nz);
+        const int i = floor_of(p < (T)nx ? p : (T)nx, 0), j = floor_of(q < (T)ny ? q : (T)ny, 1), k = floor_of(r < (T)nz ? r : (T)nz, 2);
         p = X > rx ? X : rx; q = Y > ry ? Y : ry; r = Z > rz ? Z : rz;  // beyond the ring nothing is known, nor needed
-        const int I = (int)(p < (T)(nx + 1) ? p : (T)(nx + 1)), J = (int)(q < (T)(ny + 1) ? q : (T)(ny + 1));
-        const int K = (int)(r < (T)(nz + 1) ? r : (T)(nz + 1));
+        const int I = floor_of(p < (T)(nx + 1) ? p : (T)(nx + 1), 0), J = floor_of(q < (T)(ny + 1) ? q : (T)(ny + 1), 1);
+        const int K = floor_of(r < (T)(nz + 1) ? r : (T)(nz + 1), 2);
         int di = I - i, dj = J - j, dk = K - k;
         di = di < 0 ? -di : di; dj = dj < 0 ? -dj : dj; dk = dk < 0 ? -dk : dk;
         int most = di < dj ? dj : di; most = most < dk ? dk : most;

@@ -10,6 +10,7 @@ const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
 const T* g = given.field.data - back;
 Block from, to, k1, k2, k3;
 int list[M];
+#include "floor.h"
 #include "sample.h"
 for (int start = first; start < last; start += M) {
     const int end = last - start < M ? last : start + M;

@@ -11,7 +11,7 @@ auto sample = [&](const Block& at, Block& result, int n) {
             if (ENDLESS & 4) { z = z < 1 ? z + (T)nz : z; z = z < ez ? z : z - (T)nz; }
             x = x > lx ? x : lx; y = y > ly ? y : ly; z = z > lz ? z : lz;
             x = (x < ex ? x : ex) - hx; y = (y < ey ? y : ey) - hy; z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
-            int i = (int)x, j = (int)y, k = (int)z;
+            int i = floor_of(x, 0), j = floor_of(y, 1), k = floor_of(z, 2);
             i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;  // the next node is stored, too
             const T fx = x - (T)i, fy = y - (T)j, fz = z - (T)k;
             const T* a = g + (k*s1 + j*s2 + i); const T* b = a + up;

@@ -13,7 +13,7 @@ auto into_domain = [&](T* x) {
 };
 auto closed = [=](int side) { return !(open_sides >> side & 1); };
 auto measure = [&](const T* x, T* g) -> T {
-    int i = (int)x[0], j = (int)x[1], k = planes == 2 ? (int)x[2] : 1;
+    int i = floor_of(x[0], 0), j = floor_of(x[1], 1), k = planes == 2 ? floor_of(x[2], 2) : 1;
     i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;
     const T fx = x[0] - (T)i, fy = x[1] - (T)j, fz = planes == 2 ? x[2] - (T)k : (T)0;
     const T* a = level + (k*s1 + j*s2 + i); const T* b = a + up;
@@ -42,7 +42,7 @@ auto measure_all = [&](const Block& at, T* result, int n) {
         T x = at[0][m], y = at[1][m], z = planes == 2 ? at[2][m] : (T)1;
         x = x > lx ? x : lx; y = y > ly ? y : ly; z = z > lz ? z : lz;
         x = x < ex ? x : ex; y = y < ey ? y : ey; z = z < ez ? z : ez;
-        int i = (int)x, j = (int)y, k = (int)z;
+        int i = floor_of(x, 0), j = floor_of(y, 1), k = floor_of(z, 2);
         i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;
         const T fx = x - (T)i, fy = y - (T)j, fz = z - (T)k;
         const T* a = level + (k*s1 + j*s2 + i); const T* b = a + up;
