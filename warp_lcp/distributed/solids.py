@@ -108,7 +108,7 @@ def _layer(box: NodeBox, rank: int, ranks: int) -> CellBox:
 
 
 class CutBoundaryOfPart(CutBoundary):
-    """Solids that cut the cells of a rank's part; `place` is collective where some move.
+    """Solids that cut the cells of a rank's part; `place` and `top_speed` are collective where some move.
 
     Args:
         part: of the grid.
@@ -119,7 +119,13 @@ class CutBoundaryOfPart(CutBoundary):
     def __init__(self, part: Subdomain, cut: CutCellsOfPart, sides: PeriodicSides | None) -> None:
         self._part, self._unlike = part, cut.unlikeness
         super().__init__(part.grid, cut, sides=sides)
+        self._moving = self._moving[part.ranks.rank :: part.ranks.size]
         part.fill(*self.placed())
+
+    def top_speed(self, time: float, span: float) -> float:
+        """Return how fast the solids move at most [m/s], of which each rank looks at some."""
+        mine = super().top_speed(time, span)
+        return float(self._part.ranks.max(mine)) if self.moves else mine
 
     def place(self, time: float) -> None:
         """Put the solids where they are at `time` [s]."""
