@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import tomli_w
 import warp as wp
+from scipy.optimize import nnls
 
 from warp_lcp.benchmarks.harness.machine import array_bytes, machine
 from warp_lcp.benchmarks.harness.record import Record, Results, Table
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.run.profile import Profile
 from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.models import TABLE
 from warp_lcp.scene.scene import Scene, Time
@@ -33,8 +33,7 @@ from warp_lcp.scene.table import validate
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
 FRAMES = 15  # that are timed, half a second: columns collapse, and reach the other wall
-WATCHED = 3  # steps that the shares of the stages are taken from
-STAGES = ("sort", "particles-to-grid", "grid-to-particles", "advection", "diagnostics")  # whose time is the particles'
+THIN = 0.12  # [m]: a column of less material, of the same height, tells what goes with the material from what goes with the domain
 QUIET = {"diagnostics": False}
 REFERENCE = "{}"  # the tables of the reference scene, as text
 BEGIN, END = "<!-- Written by `python -m warp_lcp.benchmarks.models` down to the next mark; do not edit. -->", "<!-- end -->"
@@ -48,7 +47,7 @@ class Offer:
     on: Tables  # with it
     off: Tables = field(default_factory=dict)  # without it
     unit: str = "cell"  # what its bytes are counted by, `cell` or `particle`
-    spent: str = ""  # what its seconds are counted by, where that is another: what works only where the liquid is goes with the particles
+    count: int = 1  # how many of it are there, each of which has the price
     frames: bool = False  # it works when a frame is made, not in a step
 
 
@@ -56,11 +55,13 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
     """Return the models of a simulator by name."""
     ball = {"shape": "sphere", "center": [0.72, 0.16, 0.25][:dimension], "radius": 0.1}
     swaying = ball | {"motion": {"kind": "sinusoid", "amplitude": [0.02, 0.0, 0.0][:dimension], "period": 1.0}}
+    bodies = [{"shape": "sphere", "center": [x, 0.1, 0.25][:dimension], "radius": 0.06, "density": 700.0} for x in (0.64, 0.78, 0.92)]
     both = {
         "cut cells": Offer({"solid": [ball]}, {"solid": [ball], "domain": {"solids": "voxel"}}),
         "moving solids": Offer({"solid": [swaying]}, {"solid": [ball]}),
-        "rigid bodies": Offer({"solid": [ball | {"density": 700.0}]}, {"solid": [swaying]}),  # which move too
+        "rigid bodies": Offer({"solid": bodies}, {"solid": [swaying]}, count=len(bodies)),  # which move too
         "density correction": Offer({"density_correction": {}}),
+        "crowding": Offer({"density_correction": None}),
         "reseeding": Offer({"particles": {"reseed": {"every": 1}}}, unit="particle"),
         "diagnostics": Offer({"output": {}}),
         "surface mesh": Offer({"output": QUIET | {"surface": True}}, frames=True),
@@ -74,7 +75,7 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
         "separating walls": Offer({"domain": {"wall": "separating"}}),
         "ghost-fluid surface": Offer(level_set),
         "smoothing": Offer({"pressure": {"smoothing": 2}}, level_set),
-        "unilateral pressure": Offer({"pressure": {"model": "unilateral"}}, level_set, spent="particle"),
+        "unilateral pressure": Offer({"pressure": {"model": "unilateral"}}, level_set),
         "viscosity": Offer({"viscosity": {"value": 10.0}}),
         "surface tension": Offer(level_set | {"surface_tension": {"coefficient": 0.072}}, level_set),
         "drag along walls": Offer({"wall_drag": {"coefficient": 5e-3}}),
@@ -87,8 +88,8 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
     return liquid | both
 
 
-def reference(simulator: str, dimension: int, tables: Tables, size: int) -> Scene:
-    """Return the reference scene, a column in a box twice as long as high, with some tables changed."""
+def reference(simulator: str, dimension: int, tables: Tables, size: int, *, width: float = 0.55) -> Scene:
+    """Return the reference scene, a column in a box twice as long as high, with some tables changed, or taken out by None."""
     scene: Tables = {
         "scene": {"simulator": simulator, "name": "reference"},
         "time": {"duration": 10.0},
@@ -99,9 +100,12 @@ def reference(simulator: str, dimension: int, tables: Tables, size: int) -> Scen
     if simulator == "fluids":
         scene["domain"]["wall"] = "free-slip"
         scene["pressure"] = {"surface": "voxel"}
-    scene["liquid" if simulator == "fluids" else "sand"] = [{"shape": "box", "min": [0.0] * dimension, "max": [0.55, 0.4, 0.5][:dimension]}]
+    scene["liquid" if simulator == "fluids" else "sand"] = [
+        {"shape": "box", "min": [0.0] * dimension, "max": [width, 0.4, 0.5][:dimension]}
+    ]
     merged = scene | {name: scene["domain"] | value if name == "domain" else value for name, value in tables.items()}
-    return validate(simulators()[simulator].scene_model, merged, "reference")
+    given = {name: value for name, value in merged.items() if value is not None}
+    return validate(simulators()[simulator].scene_model, given, "reference")
 
 
 def create(scene: Scene, device: str) -> Any:
@@ -182,15 +186,19 @@ def split(seconds: float, half: float, dimension: int) -> tuple[float, float]:
     return fixed, max(seconds - fixed, 0.0)
 
 
-def particle_share(simulation: Any) -> float:
-    """Return which part of a step's time goes with the particles, the rest with the cells."""
-    simulation.step(1e-3)
-    profile = Profile(str(simulation.grid.device))
-    simulation.watch = profile
-    for _ in range(WATCHED):
-        simulation.step(simulation.stable_dt())
-    spent = {name: stage.seconds for name, stage in profile.stages.items()}
-    return sum(spent.get(name, 0.0) for name in STAGES) / sum(spent.values())
+def split_base(base: Sample, half: Sample, thin: Sample) -> tuple[float, float, float]:
+    """Return the seconds of a step that are fixed, and those a cell and a particle, of three scenes of other sizes and amounts."""
+    scenes = [(base, counts(base.scene)), (half, counts(half.scene)), (thin, counts(thin.scene))]
+    rows = np.array([[1.0, *count] for _, count in scenes]) / np.array([[sample.seconds] for sample, _ in scenes])
+    scale = np.abs(rows).max(axis=0)
+    found = nnls(rows / scale, np.ones(3))[0] / scale
+    return float(found[0]), float(found[1]), float(found[2])
+
+
+def counts(scene: Scene) -> tuple[int, int]:
+    """Return how many cells and particles a reference scene has."""
+    simulation = create(scene, "cpu")
+    return math.prod(simulation.grid.counts), simulation.particles.count
 
 
 def records_of(simulator: str, dimension: int, options: Options) -> list[Record]:
@@ -199,29 +207,29 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
     size = max(options.sizes, default=RESOLUTION[dimension])
     samples, halves = (measure_all(simulator, dimension, n, options) for n in (size, size // 2))
     base = samples[REFERENCE]
-    simulation = create(base.scene, options.device)
-    cells, particles = math.prod(simulation.grid.counts), simulation.particles.count
-    share = particle_share(simulation)
-    fixed, growing = split(base.seconds, halves[REFERENCE].seconds, dimension)
+    thin = first_run(reference(simulator, dimension, {}, size, width=THIN), options.device)
+    cells, particles = counts(base.scene)
+    fixed, cell, particle = split_base(base, halves[REFERENCE], thin)
+    share = particle * particles / max(cell * cells + particle * particles, 1e-12)
     figures = {
         "step": Figure(base.seconds, "s"),
         "fixed_seconds": Figure(fixed, "s"),
-        "cell_seconds": Figure((1.0 - share) * growing / cells, "s"),
-        "particle_seconds": Figure(share * growing / particles, "s"),
+        "cell_seconds": Figure(cell, "s"),
+        "particle_seconds": Figure(particle, "s"),
         "cell_bytes": Figure(base.bytes / cells, "B"),
     }
     facts = {"cells": cells, "particles": particles}
     found = [Record(f"{simulator} {dimension}d: base", figures, facts)]
     for name, offer in offers(simulator, dimension).items():
-        on, off = str(offer.on), str(offer.off)
-        counts, spent = {"cell": cells, "particle": particles}, offer.spent or offer.unit
-        added, added_half = (s[on].seconds - s[off].seconds for s in (samples, halves))
+        on, off, many = str(offer.on), str(offer.off), {"cell": cells, "particle": particles}
+        added, added_half = ((s[on].seconds - s[off].seconds) / offer.count for s in (samples, halves))
         fixed, growing = (0.0, 0.0) if offer.frames else split(added, added_half, dimension)
         figures = {
             "step": Figure(added, "s"),
             "fixed_seconds": Figure(fixed, "s"),
-            f"{spent}_seconds": Figure(growing / counts[spent], "s"),
-            f"{offer.unit}_bytes": Figure((samples[on].bytes - samples[off].bytes) / counts[offer.unit], "B"),
+            "cell_seconds": Figure((1.0 - share) * growing / cells, "s"),
+            "particle_seconds": Figure(share * growing / particles, "s"),
+            f"{offer.unit}_bytes": Figure((samples[on].bytes - samples[off].bytes) / many[offer.unit] / offer.count, "B"),
         }
         found.append(Record(f"{simulator} {dimension}d: {name}", figures, facts | {"frames": offer.frames}))
     return found

@@ -69,6 +69,7 @@ class LiquidScene(ParticleScene):
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
+    stirred: ClassVar[float] = 1.2  # splashed liquid lies in more cells, and solves take more iterations
 
     pressure: Pressure = Field(default_factory=Pressure)
     viscosity: Viscosity | None = Field(default=None)

@@ -203,6 +203,7 @@ class SandScene(ParticleScene):
     solve_bytes: ClassVar[int] = STRESS_BYTES[3]
     crowded: ClassVar[float] = 4e-4  # sand at rest has 1e-5, and what crowds is not pushed apart by its pressure
     correction_gain: ClassVar[float] = 4.0  # leaves at most 1.1 of the densest nearly everywhere; 1 leaves 1.27
+    fall_speed: ClassVar[float] = 0.5  # friction holds back: .25 of columns, .4 to .8 of what runs and pours
 
     time: SandTime
     domain: SandDomain

@@ -9,7 +9,7 @@ from small_runs import run_into
 from warp_lcp.cli.commands import app
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.run.check import start
-from warp_lcp.run.foretell import doubts, expected_bytes, expected_steps, foretold
+from warp_lcp.run.foretell import doubts, expected_bytes, expected_growth, expected_step, expected_steps, foretold, in_words
 from warp_lcp.scene.scene_file import dump_scene, load_scene
 
 FACTOR = 1.5
@@ -53,6 +53,27 @@ def test_a_measured_step_makes_the_whole_run() -> None:
     lines = dict(foretold(scene, start(scene, "cpu"), seconds=2.0))
     assert "as measured, 2e+03 ms a step" in lines["whole run"]
     assert set(lines) == {"steps", "whole run", "disk"}
+
+
+def test_surface_tension_shortens_the_steps() -> None:
+    drop = load_scene(POOL | {"surface_tension": {"coefficient": 1e6}})
+    assert expected_steps(drop, start(drop, "cpu")) > 3 * expected_steps(load_scene(POOL), start(load_scene(POOL), "cpu"))
+
+
+def test_what_sources_add_counts_half_and_less_where_it_leaves() -> None:
+    stream = {"shape": "box", "min": [0.1, 0.3], "max": [0.3, 0.4], "velocity": [0.0, -2.0]}
+    full, leaks = (load_scene(POOL | {"source": [stream], "domain": POOL["domain"] | tables}) for tables in ({}, {"open": ["right"]}))
+    most, first = full.particle_estimate(), full.particle_estimate(later=False)
+    assert expected_growth(full) == pytest.approx(0.5 * (most + first) / first)
+    assert 1.0 < expected_growth(leaks) < expected_growth(full)
+    assert expected_step(full, start(full, "cpu")) > expected_step(load_scene(POOL), start(load_scene(POOL), "cpu"))
+
+
+@pytest.mark.parametrize(
+    ("size", "words"), [(12_345, "0.0123 MB"), (1.5e6, "1.5 MB"), (2e9, "2 GB"), (2.38e12, "2.38 TB"), (5e15, "5e+03 TB")]
+)
+def test_bytes_are_told_in_the_largest_unit_of_which_there_is_one(size: float, words: str) -> None:
+    assert in_words(size) == words
 
 
 def test_a_usual_scene_raises_no_doubts() -> None:

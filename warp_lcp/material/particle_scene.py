@@ -92,6 +92,8 @@ class ParticleScene(Scene):
     solve_bytes: ClassVar[int] = 0  # a cell, of the fields of the solve that are there before the particles are made
     correction_gain: ClassVar[float] = 1.0  # of the density correction
     crowded: ClassVar[float] = 2e-3  # of the material, over particles.per_axis: a pool at rest has 1e-3 / 3e-5 at 1 / 2, splashed 1e-2
+    fall_speed: ClassVar[float] = 1.0  # of its fastest particle in the mean of a run, in units of that after its whole fall
+    stirred: ClassVar[float] = 1.0  # times a step's price while a column falls: what a step takes in the mean of a run
     carried_by_grid: ClassVar[bool] = False  # whether the grid can carry the material without particles
 
     particles: ParticleSettings = Field(default_factory=ParticleSettings)
@@ -118,6 +120,7 @@ class ParticleScene(Scene):
             "rigid bodies": _solids(bodies, "has a mass") if bodies else "",
             "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
             "density correction": "[density_correction]" if self.density_correction is not None and self.correction is not None else "",
+            "crowding": "too much in a cell is moved apart" if self.density_correction is None and self.correction else "",
             "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
             "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
             "sources": "[[source]]" if self.source else "",

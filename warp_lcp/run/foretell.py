@@ -20,12 +20,14 @@ from warp_lcp.scene.models import predicted_seconds, prices
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, Points, Simulation
 
-FASTEST = 1.0  # of the speed that the whole fall of the material gives: what steps are as long as, see docs/models.md
 MANY_FRAMES = 10_000
 PIECE = 0.5  # of a step that a frame cuts off
 FULL = 0.98  # of the cells: what solids fill is a mistake, most often an inverted shape
 BURIED = 0.5  # of a material's points: less than that is how one fills a vessel
 LOG_BYTES = 14  # an entry
+FRAME_SECONDS = 3e-3  # of a core, of a frame however small
+BYTE_SECONDS = 2.5e-9  # of a core
+ROW_SECONDS = 0.8e-3  # beside a step: how long it may be, its row of the log
 
 
 def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None) -> list[tuple[str, str]]:
@@ -39,46 +41,68 @@ def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None)
     if not (isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation)):
         return []
     steps = expected_steps(scene, simulation)
+    size = expected_bytes(scene, cast(Simulation, simulation), steps)
+    where = "by the list of prices, on one core" if seconds is None else "as measured"
     if seconds is None:
-        cells, particles = math.prod(simulation.grid.counts), scene.particle_estimate()
-        seconds = predicted_seconds(scene.models(), prices(scene.scene.simulator, scene.dimension), cells, particles)
-        where = "by the list of prices, on one core"
-    else:
-        where = "as measured"
-    whole = steps * seconds
+        seconds = expected_step(scene, simulation)
+    frames = scene.time.frame_count * FRAME_SECONDS + size * BYTE_SECONDS
+    whole = steps * (seconds + ROW_SECONDS) + frames
     lasts = timedelta(seconds=round(whole)) if whole >= 10.0 else f"{whole:.2g} s"
-    return [
-        ("steps", f"about {steps:,}"),
-        *([("whole run", f"about {lasts} {where}, {1e3 * seconds:.3g} ms a step")] if seconds > 0.0 else []),
-        ("disk", f"about {expected_bytes(scene, cast(Simulation, simulation), steps) / 1e6:,.3g} MB"),
-    ]
+    spent = f"about {lasts} {where}, {1e3 * seconds:.3g} ms a step, {frames:.2g} s for frames"
+    return [("steps", f"about {steps:,}"), *([("whole run", spent)] if seconds > 0.0 else []), ("disk", f"about {in_words(size)}")]
+
+
+def in_words(size: float) -> str:
+    """Return a number of bytes in the largest unit of which there is one."""
+    unit = next((n for n in range(4, 2, -1) if size >= 1000.0**n), 2)
+    return f"{size / 1000.0**unit:.3g} {('MB', 'GB', 'TB')[unit - 2]}"
+
+
+def expected_step(scene: ParticleScene, simulation: ParticleSimulation) -> float:
+    """Return how long a step takes by the list of prices, of as much material as there is in the mean of the run [s]."""
+    growth = expected_growth(scene)
+    cells = min(round(math.prod(simulation.grid.counts) * growth), math.prod(scene.cell_counts))  # a grid that follows grows, too
+    listed, particles = prices(scene.scene.simulator, scene.dimension), round(simulation.particles.count * growth)
+    return scene.stirred * predicted_seconds(scene.models(), listed, cells, particles)
+
+
+def expected_growth(scene: ParticleScene) -> float:
+    """Return how many times the material of the start there is in the mean of a run: what comes in comes evenly, and half may leave."""
+    leaves = bool(scene.drain or scene.domain.open)
+    most, first = scene.particle_estimate(), max(scene.particle_estimate(later=False), 1)
+    return 1.0 + 0.5 * (0.5 if leaves else 1.0) * (most / first - 1.0)
 
 
 def expected_speed(scene: ParticleScene, simulation: ParticleSimulation) -> float:
     """Return the speed that the steps of a run will be as long as [m/s]: of the start, of sources, solids, and of the fall to come."""
     totals, g = simulation.particles.totals(), float(np.linalg.norm(simulation.gravity))
-    driven = [part.top_speed(0.0, scene.time.duration) for part in (simulation.boundary, simulation.sources) if part is not None]
-    falls = [_fall(scene, simulation)]
-    falls += [float(bounds[0][1]) for source in scene.source if (bounds := source.bounds(scene.dimension)) is not None]  # to the floor
-    return max(totals.max_speed, *driven, FASTEST * math.sqrt(2.0 * g * max(falls)))
+    parts, end = (simulation.boundary, simulation.sources), scene.time.duration
+    solids, sources = (0.0 if part is None else part.top_speed(0.0, end) for part in parts)
+    falls = [float(bounds[0][1]) for source in scene.source if (bounds := source.bounds(scene.dimension)) is not None]  # to the floor
+    fallen = max(_fall(scene, simulation), g * max(falls, default=0.0))
+    return max(solids, math.hypot(max(totals.max_speed, sources), scene.fall_speed * math.sqrt(2.0 * fallen)))
 
 
 def _fall(scene: ParticleScene, simulation: ParticleSimulation) -> float:
-    """Return how far the material's center will sink until it lies on the floor [m]."""
-    totals = simulation.particles.totals()
+    """Return the work of gravity on the material's top until all lies level on the floor, and along other axes until the wall [J/kg]."""
+    totals, gravity, size = simulation.particles.totals(), simulation.gravity, scene.domain.size
     if totals.count == 0:
         return 0.0
-    size, grid = scene.domain.size, simulation.grid
+    grid = simulation.grid
     volume = totals.count * grid.cell_volume / scene.particles.per_axis**grid.dimension
     level = volume / float(np.prod([side for axis, side in enumerate(size) if axis != 1]))
-    return max(float(totals.center[1]) - 0.5 * level, 0.0)
+    work = abs(gravity[1]) * max(float(totals.high[1]) - level, 0.0)
+    for axis in {0, 2} & set(range(len(size))) - set(scene.endless):
+        work += gravity[axis] * (size[axis] - totals.low[axis] if gravity[axis] > 0.0 else -totals.high[axis])
+    return float(work)
 
 
 def expected_steps(scene: ParticleScene, simulation: ParticleSimulation) -> int:
     """Return about how many steps a run will take."""
     time, dx, g = scene.time, simulation.grid.spacing, float(np.linalg.norm(simulation.gravity))
     speed = expected_speed(scene, simulation) + math.sqrt(time.cfl * g * dx)
-    longest = min(max(time.cfl * dx / speed if speed > 0.0 else math.inf, time.dt_min), time.dt_max)
+    stable = min(time.cfl * dx / speed if speed > 0.0 else math.inf, simulation.stable_dt())  # which surface tension may bound
+    longest = min(max(stable, time.dt_min), time.dt_max)
     a_frame = time.duration / time.frame_count / longest  # whole steps: at one speed the next number, over a run's speeds half a step more
     return round(time.frame_count * max(a_frame + PIECE * min(a_frame, 1.0), 1.0))
 
@@ -86,12 +110,7 @@ def expected_steps(scene: ParticleScene, simulation: ParticleSimulation) -> int:
 def expected_bytes(scene: ParticleScene, simulation: Simulation, steps: int) -> int:
     """Return about how much a run will leave on the disk: frames, of as many particles as there will be, checkpoints and the log."""
     output, wanted = scene.output, {"particles": scene.output.particles, "grid": scene.output.grid}
-    first, most = max(scene.particle_estimate(later=False), 1), scene.particle_estimate()
-    leaves = bool(scene.drain or scene.domain.open)
-    growth = 1.0 + 0.5 * (0.5 if leaves else 1.0) * (
-        most / first - 1.0
-    )  # the mean of a run: what comes in comes evenly, and half may leave
-    frame = [_grown(part, growth) for part in simulation.frame() if wanted.get(part.name, True)]
+    frame = [_grown(part, expected_growth(scene)) for part in simulation.frame() if wanted.get(part.name, True)]
     each = frame_bytes(frame, output.grid_format, surface_ply=output.surface_ply)
     state = sum(array.nbytes for array in simulation.state().values())
     log = steps * LOG_BYTES * (len(simulation.columns()) + 5)
@@ -129,4 +148,4 @@ def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
         mine = inside([material.to_geometry(Path.cwd(), scene.dimension)], points, device=grid.device)
         covered = 1.0 - float(np.mean(free[mine])) if mine.any() else 0.0
         if covered > BURIED:
-            yield f"{key}[{number}] ({material.shape}): {100.0 * covered:.2g} % of it lies inside solids, and is left out"
+            yield f"{key}[{number}] ({material.shape}): {100.0 * covered:.0f} % of it lies inside solids, and is left out"
