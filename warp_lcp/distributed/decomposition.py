@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.distributed.collective import Collective
-from warp_lcp.distributed.ranks import Ranks, petsc
+from warp_lcp.distributed.launch import petsc
+from warp_lcp.distributed.ranks import Ranks
 
 UNEVEN = 1.125  # the largest part may exceed an even share by this factor, so that cuts lie at multiples of large powers of two
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 import weakref
 from collections.abc import Sequence
-from functools import cache, cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox, Decomposition, Triple
-from warp_lcp.distributed.ranks import Ranks, petsc
-from warp_lcp.distributed.waiting import waiting
+from warp_lcp.distributed.launch import petsc
+from warp_lcp.distributed.messages import exchange, exchanging
+from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.rows.program import Launch, Task
 
 
 class Halo:
@@ -90,6 +91,13 @@ class Halo:
             return
         exchange(self._forest, field.numpy() if isinstance(field, wp.array) else field)
 
+    def filling(self, field: wp.array[Any]) -> Task:
+        """Return what fills the ghost cells of a field, now or among the launches of a program; ranks have more than one box."""
+        if field.device.is_cuda:
+            return Task(partial(self.fill, field))
+        assert self._forest is not None
+        return Task(partial(self.fill, field), partial(exchanging, self._forest, field.numpy(), field.numpy()))
+
     def _fill_through_host(self, field: wp.array[Any]) -> None:
         """Fill a field on a device: what lies within the width of the cuts goes through the host's memory, PETSc needs no CUDA then."""
         assert self._forest is not None
@@ -124,7 +132,7 @@ class Gathering:
         whole = CellBox((0, 0, 0), decomposition.counts)
         boxes = decomposition.boxes
         self._forest = star_forest(decomposition.ranks, boxes, [box.grown(1) for box in boxes], whole=whole.grown(1))
-        self._mine = decomposition.box.grown(1).moved((1, 1, 1)).slices
+        self._low = [first.start for first in decomposition.box.grown(1).moved((1, 1, 1)).slices]
         nx, ny, nz = decomposition.box.counts
         self._shape, self._whole = (nz + 2, ny + 2, nx + 2), tuple(n + 2 for n in reversed(decomposition.counts))
 
@@ -135,13 +143,25 @@ class Gathering:
         if whole.device.is_cuda:
             whole.assign(target)
 
-    def take(self, whole: wp.array[Any], mine: wp.array[Any]) -> None:
+    def collecting(self, mine: wp.array[Any], whole: wp.array[Any]) -> Task:
+        """Return `collect`, now or among the launches of a program."""
+        if whole.device.is_cuda:
+            return Task(partial(self.collect, mine, whole))
+        return Task(partial(self.collect, mine, whole), partial(exchanging, self._forest, mine.numpy(), whole.numpy()))
+
+    def take(self, whole: wp.array[Any], mine: wp.array[Any], launch: Launch = wp.launch) -> None:
         """Write this rank's part of the whole grid's field to its own, ghost cells too."""
-        target, source = mine.reshape(self._shape), whole.reshape(self._whole)[self._mine]
-        if mine.device.is_cuda:
-            wp.copy(target, source)
-        else:  # NumPy copies rows ten times as fast
-            target.numpy()[...] = source.numpy()
+        given = [whole.reshape(self._whole), mine.reshape(self._shape), *self._low]
+        launch(take_kernel, self._shape[:2], given, device=mine.device)
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def take_kernel(whole: wp.array3d(dtype=Any), mine: wp.array3d(dtype=Any), k0: int, j0: int, i0: int):
+    """Copy a row of a box."""
+    k, j = wp.tid()
+    for i in range(mine.shape[2]):
+        mine[k, j, i] = whole[k0 + k, j0 + j, i0 + i]
 
 
 class StarForest:
@@ -156,55 +176,6 @@ class StarForest:
 
     def __init__(self, made: Any) -> None:
         self.made, self.free = made, weakref.finalize(self, made.destroy)
-
-
-def exchange(forest: StarForest, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
-    """Copy roots to leaves over a star forest; leaves may lie in the same array."""
-    exchange_all(forest, [(roots, roots if leaves is None else leaves)])
-
-
-def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-    """Copy roots to leaves over a star forest, many of them at once: their messages are under way together."""
-    transport = _transport()
-    for roots, leaves in pairs:
-        forest.made.bcastBegin(transport.units[roots.dtype.itemsize], roots, leaves, transport.replace)
-    with waiting("an exchange of ghost cells"):
-        for roots, leaves in pairs:
-            transport.end(forest, roots, leaves)
-
-
-class _Transport:
-    """PETSc's exchange over a star forest with MPI's types.
-
-    petsc4py lets no other thread of Python run while PETSc waits for other ranks, no watchdog either: `end` calls PETSc itself.
-    """
-
-    def __init__(self) -> None:
-        from mpi4py import MPI
-
-        def handle(of: Any) -> Any:  # Open MPI's are pointers, MPICH's numbers
-            kind = ctypes.c_int if MPI._sizeof(of) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
-            return kind.from_buffer_copy(ctypes.string_at(MPI._addressof(of), MPI._sizeof(of)))
-
-        self.units = {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}
-        self.replace = MPI.REPLACE
-        self._handles = {size: handle(unit) for size, unit in self.units.items()}
-        self._replace = handle(MPI.REPLACE)
-        self._end = ctypes.CDLL(petsc().__file__).PetscSFBcastEnd
-
-    def end(self, forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> None:
-        """Wait for the leaves.
-
-        Raises:
-            RuntimeError: PETSc has failed.
-        """
-        where = (ctypes.c_void_p(array.ctypes.data) for array in (roots, leaves))
-        fault = self._end(ctypes.c_void_p(forest.made.handle), self._handles[roots.dtype.itemsize], *where, self._replace)
-        if fault:
-            raise RuntimeError(f"PetscSFBcastEnd: error {fault}")
-
-
-_transport = cache(_Transport)
 
 
 def star_forest(

@@ -8,9 +8,15 @@ import os
 import shutil
 import sys
 from collections.abc import Mapping
+from typing import Any
 
 DEBIAN_PETSC = "/usr/lib/petscdir/petsc*/*-real"  # where Debian keeps the builds that petsc4py chooses from by PETSC_DIR
 INSTALL = "install MPI, petsc4py and mpi4py (the extra `distributed`, or Debian's python3-petsc4py, openmpi-bin and python3-mpi4py)"
+HOW_TO_INSTALL = (
+    "the PETSc engine needs petsc4py and mpi4py: pip install 'warp-lcp[distributed]', or on Debian and Ubuntu apt-get install "
+    "python3-petsc4py python3-mpi4py openmpi-bin, a virtual environment of the system's Python with --system-site-packages and numpy < 2, "
+    "and PETSC_DIR set to a folder like /usr/lib/petscdir/petsc3.18/x86_64-linux-gnu-real"
+)
 # Open MPI: more ranks than cores, none bound to a core, root; MPICH allows all of that and ignores these names
 OPEN_MPI = {
     "OMPI_ALLOW_RUN_AS_ROOT": "1",
@@ -40,6 +46,21 @@ def find_petsc() -> None:
     for directory in debian_petsc():
         os.environ["PETSC_DIR"] = directory
         sys.path.append(os.path.join(directory, "lib", "python3", "dist-packages"))
+
+
+def petsc() -> Any:
+    """Return the module PETSc, with MPI started.
+
+    Raises:
+        ImportError: petsc4py or mpi4py cannot be imported; the message says how to install them.
+    """
+    find_petsc()
+    try:
+        import mpi4py  # noqa: F401
+        from petsc4py import PETSc
+    except ImportError as error:
+        raise ImportError(f"{HOW_TO_INSTALL} ({error})") from error
+    return PETSc
 
 
 def debian_petsc() -> list[str]:

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import warp as wp
 
+from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.petsc_matrix import PetscGrid
-from warp_lcp.distributed.ranks import petsc
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, check_taken, has

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
-from warp_lcp.distributed.ranks import petsc
+from warp_lcp.distributed.launch import petsc
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy

@@ -11,14 +11,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.launch import find_petsc
+from warp_lcp.distributed.launch import petsc
+from warp_lcp.distributed.messages import adding
 from warp_lcp.distributed.waiting import waiting
-
-HOW_TO_INSTALL = (
-    "the PETSc engine needs petsc4py and mpi4py: pip install 'warp-lcp[distributed]', or on Debian and Ubuntu apt-get install "
-    "python3-petsc4py python3-mpi4py openmpi-bin, a virtual environment of the system's Python with --system-site-packages and numpy < 2, "
-    "and PETSC_DIR set to a folder like /usr/lib/petscdir/petsc3.18/x86_64-linux-gnu-real"
-)
+from warp_lcp.rows.team import Operation
 
 
 @dataclass(frozen=True)
@@ -86,6 +82,10 @@ class Ranks:
         """Return sums over the ranks of a number or an array."""
         return self._shaped(self.gather(values).sum(axis=0), values)
 
+    def adding(self, sums: np.ndarray) -> Operation:
+        """Return what replaces float64 sums by those over the ranks, in place, as an operation of the team."""
+        return adding(self.comm, sums)
+
     def total(self, counts: np.ndarray) -> np.ndarray:
         """Return sums over the ranks of an array of integers, whose order does not matter."""
         everyone = np.empty_like(counts)
@@ -134,21 +134,6 @@ class Ranks:
     @staticmethod
     def _shaped(found: np.ndarray, values: Any) -> Any:
         return found if np.ndim(values) else found.item()
-
-
-def petsc() -> Any:
-    """Return the module PETSc, with MPI started.
-
-    Raises:
-        ImportError: petsc4py or mpi4py cannot be imported; the message says how to install them.
-    """
-    find_petsc()
-    try:
-        import mpi4py  # noqa: F401
-        from petsc4py import PETSc
-    except ImportError as error:
-        raise ImportError(f"{HOW_TO_INSTALL} ({error})") from error
-    return PETSc
 
 
 @cache

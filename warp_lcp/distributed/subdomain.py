@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
-from warp_lcp.distributed.halo import StarForest, exchange_all, star_forest
+from warp_lcp.distributed.halo import StarForest, star_forest
+from warp_lcp.distributed.messages import exchange_all
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.staggered import StaggeredGrid
 

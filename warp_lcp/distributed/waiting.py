@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import time
 from typing import Any, Self
@@ -15,8 +16,7 @@ class Waiting:
     """Tells others, such as a `Watchdog`, whether this process is inside an operation that other ranks take part in.
 
     Attributes:
-        name: of the operation, "" outside.
-        count: of entries and exits so far.
+        native: entries and exits of operations in native code, and the error of the first one that has failed, 0 while none has.
 
     >>> waiting = Waiting()
     >>> with waiting("a sum"):
@@ -27,7 +27,18 @@ class Waiting:
     """
 
     def __init__(self) -> None:
-        self.name, self.count, self._next = "", 0, ""
+        self._name, self._count, self._next = "", 0, ""
+        self.native = (ctypes.c_uint64 * 2)()
+
+    @property
+    def name(self) -> str:
+        """Of the operation, "" outside."""
+        return "an exchange among launches" if self.native[0] % 2 else self._name
+
+    @property
+    def count(self) -> int:
+        """Of entries and exits so far."""
+        return self._count + int(self.native[0])
 
     def __call__(self, name: str) -> Self:
         """Return the context of an operation of this name."""
@@ -35,13 +46,13 @@ class Waiting:
         return self
 
     def __enter__(self) -> Self:
-        self.name = self._next
-        self.count += 1
+        self._name = self._next
+        self._count += 1
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.name = ""
-        self.count += 1
+        self._name = ""
+        self._count += 1
 
 
 waiting = Waiting()  # MPI's world is one a process, and its main thread alone is in it

@@ -38,11 +38,9 @@ COARSE_BOUNDS = RowPass(
 )  # fmt: skip
 DESCEND = Wave("cycle.descend", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 1), (RESTRICT, 2))
 ASCEND = Wave("cycle.ascend", (CORRECT, 0), (SWEEP_INTO_RING, 1), (SWEEP_OUT_OF_RING, 2))
-# On a box of cells among those of other processes, what is cheap to compute twice saves passes over memory: the first sweep from zero in
-# ghost cells needs only their right-hand side, the correction there only the coarser level's ghost cells. Then a sweep follows in the same
-# pass that would have had to wait for an exchange.
-SWEEP_TWICE = Wave("cycle.sweep_twice", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 2))
-CLIMB = Wave("cycle.climb", (CORRECT, 0), (SWEEP, 1))
+# On a box of cells among those of other processes: the first sweep from zero is made in ghost cells, too, where it needs only their
+# right-hand side. So what follows waits for no exchange, but for the residual beside others' cells, which is found again.
+DESCEND_FROM_GHOSTS = Wave("cycle.descend_from_ghosts", (SWEEP_INTO_RING, 0), (SWEEP_OUT_OF_RING, 2), (RESTRICT, 3))
 COARSEN = RowPass(
     "coarsen.aggregates", HEADERS / "coarsen.h", "S", stencil=("F", "S"), finer=True, other={}, whole={"changed": wp.uint8},
     by_row={"coarse_changed": wp.uint8}, writes=dict.fromkeys(("coarse_d", "coarse_wx", "coarse_wy", "coarse_wz"), "S"),
@@ -74,7 +72,7 @@ INVERT = RowPass(
     "coarsen.invert", HEADERS / "invert.h", wp.float64, whole={"changed": wp.uint8, "matrix": wp.float64, "inverse": wp.float64},
     numbers={"m": int, "flags": int},
 )  # fmt: skip
-UNMARK = RowPass("coarsen.unmark", HEADERS / "unmark.h", wp.float32, writes={"changed": wp.uint8})
+CLEAR = RowPass("cycle.clear", HEADERS / "clear.h", "S", writes={"x": "S"})
 CHANGES = {"spans": wp.vec2i, "known": wp.vec2i, "changed": wp.uint8}
 LOWER = ("lower_x", "lower_y", "lower_z")
 RENEW = RowPass(

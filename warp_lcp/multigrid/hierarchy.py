@@ -83,10 +83,10 @@ class Level:
         fields = dict(zip(names, (c.d, *(c.weights or ())), strict=True)) | {"changed": self.changed, "coarse_changed": coarse.changed}
         return passes.COARSEN.bind(self._coarser_rows(coarse), stencil=s, **fields, **numbers)
 
-    def restricting(self, coarse: Level) -> Bound:
-        """Return the pass that sums the residual over aggregates."""
-        fields = {"x": self.x, "b": self.b, "coarse": coarse.b}
-        return self._once(("restrict", coarse), lambda: passes.RESTRICT.bind(self._coarser_rows(coarse), stencil=self.stencil, **fields))
+    def restricting(self, coarse: Level, rows: Rows | None = None) -> Bound:
+        """Return the pass that sums the residual over aggregates, all unless told."""
+        fields, there = {"x": self.x, "b": self.b, "coarse": coarse.b}, rows or self._coarser_rows(coarse)
+        return self._once(("restrict", coarse, id(rows)), lambda: passes.RESTRICT.bind(there, stencil=self.stencil, **fields))
 
     def bounding(self, coarse: Level, scale: float) -> Bound:
         """Return the pass that finds the bounds of a coarse correction."""
@@ -94,10 +94,12 @@ class Level:
         given: dict[str, Any] = {"stencil": self.stencil, "scale": scale, **fields}
         return self._once(("bounds", coarse), lambda: passes.COARSE_BOUNDS.bind(self._coarser_rows(coarse), **given))
 
-    def correcting(self, coarse: Level, scale: float, *, projected: bool, rows: Rows | None = None) -> Bound:
-        """Return the pass that adds `scale` times the coarse correction to x, clipped if projected."""
+    def correcting(
+        self, coarse: Level, scale: float, *, projected: bool, rows: Rows | None = None, x: wp.array[Any] | None = None
+    ) -> Bound:
+        """Return the pass that adds `scale` times the coarse correction to x, or another field, clipped if projected."""
         there = rows or self._finer_rows(coarse)
-        fields = {"x": self.x, "coarse": coarse.x, **self._sides(projected)}
+        fields = {"x": self.x if x is None else x, "coarse": coarse.x, **self._sides(projected)}
         given: dict[str, Any] = {"stencil": self.stencil, "scale": scale, "projected": projected, **fields}
         return self._once((coarse, projected, id(rows)), lambda: passes.CORRECT.bind(there, **given))  # which keeps the rows
 
@@ -112,10 +114,13 @@ class Level:
         yield from self.filling("t")
         yield self.sweeping(self.x, self.t, weights[1], projected=projected)
 
-    def ring_pair(self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False) -> tuple[Bound, Bound]:
-        """Return the same for one wave: what is between the sweeps lies in a ring of planes."""
-        into = self.sweeping(self.t, self.x, weights[0], projected=projected, from_zero=from_zero, kind=passes.SWEEP_INTO_RING)
-        return into, self.sweeping(self.x, self.t, weights[1], projected=projected, kind=passes.SWEEP_OUT_OF_RING)
+    def ring_pair(
+        self, weights: tuple[float, float], *, projected: bool, from_zero: bool = False, ring: wp.array[Any] | None = None
+    ) -> tuple[Bound, Bound]:
+        """Return the same for one wave: what is between the sweeps lies in a ring of planes, of t unless told."""
+        between = self.t if ring is None else ring
+        into = self.sweeping(between, self.x, weights[0], projected=projected, from_zero=from_zero, kind=passes.SWEEP_INTO_RING)
+        return into, self.sweeping(self.x, between, weights[1], projected=projected, kind=passes.SWEEP_OUT_OF_RING)
 
     def descending(self, coarse: Level, settings: CycleSettings, *, projected: bool, from_zero: bool) -> Iterator[Stage]:
         """Yield a leg of a cycle down: a pair of Chebyshev-Jacobi sweeps, and the residual on the next level."""
@@ -288,7 +293,7 @@ class Hierarchy:
             self._small.coarsening.launch(program.launch)
         if len(self.levels) > 1:
             flags = self.finest.changed
-            passes.UNMARK.bind(Rows.flat(flags.size, self.device), changed=flags).launch(program.launch)
+            passes.CLEAR.bind(Rows.flat(flags.size, self.device), x=flags).launch(program.launch)
         self._factor_coarsest(program)
         return program
 
@@ -337,10 +342,11 @@ class Hierarchy:
         self._descend(0, program, projected=False, from_zero=True, whole=False)
         return program
 
-    @cached_property
-    def unswept_cycle(self) -> Program | None:
-        """The linear cycle without its last sweep, where ghost cells must be filled before that and a caller goes on; None elsewhere."""
-        return None
+    def begin_climb(self, level: int, launch: Launch) -> None:
+        """Do what a leg up that is one launch waits for: nothing, unless others have a part of the grid."""
+
+    def end_climb(self, level: int, launch: Launch) -> None:
+        """Do what is left after it."""
 
     def last_leg(self) -> tuple[Bound, ...]:
         """Return the passes of a linear cycle's last leg, as `ASCEND` takes them."""
@@ -362,7 +368,7 @@ class Hierarchy:
             if self._small is not None and level == self._first_small:
                 self._small.cycle(1, program.launch, projected=projected)
             elif level == len(self.levels) - 1:
-                self._solve_coarsest(program.launch, projected=projected, from_zero=from_zero)
+                self._solve_coarsest(program, projected=projected, from_zero=from_zero)
             else:
                 self._descend(level, program, projected=projected, from_zero=from_zero)
         return self._descents[key]
@@ -415,12 +421,12 @@ class Hierarchy:
         correcting = L.correcting(self.levels[level + 1], s.over_correction, projected=projected)
         return correcting, *L.ring_pair(s.weights[::-1], projected=projected)
 
-    def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
+    def _solve_coarsest(self, program: Program, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""
         if projected:
-            self._last.cycle(1, launch, projected=True, from_zero=from_zero)
+            self._last.cycle(1, program.launch, projected=True, from_zero=from_zero)
         else:
-            self._solving.launch(launch)
+            self._solving.launch(program.launch)
 
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
         """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""

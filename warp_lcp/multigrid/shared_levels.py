@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import warp as wp
-
 from warp_lcp.operators.padded_stencil import PaddedStencil
 
 if TYPE_CHECKING:
@@ -42,9 +40,16 @@ def share_changes(level: Level) -> None:
         level.changed.assign(changed)
 
 
-def clear_ghosts(stencil: PaddedStencil, field: wp.array[Any]) -> None:
-    """Set the ghost cells of a stored field that stand for cells of others to 0; on the CPU."""
-    assert stencil.ghosts is not None
-    grid = field.numpy().reshape(stencil.padding.shape)
-    for axis, end in stencil.ghosts.cuts:
-        grid[(*[slice(None)] * (2 - axis), -end)] = 0
+def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[list[int], list[int]]]:
+    """Return what of a box lies within so many cells of others, as boxes low <= (k, j, i) < high that do not overlap."""
+    low, high, found = [0, 0, 0], list(stencil.padding.counts), list[tuple[list[int], list[int]]]()
+    for axis, end in stencil.ghosts.cuts if stencil.ghosts is not None else ():
+        a, first, last = 2 - axis, low.copy(), high.copy()
+        if end:
+            high[a] = max(high[a] - depth, low[a])
+            first[a] = high[a]
+        else:
+            low[a] = min(low[a] + depth, high[a])
+            last[a] = low[a]
+        found.append((first, last))
+    return found

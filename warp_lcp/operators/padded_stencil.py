@@ -9,7 +9,7 @@ not, whose `Pattern` says what neighbors there are.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, no_type_check
 
@@ -110,6 +110,9 @@ class Ghosts(Protocol):
     def fill(self, field: wp.array[Any]) -> None:
         """Fill those of a stored field."""
 
+    def filling(self, field: wp.array[Any]) -> Task:
+        """Return what does, now or among the launches of a program."""
+
     def coarser(self, factors: tuple[int, int, int]) -> Ghosts | None:
         """Return what fills those of aggregates of so many cells along x, y, z; None if aggregates would be cut."""
 
@@ -200,7 +203,7 @@ class PaddedStencil:
         strides, counts = (1, self.padding.row, self.padding.plane), self.padding.counts[::-1]
         axes = [axis for axis, periodic in enumerate(self.periodic) if periodic]
         made: list[Bound | Task] = [WRAP.bind(self._edges[a], x=x, cells=counts[a], step=strides[a]) for a in axes]
-        return made if self.ghosts is None else [*made, Task(partial(self.ghosts.fill, x))]
+        return made if self.ghosts is None else [*made, self.ghosts.filling(x)]
 
     @cached_property
     def _edges(self) -> list[Rows]:

@@ -8,7 +8,7 @@ conditionals are written as selections of values that are computed anyway.
 import ctypes
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from struct import Struct
 from types import MappingProxyType
@@ -276,13 +276,18 @@ class Rows:
         return Rows.strided(padding.size, device, steps, counts, spans, cells=counts[2] if whole else None)
 
     @staticmethod
-    def beyond(padding: Padding, device: wp.Device, axis: int, end: int, *, inside: bool = False) -> "Rows":
-        """Return the ghost cells beyond the lower (0) or upper (1) side of axis 0, 1, 2 for x, y, z, or the cells `inside` of them."""
-        strides = (padding.plane, padding.row, 1)
-        counts = [1 if 2 - axis == a else n for a, n in enumerate(padding.counts)]
-        starts = [end * (n + 1 - 2 * inside) + inside if 2 - axis == a else 1 for a, n in enumerate(padding.counts)]
-        first = sum(start * stride for start, stride in zip(starts, strides, strict=True))
-        return Rows.strided(padding.size, device, (first, padding.plane, padding.row), tuple(counts))
+    def part(padding: Padding, device: wp.Device, low: Sequence[int], high: Sequence[int]) -> "Rows":
+        """Return the cells low <= (k, j, i) < high of a padded grid, from -1 and up to one more than there are for ghosts; whole rows."""
+        strides, counts = (padding.plane, padding.row, 1), tuple(end - begin for begin, end in zip(low, high, strict=True))
+        first = sum((begin + 1) * stride for begin, stride in zip(low, strides, strict=True))
+        return Rows.strided(padding.size, device, (first, padding.plane, padding.row), counts, cells=counts[2])
+
+    @staticmethod
+    def beyond(padding: Padding, device: wp.Device, axis: int, end: int) -> "Rows":
+        """Return the ghost cells beyond the lower (0) or upper (1) side of axis 0, 1, 2 for x, y, z."""
+        low, high = [0, 0, 0], list(padding.counts)
+        low[2 - axis], high[2 - axis] = (padding.counts[2 - axis], padding.counts[2 - axis] + 1) if end else (-1, 0)
+        return Rows.part(padding, device, low, high)
 
     @staticmethod
     def stored(padding: Padding, device: wp.Device) -> "Rows":

@@ -32,13 +32,21 @@ class Launch(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """What the host does between launches: exchange with other processes, say."""
+    """What the host does between launches: exchange with other processes, say.
+
+    Args:
+        function: does it.
+        operation: makes what the team can do in its place, on the CPU; None: nothing can.
+    """
 
     function: Callable[[], object]
+    operation: Callable[[], Operation] | None = None
 
     def launch(self, launch: Launch = wp.launch) -> None:
         """Do it now, or record it between the launches."""
-        perform(self.function, launch)
+        program = getattr(launch, "__self__", None)
+        within = isinstance(program, Program) and self.operation is not None and team() is not None
+        perform(self.operation() if within and self.operation else self.function, launch)
 
 
 @dataclass(frozen=True)

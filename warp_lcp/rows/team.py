@@ -14,7 +14,7 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import warp as wp
@@ -100,6 +100,9 @@ class Stage:
 class Operation:
     """Stages that are done together: a launch, or a wave of them.
 
+    Attributes:
+        check: raises what has failed in it, once the table is done; None: nothing can.
+
     Args:
         kind: ALONE for a launch as it is; TASKS, SLABS for what is cut.
         stages: what is launched.
@@ -109,11 +112,12 @@ class Operation:
         margin: planes that the last stage of a wave is behind the first.
     """
 
-    __slots__ = ("_kept", "_stages", "chunks", "words")
+    __slots__ = ("_kept", "_stages", "check", "chunks", "words")
 
     def __init__(self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0) -> None:
         made = [word for stage in stages for word in stage.words]
         self._stages, self._kept, self.chunks = (ctypes.c_uint64 * len(made))(*made), stages, chunks
+        self.check: Callable[[], object] | None = None
         self.words = kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks
 
 
@@ -132,10 +136,15 @@ def ranges(stage: Stage, cells: int, *, ordered: bool = False) -> Operation:
 
 
 class Table:
-    """Operations one after another, as C works through them."""
+    """Operations one after another, as C works through them.
+
+    Attributes:
+        checks: raise what has failed, after all of it.
+    """
 
     def __init__(self, operations: Iterable[Operation]) -> None:
         self._kept = tuple(operations)
+        self.checks = {operation.check for operation in self._kept} - {None}
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
         sizes = [LANE_WORDS * n + operation.chunks for n, operation in zip(lanes, self._kept, strict=True)]  # what is left, and the cuts
         at = TABLE_WORDS + OPERATION_WORDS * len(self._kept)
@@ -195,6 +204,8 @@ class Team:
                 self._inside -= 1
         if share:
             self.shared_time += table.words[SHARED_TIME] * 1e-9
+        for check in table.checks:
+            check()
 
     def stop(self) -> None:
         """Send the others home; what is called later is done by the caller."""
@@ -229,9 +240,9 @@ def _arguments(*types: Any) -> Any:
     return type("LaunchArguments", (ctypes.Structure,), {"_fields_": [(f"p{i}", kind) for i, kind in enumerate(types)]})
 
 
-def launched_alone(launch: Any) -> Operation:
-    """Return a recorded launch as an operation that is not cut."""
-    return Operation(ALONE, [Stage(Entry(launch), arguments_of(launch), launch)])
+def launched_alone(launch: Any, kept: Any = None) -> Operation:
+    """Return a recorded launch as an operation that is not cut; `kept` must live as long."""
+    return Operation(ALONE, [Stage(Entry(launch), arguments_of(launch), (launch, kept))])
 
 
 @functools.cache

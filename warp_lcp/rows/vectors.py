@@ -14,8 +14,9 @@ import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.native import HEADERS, text
-from warp_lcp.rows.program import Launch, perform
+from warp_lcp.rows.program import Launch, Task
 from warp_lcp.rows.readings import Reading
+from warp_lcp.rows.team import Operation
 
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
@@ -71,6 +72,9 @@ class Across(Protocol):
 
     def sum(self, values: Any) -> Any:
         """Return sums over all parts, entry by entry."""
+
+    def adding(self, sums: np.ndarray) -> Operation:
+        """Return what replaces float64 sums by those over all parts, in place, as an operation of the team."""
 
     def max(self, values: Any) -> Any:
         """Return the largest over all parts, entry by entry."""
@@ -229,7 +233,8 @@ class Tally:
 
 def add_across(across: Across, scalars: wp.array[wp.float64], slots: slice, launch: Launch = wp.launch) -> None:
     """Add what the others have summed, now or among the launches of a program."""
-    perform(partial(_add_across, across, scalars, slots), launch)
+    operation = partial(across.adding, scalars.numpy()[slots]) if scalars.device.is_cpu else None
+    Task(partial(_add_across, across, scalars, slots), operation).launch(launch)
 
 
 def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> None:

@@ -115,7 +115,8 @@ class GridSystem(KrylovSystem):
         self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = zeros_like(self.r) if shifted else None
-        self.fused = self.hierarchy.open_cycle is not None and A.symmetric  # one CPU thread, no ghost cells to fill
+        # one CPU thread, no ghost cells to fill
+        self.fused = self.hierarchy.open_cycle is not None and A.symmetric and A.stencil.ghosts is None
         self._iterate_by(self._krylov_method(), self._weight)
 
     def _krylov_method(self) -> Any:

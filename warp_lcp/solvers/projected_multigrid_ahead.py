@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.cycle_passes import UNMARK
+from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem.residual import NaturalResidual
@@ -91,7 +91,7 @@ class RunAhead:
         r.classify = True
         r.assess(x)
         if work.scratch is not None:
-            UNMARK.bind(work.flat, changed=work.scratch[1]).launch()
+            CLEAR.bind(work.flat, x=work.scratch[1]).launch()
         counted = criteria.counted if isinstance(criteria, MeanCriteria) else None
         given = [int(r.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, counted, work.descent.noise]
         memory = [r.scalars, self._found.array, self._judged.array, self._going, self._stale]

@@ -1,12 +1,13 @@
 # mypy: ignore-errors
 """Passes of the projected multigrid method: a CG step, and the residual, active set and right-hand side after it; plans of the step."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.multigrid.cycle_passes import ASCEND, SWEEP
+from warp_lcp.multigrid.cycle_passes import ASCEND
 from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.rows import Bound, RowPass, Wave
 from warp_lcp.solvers.descent import CREEP, STALL
@@ -49,12 +50,11 @@ ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))  # a pla
 MEASURE = RowPass(
     "projected_multigrid.measure", HEADERS / "measure.h", "S", stencil=("F", "S"), reads={"z": "S", "q": "S", "g": "S"}, sums=PRODUCTS,
 )  # fmt: skip
-SIDE = RowPass(
-    "projected_multigrid.side", HEADERS / "side.h", "S", stencil=("F", "S"), reads={"z": "S", "q": "S"}, whole={"sums": wp.float64},
-    numbers={"axis": int, "end": int, "place": int, "lines": int, "places": int},
+MEASURE_AGAIN = replace(
+    MEASURE, name="projected_multigrid.measure_again", header=HEADERS / "measure_again.h", sums=(), whole={"sums": wp.float64},
+    numbers={"place": int, "lines": int, "places": int},
 )  # fmt: skip
 CLIMB = Wave("projected_multigrid.climb", *ASCEND.stages, (MEASURE, 3))  # the last leg of a cycle: z is still in the cache
-SWEEP_AND_MEASURE = Wave("projected_multigrid.sweep_and_measure", (SWEEP, 0), (MEASURE, 1))  # z's ghost cells are 0
 HOLD = RowPass(
     "projected_multigrid.hold", HEADERS / "hold.h", wp.float64, bounds=True, reads={"g": "S"}, writes={"x": wp.float64},
     by_row={"away": wp.uint8}, constants={"ROUNDED": 0},

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.cycle_passes import UNMARK
+from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.multigrid.shared_levels import clear_ghosts
+from warp_lcp.multigrid.shared_levels import beside_cuts
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
@@ -20,7 +19,7 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Bound, Rows
-from warp_lcp.rows.program import Launch, Program, perform
+from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
@@ -257,7 +256,7 @@ class MultigridWorkspace(IterateMemory):
             return
         self._forget()
         if self.scratch is not None:
-            UNMARK.bind(self.flat, changed=self.scratch[1]).launch()
+            CLEAR.bind(self.flat, x=self.scratch[1]).launch()
         rescale = not 1e-6 < self.residual.norm / self.residual.size < 1e6  # corrections in float32 would overflow, or vanish
         if rescale:
             self.residual.set(kernels.SIZE, self.residual.norm)
@@ -394,37 +393,30 @@ class MultigridWorkspace(IterateMemory):
 
     def _correct(self, program: Program) -> None:
         """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
-        residual, hierarchy = self.residual, self.hierarchy
-        if hierarchy.unswept_cycle is not None:
-            program.extend(hierarchy.unswept_cycle)
-            self._sweep_and_measure(program.launch)
-            return
+        hierarchy = self.hierarchy
         if hierarchy.open_cycle is None:
             program.extend(hierarchy.cycle)
             self._measure(launch=program.launch)
             return
         program.extend(hierarchy.open_cycle)
-        measuring = kernels.measuring(hierarchy.finest, self._p, residual.sums.partials)
-        kernels.CLIMB.launch(*hierarchy.last_leg(), measuring, launch=program.launch)
+        self._climb(program.launch)
         self._plan(program.launch)
 
-    def _sweep_and_measure(self, launch: Launch) -> None:
-        """Make a shared cycle's last sweep, measure its correction, and plan the step."""
-        residual, finest, device = self.residual, self.hierarchy.finest, self.A.device
+    def _climb(self, launch: Launch) -> None:
+        """Take a cycle's last leg, and measure the correction while it is in the cache; again beside others' cells."""
+        hierarchy, finest, sums = self.hierarchy, self.hierarchy.finest, self.residual.sums.partials
+        hierarchy.begin_climb(0, launch)
+        kernels.CLIMB.launch(*hierarchy.last_leg(), kernels.measuring(finest, self._p, sums), launch=launch)
+        hierarchy.end_climb(0, launch)
         s = finest.stencil
-        assert s.ghosts is not None
-        s.wrap(finest.t, launch=launch)
-        perform(partial(clear_ghosts, s, finest.x), launch)
-        sweep = finest.sweeping(finest.x, finest.t, self.hierarchy.settings.weights[0], projected=False)
-        kernels.SWEEP_AND_MEASURE.launch(sweep, kernels.measuring(finest, self._p, residual.sums.partials), launch=launch)
-        s.wrap(finest.x, launch=launch)
-        (nz, ny, _), partials = s.padding.counts, residual.sums.partials
-        for axis, end in s.ghosts.cuts:
-            beside = Rows.beyond(s.padding, device, axis, end, inside=True)
-            place = end * (0, ny - 1, (nz - 1) * ny)[axis]
-            numbers: dict[str, Any] = {"axis": axis, "end": end, "place": place, "lines": ny, "places": s.rows.places}
-            kernels.SIDE.bind(beside, stencil=s, z=finest.x, q=self._p, sums=partials, **numbers).launch(launch)
-        self._plan(launch)
+        if s.ghosts is not None:
+            s.wrap(finest.x, launch=launch)
+        _, lines, cells = s.padding.counts
+        for (k0, j0, _), (k1, j1, _) in beside_cuts(s, 2):
+            rows = Rows.part(s.padding, self.A.device, (k0, j0, 0), (k1, j1, cells))
+            given: dict[str, Any] = {"stencil": s, "z": finest.x, "q": self._p, "g": finest.b, "sums": sums}
+            numbers: dict[str, Any] = {"place": k0 * lines + j0, "lines": lines, "places": s.rows.places}
+            kernels.MEASURE_AGAIN.bind(rows, **given, **numbers).launch(launch)
 
     def _measure(self, *, launch: Launch = wp.launch) -> None:
         """Measure the cycle's correction and plan the step."""

@@ -1,0 +1,149 @@
+"""Messages between ranks, now or as operations of the team: a program's passes and the exchanges between them are one table then."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.distributed.launch import petsc
+from warp_lcp.distributed.waiting import waiting
+from warp_lcp.rows.team import Operation, launched_alone
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.halo import StarForest
+
+
+@wp.func_native("""
+#ifndef __CUDA_ARCH__
+unsigned long long* told = (unsigned long long*)told_;
+__atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
+typedef int Fault; typedef Fault (*Call)(void*, void*, const void*, void*, void*);
+const Call calls[2] = {(Call)begin_, (Call)end_};
+for (int i = 0; i < 2; ++i)
+    if (!told[1]) told[1] = calls[i]((void*)forest_, (void*)unit_, (const void*)roots_, (void*)leaves_, (void*)replace_);
+__atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
+#endif
+""")
+def copy_to_leaves(
+    begin_: wp.uint64, end_: wp.uint64, forest_: wp.uint64, unit_: wp.uint64, roots_: wp.uint64, leaves_: wp.uint64, replace_: wp.uint64,
+    told_: wp.uint64,
+):  # fmt: skip
+    """Call PetscSFBcastBegin and PetscSFBcastEnd."""
+
+
+@wp.func_native("""
+#ifndef __CUDA_ARCH__
+unsigned long long* told = (unsigned long long*)told_; double* sums = (double*)sums_; double* of_all = (double*)of_all_;
+__atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
+typedef int Fault; typedef Fault (*Call)(const void*, int, void*, void*, int, void*, void*);
+if (!told[1]) told[1] = ((Call)gather_)(sums, count, (void*)unit_, of_all, count, (void*)unit_, (void*)comm_);
+for (int c = 0; c < count; ++c) {
+    double sum = of_all[c];
+    for (int r = 1; r < ranks; ++r) sum += of_all[r*count + c];
+    sums[c] = sum; }
+__atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
+#endif
+""")
+def add_of_all(
+    gather_: wp.uint64, unit_: wp.uint64, comm_: wp.uint64, sums_: wp.uint64, of_all_: wp.uint64, count: int, ranks: int, told_: wp.uint64
+):
+    """Call MPI_Allgather, and add up in the order of the ranks."""
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.messages")
+def exchange_kernel(
+    begin: wp.uint64, end: wp.uint64, forest: wp.uint64, unit: wp.uint64, roots: wp.uint64, leaves: wp.uint64, replace: wp.uint64,
+    told: wp.uint64,
+):  # fmt: skip
+    """Copy roots to leaves over a star forest; one thread, on the CPU."""
+    copy_to_leaves(begin, end, forest, unit, roots, leaves, replace, told)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.messages")
+def add_kernel(
+    gather: wp.uint64, unit: wp.uint64, comm: wp.uint64, sums: wp.uint64, of_all: wp.uint64, count: int, ranks: int, told: wp.uint64
+):
+    """Add to sums those of the other ranks; one thread, on the CPU."""
+    add_of_all(gather, unit, comm, sums, of_all, count, ranks, told)
+
+
+class _Library:
+    """Functions of PETSc and MPI, and MPI's constants, as C takes them.
+
+    petsc4py lets no other thread of Python run while PETSc waits for other ranks, no watchdog either: PETSc is called directly.
+    """
+
+    def __init__(self) -> None:
+        from mpi4py import MPI
+
+        self.units = {size: handle(unit) for size, unit in {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}.items()}
+        self.replace = handle(MPI.REPLACE)
+        functions = ctypes.CDLL(petsc().__file__), ctypes.CDLL(MPI.__file__)
+        self.begin, self.end, self.gather = functions[0].PetscSFBcastBegin, functions[0].PetscSFBcastEnd, functions[1].MPI_Allgather
+
+
+_library = cache(_Library)
+
+
+def handle(of: Any) -> Any:
+    """Return what C calls an object of mpi4py: Open MPI's are pointers, MPICH's numbers."""
+    from mpi4py import MPI
+
+    kind = ctypes.c_int if MPI._sizeof(of) == ctypes.sizeof(ctypes.c_int) else ctypes.c_void_p
+    return kind.from_buffer_copy(ctypes.string_at(MPI._addressof(of), MPI._sizeof(of)))
+
+
+def exchange(forest: StarForest, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
+    """Copy roots to leaves over a star forest; leaves may lie in the same array."""
+    exchange_all(forest, [(roots, roots if leaves is None else leaves)])
+
+
+def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+    """Copy roots to leaves over a star forest, many of them at once: their messages are under way together.
+
+    Raises:
+        RuntimeError: PETSc has failed.
+    """
+    library = _library()
+    with waiting("an exchange of ghost cells"):
+        for call in (library.begin, library.end):
+            for roots, leaves in pairs:
+                where = (ctypes.c_void_p(array.ctypes.data) for array in (roots, leaves))
+                _check(call(ctypes.c_void_p(forest.made.handle), library.units[roots.dtype.itemsize], *where, library.replace))
+
+
+def exchanging(forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> Operation:
+    """Return `exchange` as an operation of the team."""
+    library, unit = _library(), _library().units[roots.dtype.itemsize].value
+    functions = (ctypes.cast(call, ctypes.c_void_p).value for call in (library.begin, library.end))
+    given = [*functions, forest.made.handle, unit, roots.ctypes.data, leaves.ctypes.data, library.replace.value]
+    return _operation(exchange_kernel, given, (forest, roots, leaves))
+
+
+def adding(comm: Any, sums: np.ndarray) -> Operation:
+    """Return what replaces float64 sums by those over all ranks, in their order, as an operation of the team."""
+    library, of_all = _library(), np.empty((comm.size, sums.size))
+    given = [ctypes.cast(library.gather, ctypes.c_void_p).value, library.units[8].value, handle(comm).value]
+    return _operation(add_kernel, [*given, sums.ctypes.data, of_all.ctypes.data, sums.size, comm.size], (comm, sums, of_all))
+
+
+def _operation(kernel: Any, given: list[Any], kept: Any) -> Operation:
+    launch = wp.launch(kernel, 1, [*given, ctypes.addressof(waiting.native)], device="cpu", record_cmd=True)
+    operation = launched_alone(launch, kept)
+    operation.check = _check_native
+    return operation
+
+
+def _check_native() -> None:
+    fault, waiting.native[1] = waiting.native[1], 0
+    _check(fault)
+
+
+def _check(fault: int) -> None:
+    if fault:
+        raise RuntimeError(f"an exchange between ranks has failed: error {fault} of PETSc or MPI")
