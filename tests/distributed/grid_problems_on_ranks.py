@@ -1,16 +1,21 @@
 """Solves grid problems on the ranks and, on each, by itself; run by `test_grids_on_ranks`."""
 
 import sys
+from functools import partial
+from itertools import product
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.distributed import hierarchy as shared_hierarchy
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.hierarchy import DistributedHierarchy
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.multigrid.turning import make_hierarchy
+from warp_lcp.rows.program import Task
 
 rng = np.random.default_rng(7301)
 
@@ -194,14 +199,42 @@ def memory_in_place(ranks):
 
 def as_on_devices(ranks):
     """Ghost cells that go through the host's memory, and no leg of a cycle in one pass."""
-    fill, streams = Halo.fill, DistributedHierarchy._streams
+    fill, filling, streams = Halo.fill, Halo.filling, DistributedHierarchy._streams
+    Halo.filling = lambda self, field: Task(partial(self.fill, field))
     Halo.fill = lambda self, field: self._fill_through_host(field.reshape(self.shape)) if isinstance(field, wp.array) else fill(self, field)
     DistributedHierarchy._streams = lambda self, level: False
     cells = scene((34, 21, 40))
     b = rng.standard_normal(cells.shape)
     for method in (PM, NEWTON):
         compare(ranks, "as on a device", cells, b, 0.0, method=method, **coefficients(cells.shape))
-    Halo.fill, DistributedHierarchy._streams = fill, streams
+    Halo.fill, Halo.filling, DistributedHierarchy._streams = fill, filling, streams
+
+
+def legs(ranks):
+    """Legs of a cycle that go through memory once are those that do not, linear ones and projected ones, whatever axes are cut."""
+    shape, gathered = (32, 40, 48), shared_hierarchy.GATHERED
+    cells, faces = scene(shape), coefficients(shape)
+    free, b, gaps = rng.random(shape) < 0.9, rng.standard_normal(shape), rng.random((2, *shape))
+    shared_hierarchy.GATHERED = 64
+    cuts = {(1, 1, ranks.size), (1, ranks.size, 1), (ranks.size, 1, 1), Decomposition(shape[::-1], ranks).processes}
+    for processes, given in product(sorted(cuts), (faces, {})):
+        boxes, found = Decomposition(shape[::-1], ranks, processes=processes), []
+        axes = {"face_x": 0, "face_y": 1, "face_z": 2}
+        mine = {key: part(value, boxes.box, shape, axes.get(key)) for key, value in given.items()}
+        A = DistributedGridPoisson(boxes, part(cells, boxes.box, shape), device="cpu", **mine)
+        for streams in (True, False):
+            made = make_hierarchy(A.stencil, wp.float64, bounded=True)
+            made._streams = made._streams if streams else lambda level: False
+            made.hold(A.stencil.d, A.layout.load(part(free, boxes.box, shape).astype(np.uint8), wp.uint8))
+            made.rebuild_changed()
+            for field, values in ((made.finest.b, b), (made.finest.lower, -gaps[0]), (made.finest.upper, gaps[1])):
+                field.assign(A.layout.load(part(np.where(free & (cells == wl.FLUID), values, 0.0), boxes.box, shape), wp.float64))
+            for cycle in (made.cycle, made.cycle, made.monotone_cycle, made.cycle):
+                cycle.run()
+                found.append(A.layout.unload(made.finest.x).numpy())
+        for once, apart in zip(found[:4], found[4:], strict=True):
+            assert np.abs(once - apart).max() <= 1e-13 * ranks.max(np.abs(apart).max()) > 0, processes
+    shared_hierarchy.GATHERED = gathered
 
 
 def wrong_input(ranks):
@@ -261,6 +294,6 @@ def halos(ranks):
 if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
     everyone = Ranks.world()
-    for check in (halos, shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, low_rank, wrong_input):
+    for check in (halos, shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, legs, low_rank, wrong_input):
         check(everyone)
     sys.stdout.write(f"rank {everyone.rank} of {everyone.size} is done\n")
