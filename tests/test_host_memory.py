@@ -8,8 +8,6 @@ import warp_lcp
 ROOT = Path(warp_lcp.__file__).parent
 VIEWS = ("reshape", "ravel", "view", "T")
 WRITES = {  # function: why it may
-    "distributed/halo.py:take": "on the CPU only; wp.copy on CUDA",
-    "multigrid/shared_levels.py:clear_ghosts": "called for the CPU only",
     "multigrid/shared_levels.py:share_changes": "assigned afterwards on CUDA",
     "rows/fields.py:copy": "sparse fields are the CPU's",
     "rows/fields.py:unload": "sparse fields are the CPU's",

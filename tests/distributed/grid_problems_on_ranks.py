@@ -14,8 +14,10 @@ from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.hierarchy import DistributedHierarchy
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.waiting import waiting
 from warp_lcp.multigrid.turning import make_hierarchy
-from warp_lcp.rows.program import Task
+from warp_lcp.rows.program import Task, run_table
+from warp_lcp.rows.team import Table
 
 rng = np.random.default_rng(7301)
 
@@ -291,9 +293,25 @@ def halos(ranks):
             assert "2 cells along z, but 3 ghost cells" in str(error)
 
 
+def messages_in_tables(ranks):
+    """Sums are those of all ranks, in their order; an error of MPI's is raised when the table is done, and nothing is sent after it."""
+    sums = np.array([0.1, 10.0**ranks.rank])
+    run_table(Table([ranks.adding(sums)]))
+    expected = ranks.sum(np.array([0.1, 10.0**ranks.rank]))
+    assert sums.tobytes() == expected.tobytes()
+    waiting.native[1] = 15
+    try:
+        run_table(Table([ranks.adding(np.ones(2))]))
+        raise AssertionError("no error")
+    except RuntimeError as error:
+        assert "error 15" in str(error), error
+    run_table(Table([ranks.adding(sums)]))
+    assert waiting.native[0] % 2 == 0
+
+
 if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
     everyone = Ranks.world()
-    for check in (halos, shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, legs, low_rank, wrong_input):
+    for check in (halos, messages_in_tables, shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, legs, low_rank, wrong_input):
         check(everyone)
     sys.stdout.write(f"rank {everyone.rank} of {everyone.size} is done\n")

@@ -164,6 +164,10 @@ def take_kernel(whole: wp.array3d(dtype=Any), mine: wp.array3d(dtype=Any), k0: i
         mine[k, j, i] = whole[k0 + k, j0 + j, i0 + i]
 
 
+for _T in (wp.float32, wp.float64):
+    wp.overload(take_kernel, [wp.array3d(dtype=_T), wp.array3d(dtype=_T), int, int, int])
+
+
 class StarForest:
     """A star forest of PETSc that is freed with the last reference to it.
 

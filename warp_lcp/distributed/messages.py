@@ -133,7 +133,8 @@ def adding(comm: Any, sums: np.ndarray) -> Operation:
 
 
 def _operation(kernel: Any, given: list[Any], kept: Any) -> Operation:
-    launch = wp.launch(kernel, 1, [*given, ctypes.addressof(waiting.native)], device="cpu", record_cmd=True)
+    words = [word & (1 << 64) - 1 for word in (*given, ctypes.addressof(waiting.native))]  # handles of MPICH may be negative
+    launch = wp.launch(kernel, 1, words, device="cpu", record_cmd=True)
     operation = launched_alone(launch, kept)
     operation.check = _check_native
     return operation

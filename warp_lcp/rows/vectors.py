@@ -233,7 +233,7 @@ class Tally:
 
 def add_across(across: Across, scalars: wp.array[wp.float64], slots: slice, launch: Launch = wp.launch) -> None:
     """Add what the others have summed, now or among the launches of a program."""
-    operation = partial(across.adding, scalars.numpy()[slots]) if scalars.device.is_cpu else None
+    operation = (lambda: across.adding(scalars.numpy()[slots])) if scalars.device.is_cpu else None
     Task(partial(_add_across, across, scalars, slots), operation).launch(launch)
 
 
