@@ -213,7 +213,7 @@ def as_on_devices(ranks):
 
 
 def legs(ranks):
-    """Legs of a cycle that go through memory once are those that do not, linear ones and projected ones, whatever axes are cut."""
+    """Legs that go through memory once are those that do not, linear and projected, on any cuts and by any number of threads."""
     shape, gathered = (32, 40, 48), shared_hierarchy.GATHERED
     cells, faces = scene(shape), coefficients(shape)
     free, b, gaps = rng.random(shape) < 0.9, rng.standard_normal(shape), rng.random((2, *shape))
@@ -224,7 +224,8 @@ def legs(ranks):
         axes = {"face_x": 0, "face_y": 1, "face_z": 2}
         mine = {key: part(value, boxes.box, shape, axes.get(key)) for key, value in given.items()}
         A = DistributedGridPoisson(boxes, part(cells, boxes.box, shape), device="cpu", **mine)
-        for streams in (True, False):
+        for streams, threads in ((True, 1), (False, 1), (True, 2)):
+            wl.set_threads(threads)
             made = make_hierarchy(A.stencil, wp.float64, bounded=True)
             made._streams = made._streams if streams else lambda level: False
             made.hold(A.stencil.d, A.layout.load(part(free, boxes.box, shape).astype(np.uint8), wp.uint8))
@@ -234,7 +235,9 @@ def legs(ranks):
             for cycle in (made.cycle, made.cycle, made.monotone_cycle, made.cycle):
                 cycle.run()
                 found.append(A.layout.unload(made.finest.x).numpy())
-        for once, apart in zip(found[:4], found[4:], strict=True):
+        wl.set_threads(1)
+        for once, apart, together in zip(found[:4], found[4:8], found[8:], strict=True):
+            assert once.tobytes() == together.tobytes(), processes
             assert np.abs(once - apart).max() <= 1e-13 * ranks.max(np.abs(apart).max()) > 0, processes
     shared_hierarchy.GATHERED = gathered
 
