@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
+from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.sides import PeriodicSides
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.scene.scene import SceneError, validate
 
 DX, DT = 0.02, 2e-3  # [m], [s]
@@ -69,6 +70,24 @@ def folded(field: Any) -> np.ndarray:
         values[[0, -1]] = 0.0
         values = values.swapaxes(0, 2)
     return values
+
+
+@pytest.mark.parametrize("at", [1, 8])
+def test_velocities_go_on_through_a_side(at: int) -> None:
+    """One face is known: what it gives to those around it does not depend on where the grid begins."""
+    grid = StaggeredGrid((8, 4, 4), 1.0, 3)
+    window, join = Window.of((1, 1, 1), (5, 5, 9), wp.get_device("cpu")), PeriodicSides(grid, (0,)).wrap
+
+    def around(i: int) -> np.ndarray:
+        host = np.zeros(grid.shape, dtype=np.float32)
+        host[2, 2, i] = 1.0
+        weight, field = (wp.array(factor * host, dtype=wp.float32) for factor in (1.0, 3.0))
+        complete(window, [field], [weight], [wp.zeros(grid.shape, dtype=wp.int8)], join)
+        return np.roll(field.numpy()[1:-1, 1:-1, 1:-1], 4 - i, axis=2)
+
+    expected = around(4)
+    assert np.count_nonzero(expected) > 20
+    assert np.array_equal(around(at), expected)
 
 
 def test_sums_and_means_over_particles_come_back_from_the_ring() -> None:

@@ -40,6 +40,8 @@ def complete(
     for field, weight, marks in zip(velocity, weights, known, strict=True):
         window.clear(marks)
         window.launch(weighted_kernel, [TINY_WEIGHT, weight, marks])
+        if join is not None:  # weights are 0 in the ring
+            join(marks, field)
         extrapolate(window, marks, field, REACH, join=join)
 
 
