@@ -44,9 +44,8 @@ class Task:
 
     def launch(self, launch: Launch = wp.launch) -> None:
         """Do it now, or record it between the launches."""
-        program = getattr(launch, "__self__", None)
-        within = isinstance(program, Program) and self.operation is not None and team() is not None
-        perform(self.operation() if within and self.operation else self.function, launch)
+        recorded = isinstance(getattr(launch, "__self__", None), Program) and team() is not None
+        perform(self.operation() if recorded and self.operation else self.function, launch)
 
 
 @dataclass(frozen=True)
