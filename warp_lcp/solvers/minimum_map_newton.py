@@ -17,6 +17,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
@@ -25,6 +26,7 @@ from warp_lcp.solvers.phases import CoarseProblem, CoarseStencilProblem, Gradien
 from warp_lcp.solvers.principal_system import (
     CLASSIFY,
     ON_FREE,
+    BandedSystem,
     DenseSystem,
     GridSystem,
     LineSystem,
@@ -32,6 +34,7 @@ from warp_lcp.solvers.principal_system import (
     principal_system,
     projected_move,
 )
+from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
 
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
@@ -203,9 +206,9 @@ class NewtonWorkspace(IterateMemory):
     def _minimizes(self) -> bool:
         """Return whether conjugate gradients within the bounds may take over: A has an energy, and is no matrix for coarse problems."""
         A = self.problem.A
-        if self.coarse is None or not isinstance(A, SparseOperator) or not A.symmetric or self.problem.preconditioner is not None:
+        if self.coarse is None or not isinstance(self.system, SparseSystem) or not A.symmetric or self.problem.preconditioner is not None:
             return False
-        host = A.matrix()
+        host = A.matrix()  # type: ignore[attr-defined]
         return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
 
     @property
@@ -295,8 +298,11 @@ class NewtonWorkspace(IterateMemory):
     def _resort(self, x: wp.array[Any]) -> Step:
         """Take a step of the last resort."""
         if self.resort is None:
-            made = ProximalPoint if self.problem.A.symmetric else InteriorSteps
-            self.resort = made(self.problem, self.residual, self.target)
+            if isinstance(self.system, BandedSystem):  # a step of the path costs little
+                self.resort = InteriorSteps(self.problem, self.residual, self.target, patience=StoppingCriteria.patience)
+            else:
+                made = ProximalPoint if self.problem.A.symmetric else InteriorSteps
+                self.resort = made(self.problem, self.residual, self.target)
         step = self.resort.step(x)
         self._round(x)
         return step

@@ -8,23 +8,25 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.linalg
 import warp as wp
 
+from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of, bandwidth
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, Step
-from warp_lcp.solvers.dense_problem import SINGULAR, factored
+from warp_lcp.solvers.dense_problem import factored
+from warp_lcp.solvers.nested_iteration import nested_iteration
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 
 MOST, WIDEST = 200, 3  # unknowns, or bandwidth whatever their number, up to which LAPACK on the host costs less than launches
 FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
+NARROW_STEPS = 20  # whole steps after nested iteration: M-matrices take 2 to 5, and beams, whose sets may wander, seldom more
 IDLE = 30  # steps without a smaller residual, the loop's patience, after which safeguarded steps take over
-PAUSE = 4  # steps without reaching out after a set has come again, doubled each time
+WARM = 8  # steps from a guess before nested iteration: an active set that has moved a few unknowns takes fewer
 
 
 class SmallMatrix:
@@ -58,71 +60,36 @@ class SmallMatrix:
         return e
 
 
-class BandedMatrix:
-    """The diagonals of a matrix of bandwidth at most `WIDEST` on the host, float64.
+class NarrowMatrix:
+    """The bands of an operator of bandwidth at most `WIDEST` on the host, float64.
 
     Args:
         A: dense or sparse.
-        width: diagonals on either side.
+        width: its bandwidth.
     """
 
     def __init__(self, A: DenseOperator | SparseOperator, width: int) -> None:
         self._A, self.width, self._version = A, width, -1
-        self._bands = np.zeros((2 * width + 1, A.unknowns))  # a_ij at (width + i - j, j), as LAPACK has it
-        if isinstance(A, SparseOperator):
-            self._columns = A.indices.numpy()
-            self._at = width + np.repeat(np.arange(A.unknowns), np.diff(A.indptr.numpy())) - self._columns
         self.refresh()
 
     def refresh(self) -> None:
         """Take the entries as they are now."""
-        A, k, n = self._A, self.width, self._A.unknowns
-        if isinstance(A, SparseOperator):
-            if self._version == A.version:
-                return
-            self._version = A.version
-            self._bands[self._at, self._columns] = A.values.numpy()
-        else:
-            host = A.matrix.numpy()
-            for o in range(-k, k + 1):
-                self._bands[k - o, max(o, 0) : n + min(o, 0)] = host.diagonal(o)
-        self._by_columns = np.asfortranarray(self._bands)
-        sizes = np.abs(self._bands).sum(axis=0)
-        self._size, self._own = sizes.max(), np.where(sizes > 0, sizes, 1.0)
+        version = self._A.version if isinstance(self._A, SparseOperator) else self._version + 1
+        if version != self._version:
+            self._version, self.banded = version, BandedMatrix(bands_of(self._A, self.width))
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """Return A x, shape (n,), on the host."""
-        n, k = len(x), self.width
-        return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._by_columns, x)
+        return self.banded.product(x)
 
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
-        """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular; held rows and columns keep their diagonal."""
-        k, n, masked = self.width, len(r), self._bands * free
-        for o in range(-k, k + 1):
-            masked[k - o, max(o, 0) : n + min(o, 0)] *= free[max(-o, 0) : n - max(o, 0)]
-        masked[k] += ~free * self._own
-        right = np.where(free, r, 0.0)
-        if k == 0:
-            pivots, info = masked[0], 0
-            e = right / np.where(pivots == 0, 1.0, pivots)
-        elif k == 1:
-            _, pivots, _, e, info = scipy.linalg.lapack.dgtsv(masked[2, :-1], masked[1], masked[0, 1:], right)
-        else:
-            factors, _, e, info = scipy.linalg.lapack.dgbsv(k, k, np.vstack([np.zeros((k, n)), masked]), right)
-            pivots = factors[2 * k]
-        return None if info != 0 or np.abs(pivots).min() <= SINGULAR * self._size else e
+        """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular."""
+        return self.banded.solve(free, r)
 
 
 def suits(A: Any) -> bool:
     """Return whether an operator's systems are solved directly on the host: a matrix that is small or narrow."""
     return isinstance(A, (DenseOperator, SparseOperator)) and A.layout.across is None and (A.unknowns <= MOST or bandwidth(A) <= WIDEST)
-
-
-def bandwidth(A: DenseOperator | SparseOperator) -> int:
-    """Return how far from the diagonal the farthest entry is."""
-    if isinstance(A, SparseOperator):
-        return A.bandwidth
-    return max(scipy.linalg.bandwidth(A.matrix.numpy()))
 
 
 class HostResidual(NaturalResidual):
@@ -133,7 +100,7 @@ class HostResidual(NaturalResidual):
         matrix: its A.
     """
 
-    def __init__(self, problem: LCP, matrix: SmallMatrix | BandedMatrix) -> None:
+    def __init__(self, problem: LCP, matrix: SmallMatrix | NarrowMatrix) -> None:
         self.problem, self.matrix = problem, matrix
         self.norm, self.current, self.unit = 0.0, False, 1.0
         self._y = np.zeros(problem.layout.size)
@@ -187,10 +154,9 @@ class HostResidual(NaturalResidual):
 class DirectNewtonWorkspace(IterateMemory):
     """Whole Newton steps solved by LAPACK on the host, then the safeguarded ones where these lead nowhere.
 
-    On an M-matrix whole steps end at the solution, but the contact set may shrink by a layer a step. Where a narrow problem's set has
-    shrunk and not grown for some steps in a row, releases reach out by 1, 3, 7, ... unknowns; what is let go too early comes back at
-    once. A set that comes again, a singular block, or `IDLE` steps without gain: MinimumMapNewton's own steps go on from the best
-    iterate.
+    On an M-matrix whole steps end at the solution, but an end of a contact set may move by one unknown a step. A narrow problem
+    therefore begins by nested iteration, which finds the ends to within a few unknowns; from a guess, after `WARM` steps. A set that
+    comes again, a singular block, or `IDLE` steps without gain: MinimumMapNewton's own steps go on from the best iterate.
 
     Attributes:
         rest: their memory, once they do.
@@ -204,7 +170,7 @@ class DirectNewtonWorkspace(IterateMemory):
             raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {WIDEST}")
         self.settings = settings
         width = bandwidth(A) if A.unknowns > FEW else WIDEST + 1
-        self.matrix: SmallMatrix | BandedMatrix = BandedMatrix(A, width) if width <= WIDEST else SmallMatrix(A)
+        self.matrix: SmallMatrix | NarrowMatrix = NarrowMatrix(A, width) if width <= WIDEST else SmallMatrix(A)
         on_host = problem.device.is_cpu and problem.bounds.affine is None
         super().__init__(problem, settings.precision, residual=HostResidual(problem, self.matrix) if on_host else None)
 
@@ -227,8 +193,9 @@ class DirectNewtonWorkspace(IterateMemory):
             self._lower, self._upper = bounds.host(0), bounds.host(1)
             self._d = residual.diagonal.numpy().astype(np.float64)
         self._seen: set[bytes] = set()
-        self._held: tuple[np.ndarray, np.ndarray] | None = None
-        self._reach, self._plain, self._pause = 0, 0, PAUSE
+        self._wait = WARM if warm else 0  # steps before nested iteration
+        self._begun = self._nested = False
+        self._left: float = math.inf
         self._least, self._idle = math.inf, 0
 
     def step(self, x: wp.array[Any]) -> Step:
@@ -257,24 +224,37 @@ class DirectNewtonWorkspace(IterateMemory):
     def _whole_step(self, x: wp.array[Any]) -> Step | None:
         """Classify, solve on the free set, take the whole step; None where that leads nowhere."""
         residual, start = self.residual, self._read(x)
-        if self._held is not None:  # the start's residual says nothing of the steps to come
+        self._wait -= 1
+        if self._wait < 0 and isinstance(self.matrix, NarrowMatrix) and not self._nested:
+            self._nested = True
+            coarse = nested_iteration(self.matrix.banded, self._b, self._lower, self._upper)
+            if coarse is not None:
+                self._seen.clear()
+                self._left = NARROW_STEPS
+                return self._move(x, coarse, "nested iteration", None)
+        if self._begun:  # the start's residual says nothing of the steps to come
             self._least, self._idle = (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
         below, above = self._classify(start, residual.host_y() if isinstance(residual, HostResidual) else residual.y.numpy())
-        if self._idle >= IDLE or self._comes_again(below, above):
+        self._left -= 1
+        if self._left < 0 or self._idle >= IDLE or self._comes_again(below, above):
             return None
         held = below | above
         moved = np.where(below, self._lower, np.where(above, self._upper, start))
         e = self.matrix.solve(~held, -(self.matrix.product(moved) + self._b))
         if e is None or not np.isfinite(e).all():
             return None
-        moved += e
+        return self._move(x, moved + e, "active set", int(np.count_nonzero(held)))
+
+    def _move(self, x: wp.array[Any], moved: np.ndarray, name: str, active: int | None) -> Step:
+        """Set x, within its bounds once the residual meets the tolerance."""
+        residual, self._begun = self.residual, True
         self._write(x, moved)
         if residual.evaluate(x) <= self._target:  # x may miss its bounds by what the criteria allow
             self._write(x, np.clip(moved, self._lower, self._upper))
             residual.current = False
         self._round(x)
         residual.current = residual.current and self._rounded is None
-        return Step("active set", 1, int(np.count_nonzero(held)), interim=True)
+        return Step(name, 1, active, interim=True)
 
     def _read(self, x: wp.array[Any]) -> np.ndarray:
         residual = self.residual
@@ -289,35 +269,12 @@ class DirectNewtonWorkspace(IterateMemory):
     def _classify(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return which unknowns are held at l and which at u."""
         target = x - y / self._d
-        below, above = target < self._lower, target > self._upper
-        last, self._held = self._held, (below, above)
-        if self.matrix.width and last is not None:
-            released = (last[0] & ~below) | (last[1] & ~above)
-            shrinks = released.any() and not ((below & ~last[0]) | (above & ~last[1])).any()
-            self._plain -= 1
-            if shrinks and self._plain < 0:
-                spread = _spread(released, self._reach * self.matrix.width)
-                below, above = below & ~spread, above & ~spread
-                self._held = below, above
-            self._reach = 2 * self._reach + 1 if shrinks and self._plain < 0 else 0
-        return below, above
+        return target < self._lower, target > self._upper
 
     def _comes_again(self, below: np.ndarray, above: np.ndarray) -> bool:
-        """Return whether a set has come again; the first times that stops reaching out for some steps instead."""
+        """Return whether an active set has come again: whole steps would repeat themselves."""
         key = below.tobytes() + above.tobytes()
         if key in self._seen:
-            if self._plain >= 0 or not self.matrix.width or self._pause > len(below):
-                return True
-            self._seen.clear()
-            self._reach, self._plain, self._pause = 0, self._pause, 2 * self._pause
+            return True
         self._seen.add(key)
         return False
-
-
-def _spread(marked: np.ndarray, distance: int) -> np.ndarray:
-    """Return what is within a distance of a marked entry."""
-    if distance == 0:
-        return marked
-    n, at = len(marked), np.arange(len(marked))
-    counts = np.r_[0, np.cumsum(marked)]
-    return counts[np.minimum(at + distance + 1, n)] > counts[np.maximum(at - distance, 0)]

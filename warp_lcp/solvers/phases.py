@@ -315,16 +315,17 @@ class InteriorSteps:
         problem: with a dense or sparse operator.
         residual: the problem's own.
         tolerance: the norm of it that is asked for.
+        patience: steps without progress before the proximal-point iteration.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float, *, patience: int = PATH_IDLE) -> None:
         from warp_lcp.solvers.interior_point import InteriorPoint  # which knows the active-set methods
 
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
         self._inner = Inner(InteriorPoint(precision="double"), problem)
         self._inner.work.residual.start(self._inner.work.x, keep=False)
         self._inner.begin(self._inner.work.x, tolerance, warm=False)
-        self._smallest, self._idle = math.inf, 0
+        self._smallest, self._idle, self._patience = math.inf, 0, patience
         self._begun: wp.array[Any] | None = None
         self._next: ProximalPoint | None = None
 
@@ -340,7 +341,7 @@ class InteriorSteps:
         norm = self._inner.work.residual.norm
         self._idle = 0 if norm <= FALL * self._smallest else self._idle + 1
         self._smallest = min(norm, self._smallest)
-        over = step.failure is not None or self._idle >= PATH_IDLE
+        over = step.failure is not None or self._idle >= self._patience
         wp.copy(x, self._begun if over else self._inner.work.x)
         if over:
             self._residual.evaluate(x)
@@ -362,7 +363,8 @@ class CoarseProblem:
     """
 
     def __init__(self, A: Any, settings: MinimumMapNewton, *, coarse: bool = False) -> None:
-        self._A, self._settings, self._coarse, self._version = A, replace(settings, monotone_cycles=0), coarse, -1
+        self._A, self._coarse, self._version = A, coarse, -1
+        self._settings = replace(settings, monotone_cycles=0, direct=False)
         self._work: Any = None
         self.start()
 

@@ -1,7 +1,7 @@
 """The system on the free unknowns that Newton-type methods share: (P A P + P D P) e = r with a free set P and a shift D >= 0.
 
-Grids take multigrid-preconditioned conjugate gradients, dense matrices a factorization, sparse ones algebraic multigrid or incomplete
-factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. Where a
+Grids take multigrid-preconditioned conjugate gradients, dense and narrow matrices a factorization, sparse ones algebraic multigrid or
+incomplete factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. Where a
 problem brings a preconditioner, that is taken instead. The passes that make free sets, right-hand sides on them and projected steps stand
 here too.
 """
@@ -21,6 +21,7 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.line_hierarchy import LineHierarchy, needs_lines
 from warp_lcp.multigrid.turning import make_hierarchy
+from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
@@ -37,6 +38,8 @@ from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 
+NARROW = 3  # bandwidth up to which LAPACK's band factors cost less than an iteration of a Krylov method
+NUDGES = (0.0, 1e-12, 1e-9, 1e-6)  # shifts of a singular banded block, in units of the matrix's largest column sum
 HEADERS = Path(__file__).parent / "headers"
 f64, i8, u8 = wp.float64, wp.int8, wp.uint8
 ANY_STENCIL = ("D", "W")
@@ -292,6 +295,40 @@ def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
     return solution
 
 
+class BandedSystem:
+    """Band LU factors of the free block of a narrow sparse matrix, on the host; slightly shifted where it is singular."""
+
+    def __init__(self, A: SparseOperator) -> None:
+        self._A, self._version = A, -1
+        self.r, self.e = A.layout.zeros(wp.float64), A.layout.zeros(wp.float64)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Copy the entries to the host if they have changed."""
+        if self._version != self._A.version:
+            self._version, self._matrix = self._A.version, BandedMatrix(bands_of(self._A, self._A.bandwidth))
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Take another free set and shift."""
+        self._free = free.numpy() != 0
+        self._shift = 0.0 if shift is None else np.where(self._free, shift.numpy(), 0.0)
+
+    def norm(self) -> float:
+        """Return ||r||, plain for matrices solved directly."""
+        return float(np.linalg.norm(self.r.numpy()))
+
+    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Factor the free block and solve, whatever the tolerance."""
+        A, r, free = self._matrix, self.r.numpy(), self._free
+        for nudge in NUDGES:
+            e = A.solve(free, r, self._shift + nudge * A.size)
+            if e is not None and np.isfinite(e).all():
+                self.e.assign(e)
+                return 1, float(np.linalg.norm(np.where(free, A.product(e) + self._shift * e - r, 0.0)))
+        self.e.zero_()
+        return 1, self.norm()
+
+
 class DiagonalSystem(KrylovSystem):
     """A Krylov method preconditioned by the diagonal, for any operator, in float64: conjugate gradients if A is symmetric, else GMRES."""
 
@@ -363,6 +400,8 @@ def principal_system(
     if isinstance(A, DenseOperator):
         return DenseSystem(A)
     if isinstance(A, SparseOperator):
+        if A.bandwidth <= NARROW:
+            return BandedSystem(A)
         return SparseSystem(A, real, shifted=shifted)
     terms = grid_and_low_rank(A)
     if terms is not None:
