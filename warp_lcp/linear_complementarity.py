@@ -33,6 +33,7 @@ STATUSES = {  # in the manner of SciPy: 0 is success, 99 that a callback has end
     SolveStatus.DIVERGED: 7,
     SolveStatus.NON_FINITE: 8,
     SolveStatus.TIME_LIMIT: 9,
+    SolveStatus.NEGATIVE_CURVATURE: 10,
     SolveStatus.STOPPED: 99,
 }
 WORDS = {"max_iterations": "maxiter", "rtol": "tol"}  # what criteria are called here

@@ -255,8 +255,9 @@ class TestStatuses:
 
     def test_non_descent(self):
         A = np.array([[-1.0, 0.0], [0.0, -1.0]])  # y = -x - 1 < 0 for all x >= 0
-        result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(2)), wl.MinimumMapNewton())
-        assert result.status is wl.SolveStatus.INFEASIBLE
+        problem = wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(2))
+        assert wl.solve(problem, wl.MinimumMapNewton()).status is wl.SolveStatus.NEGATIVE_CURVATURE
+        assert wl.solve(problem, wl.Lemke()).status is wl.SolveStatus.INFEASIBLE
         rng = np.random.default_rng(0)
         A, b = rng.standard_normal((3, 3)), rng.standard_normal(3)
         indefinite = wl.LCP(wl.DenseOperator(A + A.T, device="cpu"), b)

@@ -7,6 +7,7 @@ change when x is rescaled; it vanishes exactly at solutions.
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Sums
 
 HEADERS = Path(__file__).parent / "headers"
+EPS = float(np.finfo(np.float64).eps)
 f64, i8 = wp.float64, wp.int8
 NATURAL = RowPass(
     "residual.natural", HEADERS / "natural.h", f64, bounds=True, reads={"x": f64, "y": f64, "d": "D", "unknown": i8},
@@ -141,9 +143,42 @@ class NaturalResidual:
         self._sums.launch(UNKNOWN_SQUARE, b=self.problem.b, unknown=self.problem.unknown)
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
-        """Return an estimate of the residual that rounding x to `epsilon` leaves: epsilon || 2 |d x| + |b| ||."""
-        inside = self.problem.unknown.numpy() == 1
+        """Return an estimate of the residual's norm that rounding x to `epsilon` leaves, units of y.
+
+        r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has the error e_i = epsilon (2 |d_i x_i| + |b_i|) of y_i where it is y_i
+        or could be y_i within that error, and only the error epsilon |d_i x_i| of x_i where a bound decides: the size of b in a row that
+        is held says nothing of the others.
+        """
+        y, r, d, b, at = self._rows_at(x)
+        own = epsilon * np.abs(d * at)
+        error = 2 * own + epsilon * np.abs(b)
+        errors = np.where(np.abs(y - r) <= error, error, own)
+        return math.sqrt(self._total(float(errors @ errors)))
+
+    def is_rounding(self, x: wp.array[Any]) -> bool:
+        """Return whether |r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|) in every row: x then solves the problem as well as float64 can tell.
+
+        Where an operator shows no rows, |d_i x_i| stands for the sum, which is no larger.
+        """
+        _, r, d, b, at = self._rows_at(x)
+        sizes = np.abs(d * at)
+        if at.any() and has(self.problem.A, HasRows):
+            sizes = abs(self.problem.A.rows().matrix()) @ np.abs(at)
+        beyond = float(np.count_nonzero(~(np.abs(r) <= 4 * EPS * (np.abs(b) + sizes))))
+        return self._total(beyond) == 0
+
+    def _rows_at(self, x: wp.array[Any]) -> tuple[np.ndarray, ...]:
+        """Return y, r, d, b and x at x, of the unknowns alone, on the host."""
+        p, field = self.problem, self.problem.layout.zeros(wp.float64)
+        p.bounds.follow(x)
+        p.apply_plus(x, p.b, field)
+        inside = p.unknown.numpy() == 1
         d = np.abs(self.diagonal.numpy()[inside].astype(np.float64)) * self.unit
-        parts = 2 * d * np.abs(x.numpy()[inside]) + np.abs(self.problem.b.numpy()[inside])
+        d = np.where(d == 0, 1.0, d)
+        y, at, b, lower, upper = (f.numpy()[inside] for f in (field, x, p.b, p.bounds.as_field(0), p.bounds.as_field(1)))
+        return y, np.maximum(np.minimum(y, d * (at - lower)), d * (at - upper)), d, b, at
+
+    def _total(self, value: float) -> float:
+        """Return the sum of a number over all ranks."""
         across = self.problem.layout.across
-        return float(epsilon * (np.linalg.norm(parts) if across is None else np.sqrt(across.sum(float(parts @ parts)))))
+        return value if across is None else float(across.sum(value))

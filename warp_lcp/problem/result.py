@@ -31,7 +31,14 @@ class SolveStatus(Enum):
         "a NaN or an infinity appeared: check b, the bounds and the coefficients; where these are beyond 1e36 or below 1e-36, "
         "scale A and b, or take precision='double'"
     )
-    INFEASIBLE = "the problem has no solution: b is incompatible with a singular component, or the method has proved it"
+    INFEASIBLE = (
+        "the problem has no solution: b is incompatible with a singular component, or the method has proved it; "
+        "check the signs: y = A x + b"
+    )
+    NEGATIVE_CURVATURE = (
+        "A has a negative diagonal entry, or x'Ax < 0, where a bound is infinite: it is neither positive semi-definite nor a P-matrix; "
+        "check the sign of A: y = A x + b wants A, not -A; where the sign is right, try wl.Lemke()"
+    )
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
         """Pickle the name: what the value says may change."""

@@ -14,15 +14,15 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import Deadline, TimeIsUp
+from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import NamesComponents, has, version_of
-from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows.fields import Array
 from warp_lcp.rows.vectors import convert
 
-EPS = float(np.finfo(np.float64).eps)
 SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squares that float64 holds
 FLOOR_MARGIN = 8.0  # a stagnated residual within this multiple of the rounding estimate is called the precision's floor
 
@@ -407,6 +407,10 @@ class _LoopInBox(_Loop):
             self._record(0, Step("start", 0))
             self._keep(0)
             return ended
+        if getattr(self.solver, "definite", False) and has_negative_curvature(self.problem):
+            self._record(0, Step("start", 0))
+            self._keep(0)
+            return SolveStatus.NEGATIVE_CURVATURE
         A = self.problem.A
         floating = A.floating_components(getattr(self.work, "scratch", None)) if has(A, NamesComponents) else None
         self.work.floating = floating
@@ -440,7 +444,8 @@ class _LoopInBox(_Loop):
             self._refuse_unrepresentable()
             return SolveStatus.NON_FINITE
         self._refuse_vanishing()
-        return SolveStatus.CONVERGED if self.reference <= 4 * EPS * self.residual.norm_of_b() else None
+        small = self.reference <= 4 * EPS * self.residual.norm_of_b()  # implied by the rule for rows where x = 0, and cheap
+        return SolveStatus.CONVERGED if small and self.residual.is_rounding(self.work.x) else None
 
     def _refuse_unrepresentable(self) -> None:
         """Refuse bounds that no x in the method's precision can meet."""

@@ -32,6 +32,7 @@ from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
 f64 = wp.float64
 HEADERS = Path(__file__).parent / "headers"
+LARGEST_START = 1e6  # of the residual's norm: ||b|| up to which it gives the start's size
 PAIRS = dict.fromkeys(("w", "v", "s", "t"), f64)
 DIRECTION = dict.fromkeys(("scale", "second", "joined", "tau"), f64)
 FORM = {"UPPER": 0, "FUSED": 0}  # whether there are upper bounds
@@ -108,6 +109,7 @@ class InteriorPoint(Settings):
     """
 
     needs: ClassVar[str] = "A positive semi-definite; it need not be symmetric"
+    definite: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"
     mehrotra: bool = True
@@ -237,7 +239,8 @@ class InteriorPointWorkspace(IterateMemory):
                 least = NEAR * self.residual.norm / math.sqrt(self.count)
             else:
                 unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
-                size = max(self.residual.norm_of_b(), self.residual.norm)  # b may be 0 where bounds are not
+                # b may be 0 where bounds are not, and have a row that is held, which says nothing of the others
+                size = max(min(self.residual.norm_of_b(), LARGEST_START * self.residual.norm), self.residual.norm)
                 least = self.settings.start * size / math.sqrt(unknowns)
             self._inside(x, least)
             self.residual.affine(x)

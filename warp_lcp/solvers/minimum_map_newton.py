@@ -76,6 +76,7 @@ class MinimumMapNewton(Settings):
     """
 
     needs: ClassVar[str] = "positive definite or P-matrix"
+    definite: ClassVar[bool] = True
     distributed: ClassVar[bool] = True
     preconditioned: ClassVar[bool] = True
 

@@ -15,6 +15,7 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
@@ -374,6 +375,8 @@ def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings, system: Any) 
     """Return the principal system and what preconditions it."""
     if system is None and isinstance(problem.A, DenseOperator):  # its own system is solved directly: that would be an active-set method
         system = DiagonalSystem(problem)
+    elif system is None and isinstance(problem.A, SparseOperator):  # narrow ones too, for the same reason
+        system = SparseSystem(problem.A, real)
     elif system is None:
         system = principal_system(problem, real, bounded=problem.bounded, settings=cycle)
     return system, system.preconditioner if isinstance(system, SparseSystem) else system

@@ -6,7 +6,7 @@ with even numbers, C, alone: A_FF is block diagonal. With y_F = 0 they follow fr
     x_F = -A_FF^-1 (A_FC x_C + b_F),
 
 and what is left is the complementarity problem of the Schur complement S = A_CC - A_CF A_FF^-1 A_FC with b_C - A_CF A_FF^-1 b_F and the
-bounds of C: block tridiagonal again, of half the size, and an M-, P- or semi-definite matrix if A is. (Cyclic reduction: Hockney 1965.)
+bounds of C: block tridiagonal again, of half the size, and an M-, P- or semi-definite matrix if A is.
 Only the bounds of F are left out. A contact set of many unknowns in a row therefore has the right ends but for a block or two, whatever
 the coefficients, and Newton's steps on the finer level have only those to move, where from a cold start they move an end by a block a step.
 """

@@ -302,7 +302,10 @@ class ProximalPoint:
         """Return A + eps D."""
         if not scipy.sparse.issparse(self._matrix):
             return self._matrix + np.diag(self._eps * self._D)
-        return scipy.sparse.csr_array(self._matrix + scipy.sparse.diags_array(self._eps * self._D))
+        entries, i = self._matrix.tocoo(), np.arange(len(self._D))
+        places = np.r_[entries.row, i], np.r_[entries.col, i]
+        # duplicates are summed and sums of 0 stay entries: the pattern is the same for all eps
+        return scipy.sparse.csr_array((np.r_[entries.data, self._eps * self._D], places), shape=self._matrix.shape)
 
 
 class InteriorSteps:

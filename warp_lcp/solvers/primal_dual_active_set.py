@@ -53,6 +53,7 @@ class PrimalDualActiveSet(Settings):
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
+    definite: ClassVar[bool] = True
     preconditioned: ClassVar[bool] = True
 
     precision: PrecisionName = "mixed"

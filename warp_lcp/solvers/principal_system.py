@@ -400,7 +400,7 @@ def principal_system(
     if isinstance(A, DenseOperator):
         return DenseSystem(A)
     if isinstance(A, SparseOperator):
-        if A.bandwidth <= NARROW:
+        if A.bandwidth <= NARROW and A.unknowns > 2 * NARROW:
             return BandedSystem(A)
         return SparseSystem(A, real, shifted=shifted)
     terms = grid_and_low_rank(A)

@@ -1,0 +1,89 @@
+"""Matrices with their sign flipped: told at once, with a message that asks for the sign."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+import scipy.sparse.linalg
+
+import warp_lcp as wl
+from warp_lcp.problem.curvature import has_negative_curvature
+
+CURVED = wl.SolveStatus.NEGATIVE_CURVATURE
+
+
+def laplacian(n):
+    T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
+    return (scipy.sparse.kron(scipy.sparse.eye_array(n), T) + scipy.sparse.kron(T, scipy.sparse.eye_array(n))).tocsr()
+
+
+def drawn(seed):
+    """Return a matrix that methods solve with: sparse or dense, symmetric positive definite or a dominant unsymmetric one."""
+    rng = np.random.default_rng(seed)
+    kind, n = int(rng.integers(0, 4)), int(rng.integers(2, 40))
+    if kind == 0:
+        return laplacian(n // 6 + 2)
+    if kind == 1:
+        F = rng.standard_normal((n, n))
+        return F @ F.T + np.eye(n)
+    A = rng.standard_normal((n, n)) * (rng.random((n, n)) < 0.4)
+    np.fill_diagonal(A, 0.0)
+    np.fill_diagonal(A, np.abs(A).sum(axis=1) + rng.uniform(0.1, 1.0, n))
+    return A if kind == 2 else scipy.sparse.csr_array(A)
+
+
+def products(A):
+    """Return A as an operator that shows products only."""
+    symmetric = bool(abs(A - A.T).max() < 1e-12)
+    return wl.LinearOperator(lambda x: A @ x, shape=(A.shape[0],), symmetric=symmetric, transpose=None if symmetric else lambda x: A.T @ x)
+
+
+@pytest.mark.parametrize("method", [None, wl.MinimumMapNewton(), wl.PrimalDualActiveSet(), wl.InteriorPoint()])
+def test_flipped_matrices_take_no_steps(method):
+    for seed in range(6201, 6216):
+        A = drawn(seed)
+        b = np.random.default_rng([seed, 1]).standard_normal(A.shape[0]) - 1.0
+        result = wl.solve(wl.LCP(-A, b), *([method] if method else []))
+        assert result.status is CURVED or (method is None and result), (seed, result.status)
+        if result.status is CURVED:
+            assert result.iterations == 0
+        assert wl.solve(wl.LCP(A, b), *([method] if method else [])).status is not CURVED
+
+
+def test_the_message_asks_for_the_sign():
+    found = wl.linear_complementarity(-laplacian(20), np.full(400, -1.0))
+    assert not found.success
+    assert "A, not -A" in found.message
+    assert found.status == 10
+
+
+def test_products_alone_tell_too():
+    for seed in range(6221, 6251):
+        A = drawn(seed)
+        b = np.full(A.shape[0], -1.0)
+        assert has_negative_curvature(wl.LCP(products(-A), b)), seed
+        assert has_negative_curvature(wl.LCP(products(-A), b, -np.inf, 0.0)), seed
+        assert not has_negative_curvature(wl.LCP(products(A), b)), seed
+
+
+def test_finite_bounds_allow_any_sign():
+    """A box always holds a solution (Brouwer's fixed point of the projection)."""
+    A = drawn(6261)
+    assert not has_negative_curvature(wl.LCP(-A, np.ones(A.shape[0]), 0.0, 1.0))
+    upper = np.full(A.shape[0], np.inf)
+    assert has_negative_curvature(wl.LCP(-A, np.ones(A.shape[0]), 0.0, upper))
+
+
+def test_a_start_that_solves_stays_a_solution():
+    A = laplacian(5)
+    result = wl.solve(wl.LCP(-A, np.ones(25)))
+    assert result
+    assert not result.x.numpy().any()
+
+
+def test_semidefinite_and_skew_matrices_are_no_such_case():
+    rng = np.random.default_rng(6271)
+    F = rng.standard_normal((12, 3))
+    S = rng.standard_normal((12, 12))
+    for A in (F @ F.T, S - S.T, F @ F.T + S - S.T, np.zeros((12, 12))):
+        for form in (A, products(A)):
+            assert not has_negative_curvature(wl.LCP(form, -np.ones(12)))

@@ -1,0 +1,39 @@
+"""Negative curvature along unknowns without bounds: matrices for which definite methods cannot work."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasColumns, HasRows, HasStencil, has
+
+NEGATIVE = 1e-8  # of ||z|| ||A z||: z'Az below minus this is no rounding of products
+
+
+def has_negative_curvature(problem: LCP) -> bool:
+    """Return whether A is surely neither positive semi-definite nor a P-matrix on the unknowns F that have an infinite bound.
+
+    A_ii < 0 shows that, for i in F. Of an operator without rows one product A z tells, z pointing away from the bounds of F: z'Az < 0 if
+    A is symmetric, of a random z; else z_i (A z)_i < 0 for all i in F, of a z of ones and minus ones (a P-matrix reverses the sign of no
+    vector). A flipped sign shows itself so: -A of a positive definite or a diagonally dominant A.
+    """
+    A = problem.A
+    if has(A, HasStencil) or has(A, HasColumns):  # which have positive diagonals
+        return False
+    lower, upper = problem.bounds.host(0), problem.bounds.host(1)
+    free = (np.isinf(lower) | np.isinf(upper)) & (problem.unknown.numpy() == 1)
+    if not free.any():
+        return False
+    if has(A, HasRows):
+        return bool((A.diagonal().numpy().ravel()[free] < 0).any())
+    away = np.where(np.isinf(upper), 1.0, -1.0)
+    sizes = np.random.default_rng(19620701).uniform(0.5, 1.5, len(free)) if A.symmetric else 1.0
+    z = np.where(free, sizes * away, 0.0)
+    direction, image = problem.layout.zeros(wp.float64), problem.layout.zeros(wp.float64)
+    direction.assign(z)
+    problem.apply_plus(direction, problem.layout.zeros(wp.float64), image)
+    Az = image.numpy()
+    if A.symmetric:
+        return bool(z @ Az < -NEGATIVE * np.linalg.norm(z) * np.linalg.norm(Az))
+    return bool((z * Az)[free].max() < 0)
