@@ -258,9 +258,8 @@ class TestStatuses:
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(2))
         assert wl.solve(problem, wl.MinimumMapNewton()).status is wl.SolveStatus.NEGATIVE_CURVATURE
         assert wl.solve(problem, wl.Lemke()).status is wl.SolveStatus.INFEASIBLE
-        rng = np.random.default_rng(0)
-        A, b = rng.standard_normal((3, 3)), rng.standard_normal(3)
-        indefinite = wl.LCP(wl.DenseOperator(A + A.T, device="cpu"), b)
+        A = np.array([[7.0, -7.0, 3.0], [-7.0, 9.0, 8.0], [3.0, 8.0, 5.0]])  # indefinite, with a positive diagonal
+        indefinite = wl.LCP(wl.DenseOperator(A, device="cpu"), np.array([-3.0, -2.0, -2.0]))
         assert wl.solve(indefinite, wl.DirectEnumeration())
         result = wl.solve(indefinite, wl.MinimumMapNewton())
         assert result.status in (wl.SolveStatus.NON_DESCENT, wl.SolveStatus.STAGNATED)

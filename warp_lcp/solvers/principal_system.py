@@ -1,9 +1,9 @@
 """The system on the free unknowns that Newton-type methods share: (P A P + P D P) e = r with a free set P and a shift D >= 0.
 
-Grids take multigrid-preconditioned conjugate gradients, dense and narrow matrices a factorization, sparse ones algebraic multigrid or
-incomplete factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. Where a
-problem brings a preconditioner, that is taken instead. The passes that make free sets, right-hand sides on them and projected steps stand
-here too.
+Grids take multigrid-preconditioned conjugate gradients, dense and narrow matrices a factorization, other sparse ones algebraic multigrid
+or incomplete factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES.
+Where a problem brings a preconditioner, that is taken instead. The passes that make free sets, right-hand sides on them and projected
+steps stand here too.
 """
 
 from __future__ import annotations
