@@ -8,6 +8,7 @@ import scipy.linalg
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 
+NARROW = 3  # bandwidth up to which LAPACK's band factors cost less than launches of kernels, whatever the number of unknowns
 SINGULAR = 1e-13  # of the largest column sum: a pivot below it is rounding
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of, bandwidth
+from warp_lcp.operators.banded_matrix import NARROW, BandedMatrix, bands_of, bandwidth
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
@@ -22,7 +22,7 @@ from warp_lcp.solvers.nested_iteration import nested_iteration
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 
-MOST, WIDEST = 200, 3  # unknowns, or bandwidth whatever their number, up to which LAPACK on the host costs less than launches
+MOST = 200  # unknowns up to which LAPACK on the host costs less than launches of kernels, whatever the bandwidth
 FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
 NARROW_STEPS = 20  # whole steps after nested iteration: M-matrices take 2 to 5, and beams, whose sets may wander, seldom more
 IDLE = 30  # steps without a smaller residual, the loop's patience, after which safeguarded steps take over
@@ -61,7 +61,7 @@ class SmallMatrix:
 
 
 class NarrowMatrix:
-    """The bands of an operator of bandwidth at most `WIDEST` on the host, float64.
+    """The bands of an operator of bandwidth at most `NARROW` on the host, float64.
 
     Args:
         A: dense or sparse.
@@ -89,7 +89,7 @@ class NarrowMatrix:
 
 def suits(A: Any) -> bool:
     """Return whether an operator's systems are solved directly on the host: a matrix that is small or narrow."""
-    return isinstance(A, (DenseOperator, SparseOperator)) and A.layout.across is None and (A.unknowns <= MOST or bandwidth(A) <= WIDEST)
+    return isinstance(A, (DenseOperator, SparseOperator)) and A.layout.across is None and (A.unknowns <= MOST or bandwidth(A) <= NARROW)
 
 
 class HostResidual(NaturalResidual):
@@ -167,10 +167,10 @@ class DirectNewtonWorkspace(IterateMemory):
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
         A: Any = problem.A
         if not suits(A):
-            raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {WIDEST}")
+            raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {NARROW}")
         self.settings = settings
-        width = bandwidth(A) if A.unknowns > FEW else WIDEST + 1
-        self.matrix: SmallMatrix | NarrowMatrix = NarrowMatrix(A, width) if width <= WIDEST else SmallMatrix(A)
+        width = bandwidth(A) if A.unknowns > FEW else NARROW + 1
+        self.matrix: SmallMatrix | NarrowMatrix = NarrowMatrix(A, width) if width <= NARROW else SmallMatrix(A)
         on_host = problem.device.is_cpu and problem.bounds.affine is None
         super().__init__(problem, settings.precision, residual=HostResidual(problem, self.matrix) if on_host else None)
 

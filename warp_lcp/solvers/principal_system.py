@@ -21,7 +21,7 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.line_hierarchy import LineHierarchy, needs_lines
 from warp_lcp.multigrid.turning import make_hierarchy
-from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of
+from warp_lcp.operators.banded_matrix import NARROW, BandedMatrix, bands_of
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
@@ -38,7 +38,6 @@ from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 
-NARROW = 3  # bandwidth up to which LAPACK's band factors cost less than an iteration of a Krylov method
 NUDGES = (0.0, 1e-12, 1e-9, 1e-6)  # shifts of a singular banded block, in units of the matrix's largest column sum
 HEADERS = Path(__file__).parent / "headers"
 f64, i8, u8 = wp.float64, wp.int8, wp.uint8
