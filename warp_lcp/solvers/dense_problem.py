@@ -24,6 +24,8 @@ PROVABLE = 250_000  # entries of A up to which a linear program is asked whether
 PROOF_SECONDS = 10.0  # of such a program: one that takes longer proves nothing
 TOLERANCE = 1e-10  # of such a program, the least that HiGHS takes; its optimum is a vertex, whose equations hold to rounding
 ROUNDING = 8.0  # times sqrt(k) eps of its terms: a sum of k of them below that may be 0
+REFINEMENTS = 2  # of its optimum
+VERTEX = 1e-8  # of the terms of such an equation, and of the largest multiplier: what its solver leaves of zeros
 SHARE = 1e-8  # of the terms of a contradiction, that it must exceed: b = y - A x is rounded where A x cancels
 EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration, which halves the logarithms of rows that differ
 SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding
@@ -239,10 +241,27 @@ def inconsistent(data: DenseProblem) -> bool:
     options["time_limit"] = min(seconds_left(), PROOF_SECONDS)
     found = linprog(cost, A_eq=system, b_eq=np.zeros(len(data.b)), bounds=signs, method="highs", options=options)
     check_time()
-    z = np.zeros(len(data.b))
-    if found.x is not None:
-        z[rows] = R * found.x[: len(rows)]
-    return certifies(data, z)
+    if found.x is None or not found.fun < 0:
+        return False
+    z, multipliers = np.zeros(len(data.b)), found.x[: len(rows)]
+    for _ in range(1 + REFINEMENTS):
+        z[rows] = R * multipliers
+        if certifies(data, z):
+            return True
+        multipliers = _refined(system[:, : len(rows)], multipliers)
+    return False
+
+
+def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
+    """Return the multipliers nearest to z, among those that are 0 where z is, with (A'z)_j = 0 where a vertex has it but for errors.
+
+    Where a vertex of the linear program has 0, its solver leaves 1e-10 of the terms at most.
+    """
+    g, terms = transpose @ z, abs(transpose) @ np.abs(z)
+    zero, support = np.flatnonzero(np.abs(g) <= VERTEX * terms), np.flatnonzero(np.abs(z) > VERTEX)
+    block, out = transpose[zero][:, support], np.zeros(len(z))
+    out[support] = z[support] - scipy.sparse.linalg.lsmr(block, block @ z[support], atol=0.0, btol=0.0, conlim=0.0)[0]
+    return out
 
 
 def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -267,8 +286,10 @@ def entries_of_columns(A: Any) -> np.ndarray:
 def proved_infeasible(problem: LCP) -> bool:
     """Return whether `inconsistent` proves it of a dense or sparse problem; False where that would take long."""
     sparse = sparse_matrix(problem)
-    entries = sparse.nnz if sparse is not None else problem.layout.size**2
-    return entries <= PROVABLE and inconsistent(DenseProblem.read(problem, keep_sparse=True))
+    if sparse is not None and sparse.nnz > PROVABLE:
+        return False
+    data = DenseProblem.read(problem, keep_sparse=True)
+    return (sparse is not None or np.count_nonzero(data.A) <= PROVABLE) and inconsistent(data)
 
 
 def check_size(problem: LCP, method: str, most: int) -> int:
