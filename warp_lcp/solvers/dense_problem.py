@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+import scipy.sparse.csgraph
 import scipy.sparse.linalg
 import warp as wp
 
@@ -20,12 +21,14 @@ from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
 from warp_lcp.problem.solve import EPS, IterateMemory, Precision, Step
 
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
+SIDE = 4096  # unknowns of a dense matrix up to which it is looked at
 PROVABLE = 250_000  # entries of A up to which a linear program is asked whether there is a solution: seconds
 PROOF_SECONDS = 10.0  # of such a program: one that takes longer proves nothing
 TOLERANCE = 1e-10  # of such a program, the least that HiGHS takes; its optimum is a vertex, whose equations hold to rounding
 ROUNDING = 8.0  # times sqrt(k) eps of its terms: a sum of k of them below that may be 0
 REFINEMENTS = 2  # of its optimum
 VERTEX = 1e-8  # of the terms of such an equation, and of the largest multiplier: what its solver leaves of zeros
+NULL = 1e-11  # of the terms of A z: below that, rounding of A and of a factorization has made it
 SHARE = 1e-8  # of the terms of a contradiction, that it must exceed: b = y - A x is rounded where A x cancels
 EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration, which halves the logarithms of rows that differ
 SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding
@@ -164,6 +167,15 @@ def factored(block: np.ndarray, r: np.ndarray) -> np.ndarray | None:
     return scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
+def solved_or_none(A: Any, r: np.ndarray) -> np.ndarray | None:
+    """Return A^-1 r of a sparse A, None where a factor is exactly singular."""
+    try:
+        solution = scipy.sparse.linalg.splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(r)
+    except RuntimeError:  # a pivot is 0
+        return None
+    return solution if np.isfinite(solution).all() else None
+
+
 def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return A^-1 r, the least-squares solution where A is singular."""
     try:
@@ -283,13 +295,48 @@ def entries_of_columns(A: Any) -> np.ndarray:
     return np.bincount(A.indices, minlength=A.shape[1]) if scipy.sparse.issparse(A) else np.count_nonzero(A, axis=0)
 
 
+def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
+    """Return x with y = 0 on each connected component on which A is singular and that has such a solution within the bounds.
+
+    Where z'A = 0 with z > 0 and b'z = 0, as of a Laplacian that nothing holds and a b that sums to 0, z'y = 0 makes y >= 0 vanish: no
+    point is strictly feasible, and neither active sets nor a central path lead there. With one unknown of each component held at 0 and the
+    others R, x_R = -A_RR^-1 b_R solves it; z, with A z = 0 and 1 at the unknown held, moves it within the bounds.
+    """
+    A = scipy.sparse.csr_array(data.A)
+    count, label = scipy.sparse.csgraph.connected_components(A, directed=False)
+    order = np.lexsort((-np.abs(A.diagonal()), label))  # the largest diagonal entry of each component first
+    held = order[np.searchsorted(label[order], np.arange(count))]
+    rest = np.setdiff1d(np.arange(len(x)), held)
+    sides = np.stack([-data.b[rest], -np.asarray(A[rest][:, held].sum(axis=1)).ravel()], axis=1)
+    found, z = np.zeros(len(x)), np.zeros(len(x))
+    solved = solved_or_none(A[rest][:, rest], sides) if len(rest) else sides
+    if solved is None:
+        return x
+    found[rest], z[rest], z[held] = solved[:, 0], solved[:, 1], 1.0
+    zero = np.abs(A @ z) <= NULL * (abs(A) @ np.abs(z))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.sort([(bound - found) / z for bound in (data.lower, data.upper)], axis=0)
+    low, high = np.full(count, -np.inf), np.full(count, np.inf)
+    np.maximum.at(low, label, np.where(z == 0, -np.inf, ends[0]))
+    np.minimum.at(high, label, np.where(z == 0, np.inf, ends[1]))
+    works = low <= high
+    works[label[~zero]] = False
+    shift = np.clip(0.0, low, np.maximum(low, high))
+    moved = np.where(works[label], found + np.where(works[label], shift[label], 0.0) * z, x)
+    return np.clip(moved, data.lower, data.upper)
+
+
 def proved_infeasible(problem: LCP) -> bool:
     """Return whether `inconsistent` proves it of a dense or sparse problem; False where that would take long."""
+    return within_reach(problem) and inconsistent(DenseProblem.read(problem, keep_sparse=True))
+
+
+def within_reach(problem: LCP) -> bool:
+    """Return whether a dense or sparse matrix has so few entries other than 0 that a linear program, or a factorization, takes seconds."""
     sparse = sparse_matrix(problem)
-    if sparse is not None and sparse.nnz > PROVABLE:
+    if sparse is None and problem.layout.size > SIDE:
         return False
-    data = DenseProblem.read(problem, keep_sparse=True)
-    return (sparse is not None or np.count_nonzero(data.A) <= PROVABLE) and inconsistent(data)
+    return (np.count_nonzero(assemble(problem, np.arange(problem.layout.size))) if sparse is None else sparse.nnz) <= PROVABLE
 
 
 def check_size(problem: LCP, method: str, most: int) -> int:

@@ -19,7 +19,7 @@ from warp_lcp.problem.scale import scaled
 from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import rows_of
-from warp_lcp.solvers.dense_problem import power_of_two, proved_infeasible, unit_rows_and_columns
+from warp_lcp.solvers.dense_problem import DenseProblem, power_of_two, proved_infeasible, unit_rows_and_columns, within_reach, without_contact
 
 UNITS = RowPass(
     "equilibrated.units", Path(__file__).parent / "headers" / "units.h", wp.float64, reads={"x": wp.float64, "units": wp.float64},
@@ -59,6 +59,7 @@ class EquilibratedWorkspace(IterateMemory):
         self._inner = LCP(self._operator, layout.zeros(wp.float64), *limits)
         self.inner = make(self._inner)
         self._version = version_of(problem.A)
+        self._target = 0.0
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
 
     @staticmethod
@@ -82,7 +83,8 @@ class EquilibratedWorkspace(IterateMemory):
         self._multiply(self.x, self.inner.x, inverse=True)
         self.inner.floating = None
         self.inner.residual.evaluate(self.inner.x)
-        self.inner.start(warm=warm, tolerance=tolerance * float(self._rows.numpy().min()))
+        self._target = tolerance * float(self._rows.numpy().min())
+        self.inner.start(warm=warm, tolerance=self._target)
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
 
     def step(self, advance: Callable[[LCP, Any, wp.array[Any]], Step]) -> Step:
@@ -104,9 +106,27 @@ class EquilibratedWorkspace(IterateMemory):
         self._smallest = min(self._smallest, norm)
         if not self._asked and (self._waited >= WAIT or norm > GROWN * self._smallest):
             self._asked = True
+            if self._take_without_contact():
+                return Step("equations", 1, None)
             if self._ended() is SolveStatus.INFEASIBLE:
                 return Step(step.name, step.linear_iterations, None, SolveStatus.INFEASIBLE)
         return replace(step, interim=True) if self._steps <= EARLY else step
+
+    def _take_without_contact(self) -> bool:
+        """Take the solution with y = 0 where A is singular, if the residual falls by that; return whether it does."""
+        if not within_reach(self.problem):
+            return False
+        data = DenseProblem.read(self.problem, keep_sparse=True)
+        before, norm = self.x.numpy(), self.residual.norm
+        self.x.assign(without_contact(data, before[data.rows]))
+        if not self.residual.evaluate(self.x) < norm:
+            self.x.assign(before)
+            self.residual.evaluate(self.x)
+            return False
+        self._multiply(self.x, self.inner.x, inverse=True)
+        self.inner.residual.evaluate(self.inner.x)
+        self.inner.start(warm=True, tolerance=self._target)
+        return True
 
     def _ended(self) -> SolveStatus:
         """Return how a solve ends that leads nowhere."""

@@ -295,8 +295,7 @@ class NewtonWorkspace(IterateMemory):
     def _resort(self, x: wp.array[Any]) -> Step:
         """Take a step of the last resort."""
         if self.resort is None:
-            made = ProximalPoint if self.problem.A.symmetric else InteriorSteps
-            self.resort = made(self.problem, self.residual, self.target)
+            self.resort = InteriorSteps(self.problem, self.residual, self.target)
         step = self.resort.step(x)
         self._round(x)
         return step
