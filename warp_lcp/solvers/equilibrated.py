@@ -28,6 +28,7 @@ UNITS = RowPass(
 ALIKE = 4.0  # rows whose units differ by no more stay as they are
 WAIT = 6  # steps without a residual below FALL times the smallest after which it is asked whether there is a solution
 FALL = 0.9
+HALF = 0.5  # of the residual, below which that of equations on singular components is worth another start
 GROWN = 1e4  # growth of the residual after which it is
 EARLY = 10  # steps before which a residual says little: a path is joined far from the start
 
@@ -61,6 +62,7 @@ class EquilibratedWorkspace(IterateMemory):
         self._version = version_of(problem.A)
         self._target = 0.0
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
+        self._tried = False
 
     @staticmethod
     def suits(problem: LCP) -> bool:
@@ -86,6 +88,7 @@ class EquilibratedWorkspace(IterateMemory):
         self._target = tolerance * float(self._rows.numpy().min())
         self.inner.start(warm=warm, tolerance=self._target)
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
+        self._tried = False
 
     def step(self, advance: Callable[[LCP, Any, wp.array[Any]], Step]) -> Step:
         """Take a step of the method on the scaled problem."""
@@ -105,27 +108,29 @@ class EquilibratedWorkspace(IterateMemory):
         self._waited = 0 if norm <= FALL * self._smallest else self._waited + 1
         self._smallest = min(self._smallest, norm)
         if not self._asked and (self._waited >= WAIT or norm > GROWN * self._smallest):
-            self._asked = True
-            if self._take_without_contact():
+            if not self._tried and self._take_without_contact():
                 return Step("equations", 1, None)
+            self._asked = True
             if self._ended() is SolveStatus.INFEASIBLE:
                 return Step(step.name, step.linear_iterations, None, SolveStatus.INFEASIBLE)
         return replace(step, interim=True) if self._steps <= EARLY else step
 
     def _take_without_contact(self) -> bool:
-        """Take the solution with y = 0 where A is singular, if the residual falls by that; return whether it does."""
+        """Take the solution with y = 0 where A is singular, if the residual falls; return whether it does."""
+        self._tried = True
         if not within_reach(self.problem):
             return False
         data = DenseProblem.read(self.problem, keep_sparse=True)
         before, norm = self.x.numpy(), self.residual.norm
         self.x.assign(without_contact(data, before[data.rows]))
-        if not self.residual.evaluate(self.x) < norm:
+        if not self.residual.evaluate(self.x) <= HALF * norm:
             self.x.assign(before)
             self.residual.evaluate(self.x)
             return False
         self._multiply(self.x, self.inner.x, inverse=True)
         self.inner.residual.evaluate(self.inner.x)
         self.inner.start(warm=True, tolerance=self._target)
+        self._smallest, self._waited = self.residual.norm, 0
         return True
 
     def _ended(self) -> SolveStatus:
