@@ -97,7 +97,12 @@ class EquilibratedWorkspace(IterateMemory):
         inner.residual.current = False
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is seen below
             step = advance(self._inner, inner, inner.x)
+        alone = self.x.numpy()[self._alone] if self._alone.size else None
         self._multiply(inner.x, self.x)
+        if alone is not None:  # any x will do where row and column are empty and b = 0: it stays
+            x = self.x.numpy().copy()
+            x[self._alone] = alone
+            self.x.assign(x)
         self._round(self.x)
         norm = self.residual.evaluate(self.x)
         if not math.isfinite(norm):
@@ -144,6 +149,7 @@ class EquilibratedWorkspace(IterateMemory):
         R, C = (power_of_two(1 / np.sqrt(A.scale())),) * 2 if A.symmetric else unit_rows_and_columns(matrix)
         if max(R.max() / R.min(), C.max() / C.min()) <= ALIKE:
             R = C = np.ones(len(R))
+        self._alone = np.flatnonzero((np.asarray(abs(matrix).sum(axis=0)).ravel() == 0) & (np.asarray(abs(matrix).sum(axis=1)).ravel() == 0))
         self._rows.assign(R)
         self._units.assign(C)
         return scaled(matrix, R, C)
