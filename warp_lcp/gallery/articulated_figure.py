@@ -62,6 +62,8 @@ class ArticulatedFigure:
             raise ValueError(f"effectors = {self.effectors}: need one at least, each a hinge")
         if not np.allclose(np.linalg.norm(self.axes, axis=1), 1):
             raise ValueError("axes holds a vector that is no unit vector")
+        if not 0 < self.reach < np.inf:
+            raise ValueError(f"offsets and tips: an end effector must be some way from the first hinge, but reach = {self.reach:.6g} m")
         if not (self.lower <= self.upper).all():
             raise ValueError("lower > upper, or a NaN, in the limits")
         if self.dimension not in (2, 3) or (self.dimension == 2 and not np.allclose(self.axes, Z)):
@@ -146,6 +148,8 @@ def planar_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, uppe
         upper: largest angles [rad], likewise.
     """
     n = len(lengths)
+    if n == 0 or not np.isfinite(lengths).all() or not np.any(lengths):
+        raise ValueError(f"lengths = {lengths}: expected finite lengths [m], one that is not 0 at least")
     offsets = np.zeros((n, 3))
     offsets[1:, 0] = lengths[:-1]
     tips = np.array([[lengths[-1], 0.0, 0.0]])

@@ -22,6 +22,9 @@ from warp_lcp.files.claims import ClaimError, check_claim
 from warp_lcp.gallery.contact_models import ContactSystem
 
 
+UNWRITTEN = 2**24  # bytes of a dataset that was never written, up to which it is read as zeros
+
+
 @dataclass(frozen=True, eq=False)
 class FclibProblem:
     """What a file holds.
@@ -67,11 +70,13 @@ def _read(file: Any, path: Path) -> FclibProblem:
     dim = _number(group, "spacedim", path)
     if dim not in (2, 3):
         raise ValueError(f"{path}: spacedim = {dim}: must be 2 or 3")
-    B, q = (_local if kind == "fclib_local" else _global)(group, path)
-    mu = _values(group, "vectors/mu", path)
-    joints = len(q) - dim * len(mu)
-    if joints < 0:
-        raise ValueError(f"{path}: mu has {len(mu)} values for {len(q)} rows of {dim} a contact")
+    with np.errstate(over="ignore", invalid="ignore"):
+        B, q, joints = (_local if kind == "fclib_local" else _global)(group, path)
+    if not (np.isfinite(B.data).all() and np.isfinite(q).all()):
+        raise ValueError(f"{path}: products of the matrices and vectors overflow: their entries are too large")
+    mu, rows = _values(group, "vectors/mu", path), len(q) - joints
+    if dim * len(mu) != rows:
+        raise ValueError(f"{path}: mu has {len(mu)} values for {rows} rows of {dim} a contact")
     title = _text(group, "info/title", path)
     free = np.full(joints, np.inf)
     try:
@@ -81,32 +86,33 @@ def _read(file: Any, path: Path) -> FclibProblem:
     return FclibProblem(system, _solution(file, len(q), joints, path), title)
 
 
-def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray]:
-    """Return B = [W, V; V', R] and (q, s)."""
+def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
+    """Return B = [W, V; V', R], (q, s) and how many rows are joints'."""
     q = _values(group, "vectors/q", path)
     W = _matrix(group, "W", (len(q), len(q)), path)
     if "V" not in group:
-        return _symmetric(W, path), q
+        return _symmetric(W, path), q, 0
     s = _values(group, "vectors/s", path)
     V, R = _matrix(group, "V", (len(q), len(s)), path), _matrix(group, "R", (len(s), len(s)), path)
-    return _symmetric(scipy.sparse.block_array([[W, V], [V.T, R]]), path), np.concatenate([q, s])
+    return _symmetric(scipy.sparse.block_array([[W, V], [V.T, R]]), path), np.concatenate([q, s]), len(s)
 
 
-def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray]:
-    """Return B = C'M^-1 C and C'M^-1 f + (w, b) with C = (H, G)."""
+def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray, int]:
+    """Return B = C'M^-1 C and C'M^-1 f + (w, b) with C = (H, G), and how many rows are joints'."""
+    joints = 0
     f, q = _values(group, "vectors/f", path), _values(group, "vectors/w", path)
     M, C = _matrix(group, "M", (len(f), len(f)), path), _matrix(group, "H", (len(f), len(q)), path)
     if "G" in group:
         b = _values(group, "vectors/b", path)
         C = scipy.sparse.csr_array(scipy.sparse.hstack([C, _matrix(group, "G", (len(f), len(b)), path)]))
-        q = np.concatenate([q, b])
+        q, joints = np.concatenate([q, b]), len(b)
     check_claim(f"M^-1 C of {len(f)} x {len(q)} values", 2 * np.dtype(np.float64).itemsize * len(f) * len(q))
     try:
         solve = scipy.sparse.linalg.splu(scipy.sparse.csc_array(M)).solve
     except RuntimeError as error:
         raise ValueError(f"{path}: M has no inverse: {error}") from error
     response = scipy.sparse.csr_array(np.asarray(solve(C.toarray())))
-    return _symmetric(C.T @ response, path), C.T @ np.asarray(solve(f)) + q
+    return _symmetric(C.T @ response, path), C.T @ np.asarray(solve(f)) + q, joints
 
 
 def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.sparse.csr_array:
@@ -139,7 +145,7 @@ def _symmetric(B: Any, path: Path) -> scipy.sparse.csr_array:
         raise ValueError(f"{path}: the matrix of the contacts is empty or not finite")
     if abs(B - B.T).max() > 1e-6 * abs(B).max():
         raise ValueError(f"{path}: the matrix of the contacts is not symmetric")
-    return scipy.sparse.csr_array(0.5 * (B + B.T))
+    return scipy.sparse.csr_array(0.5 * B + 0.5 * B.T)
 
 
 def _values(group: Any, name: str, path: Path, kinds: str = "iuf") -> np.ndarray:
@@ -168,6 +174,8 @@ def _dataset(group: Any, name: str, path: Path) -> Any:
     if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
         raise ValueError(f"{path}: {group.name}/{name} is no dataset of this file")
     size, stored = int(found.nbytes), int(found.id.get_storage_size())
+    if stored == 0 and size <= UNWRITTEN and not found.chunks:  # its fill value, which is 0: FCLIB makes datasets that it writes nothing to
+        return found
     check_claim(f"{name} of {size} bytes", size, stored=-(-size // DEFLATED) if found.chunks else size, held=stored)
     return found
 

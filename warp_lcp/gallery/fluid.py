@@ -36,6 +36,12 @@ class Splash:
     wall: np.ndarray
     faces: dict[str, Any] = field(default_factory=dict)
 
+    def __getattr__(self, name: str) -> Any:
+        """Say what makes the problem, to those who know it from other members of the gallery."""
+        if name in ("lcp", "A"):
+            raise AttributeError(f"a Splash has no {name}, its bounds are open: take splash.named('everywhere').{name}, or 'walls', 'linear'")
+        raise AttributeError(f"a Splash has no {name}")
+
     def lower(self, bounds: str) -> float | np.ndarray:
         """Return the lower bound: -inf (linear), 0 on wall cells (walls) or 0 (everywhere)."""
         if bounds == "walls":

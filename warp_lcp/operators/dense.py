@@ -14,7 +14,7 @@ from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Layout, check_kept, check_storable, real_array
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, real_array
 
 HEADERS, FIELDS = Path(__file__).parent / "headers", dict.fromkeys(("b", "lower", "upper"), "S")
 PRODUCT = RowPass(
@@ -64,7 +64,7 @@ class DenseOperator(Pickled):
         if host.ndim != 2 or host.shape[0] != host.shape[1] or host.size == 0:
             raise ValueError(f"matrix has shape {host.shape}: expected (n, n) with n >= 1")
         check_storable(host, dtype, "matrix")
-        self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
+        self.device, self.dtype, self.shape = checked_device(device), dtype, (host.shape[0],)
         self.layout = Layout(self.shape, self.device)
         self.matrix = wp.array(host, dtype=dtype, device=self.device)
         largest = np.abs(host).max(axis=1)

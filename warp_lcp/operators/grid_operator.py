@@ -16,7 +16,7 @@ from warp_lcp.operators.padded_stencil import Ghosts, PaddedStencil, find_spans_
 from warp_lcp.problem.pickling import Pickled
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, real_array
+from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, checked_device, real_array
 from warp_lcp.rows.vectors import Across
 
 HEADERS = Path(__file__).parent / "headers"
@@ -53,7 +53,7 @@ class GridOperator(Pickled):
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         host = _checked_cells(cells)
-        self.device = wp.get_device(device if device is not None else cells.device if isinstance(cells, wp.array) else None)
+        self.device = checked_device(device if device is not None else cells.device if isinstance(cells, wp.array) else None)
         self.dtype, self.shape = dtype, host.shape
         self.layout = PaddedLayout(host.shape, self.device, self._across)
         counts = self.layout.padding.counts

@@ -14,7 +14,7 @@ from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.protocol import Operator
 from warp_lcp.problem.scale import NoTranspose, estimated_scale
-from warp_lcp.rows.fields import Layout, check_storable, real_array
+from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
 
 Product = Callable[[np.ndarray], Any]
 ASYMMETRY = 1e-5  # of ||u|| ||A v||: above what products in float32 leave of u'Av = v'Au
@@ -55,7 +55,7 @@ class LinearOperator(Pickled, Operator):
     ) -> None:  # fmt: skip
         self._given = (A, shape, symmetric, diagonal, transpose)
         self.shape = _shape_of(A, shape)
-        self.device = wp.get_device("cpu" if device is None else device)
+        self.device = checked_device("cpu" if device is None else device)
         self.layout = Layout(self.shape, self.device)
         self._product, self._transpose = _products_of(A, self.shape, transpose)
         self._diagonal = None if diagonal is None else self._field(diagonal)
@@ -121,7 +121,7 @@ class LinearOperator(Pickled, Operator):
             ValueError: it is none, not real or has another shape.
         """
         try:
-            image = np.asarray(product(x))
+            image = np.array(product(x))  # a copy: A may hand out its own buffer, and write to it next time
         except ValueError as reason:  # SciPy's, of a matvec that returns another shape
             raise ValueError(f"A fails to multiply an array of shape {self.shape}: {reason}") from reason
         if image.dtype.kind not in "biuf":

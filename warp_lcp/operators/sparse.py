@@ -17,7 +17,7 @@ from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Layout, check_kept, check_storable, kept, real_array, zeros, zeros_like
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, kept, real_array, zeros, zeros_like
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
 
@@ -97,7 +97,7 @@ class SparseOperator(Pickled):
         host = _checked(matrix)
         check_storable(host.data, dtype, "matrix")
         self.near_null_space = None if near_null_space is None else _near_null_space(near_null_space, host.shape[0])
-        self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
+        self.device, self.dtype, self.shape = checked_device(device), dtype, (host.shape[0],)
         self.layout = Layout(self.shape, self.device)
         parts = (host.indptr, wp.int32), (host.indices, wp.int32), (host.data, dtype)
         self.indptr, self.indices, self.values = (wp.array(v, dtype=t, device=self.device, copy=self.device.is_cuda) for v, t in parts)
@@ -329,11 +329,25 @@ def _checked(matrix: Any) -> scipy.sparse.csr_array:
         raise ValueError(f"matrix has shape {matrix.shape}: expected (n, n) with n >= 1")
     if matrix.dtype.kind not in "fiub":
         raise ValueError(f"matrix has entries of type {matrix.dtype}: expected real numbers")
+    _check_indices(matrix)
     host = scipy.sparse.csr_array(matrix, dtype=np.float64, copy=True)
     host.sum_duplicates()
     if host.nnz > np.iinfo(np.int32).max:
         raise ValueError(f"matrix has {host.nnz} entries: at most 2^31 - 1 can be indexed")
     return host
+
+
+def _check_indices(matrix: Any) -> None:
+    """Refuse indices out of range, which SciPy's conversions and our kernels would follow to memory of others."""
+    try:
+        if matrix.format in ("csr", "csc", "bsr"):
+            matrix.check_format(full_check=True)
+        elif matrix.format == "coo":
+            for name, index, n in zip(("row", "column"), (matrix.row, matrix.col), matrix.shape, strict=True):
+                if len(index) != matrix.nnz or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < n):
+                    raise ValueError(f"{name} indices must be from 0 to {n - 1}, one an entry")
+    except ValueError as reason:
+        raise ValueError(f"matrix is no sparse matrix of shape {matrix.shape}: {reason}") from reason
 
 
 def _near_null_space(given: Any, n: int) -> np.ndarray:

@@ -19,6 +19,19 @@ LARGE = 1 << 20  # elements from which a field of the CPU is looked through for 
 HUGE_PAGE, SMALL_PAGE = 1 << 21, 1 << 12  # bytes that the system gives memory by, when something in them is first written
 
 
+def checked_device(device: Any) -> wp.Device:
+    """Return a Warp device; the default one if None.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    try:
+        return wp.get_device(device)
+    except (ValueError, RuntimeError) as reason:
+        there = ", ".join(str(d) for d in wp.get_devices())
+        raise ValueError(f"device = {device!r}: there is no such device, expected one of {there}") from reason
+
+
 def zeros(n: int, dtype: Any, device: wp.Device, *, small_pages: bool = False) -> wp.array[Any]:
     """Return a flat field of zeros, whose memory on the CPU is taken when it is first written.
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+import scipy.sparse.csgraph
 import scipy.sparse.linalg
 import warp as wp
 
@@ -17,10 +18,18 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
-from warp_lcp.problem.solve import IterateMemory, Precision, Step
+from warp_lcp.problem.solve import EPS, IterateMemory, Precision, Step
 
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
+SIDE = 4096  # unknowns of a dense matrix up to which it is looked at
 PROVABLE = 250_000  # entries of A up to which a linear program is asked whether there is a solution: seconds
+PROOF_SECONDS = 10.0  # of such a program: one that takes longer proves nothing
+TOLERANCE = 1e-10  # of such a program, the least that HiGHS takes; its optimum is a vertex, whose equations hold to rounding
+ROUNDING = 8.0  # times sqrt(k) eps of its terms: a sum of k of them below that may be 0
+REFINEMENTS = 2  # of its optimum
+VERTEX = 1e-8  # of the terms of such an equation, and of the largest multiplier: what its solver leaves of zeros
+NULL = 1e-11  # of the terms of A z: below that, rounding of A and of a factorization has made it
+SHARE = 1e-8  # of the terms of a contradiction, that it must exceed: b = y - A x is rounded where A x cancels
 EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration, which halves the logarithms of rows that differ
 SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding
 RANK = 1e-12  # singular values below this part of the largest are zero to least-squares solutions (methods.md: all solved with it)
@@ -158,6 +167,15 @@ def factored(block: np.ndarray, r: np.ndarray) -> np.ndarray | None:
     return scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
+def solved_or_none(A: Any, r: np.ndarray) -> np.ndarray | None:
+    """Return A^-1 r of a sparse A, None where a factor is exactly singular."""
+    try:
+        solution = scipy.sparse.linalg.splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(r)
+    except RuntimeError:  # a pivot is 0
+        return None
+    return solution if np.isfinite(solution).all() else None
+
+
 def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return A^-1 r, the least-squares solution where A is singular."""
     try:
@@ -177,32 +195,148 @@ def semidefinite(A: np.ndarray) -> bool:
     return True
 
 
-def inconsistent(data: DenseProblem) -> bool:
-    """Return whether no x within its bounds gives every y a sign that its bounds allow, so that no solution exists (a linear program).
+def certifies(data: DenseProblem, z: np.ndarray) -> bool:
+    """Return whether z proves that no x within its bounds gives every y a sign that its bounds allow (Farkas' lemma).
 
-    For a positive semi-definite A, symmetric or not, such an x is also enough for a solution to exist.
+    A solution has y_i >= 0 where l_i alone is finite, y_i <= 0 where u_i alone is, and y_i = 0 where neither is. With z_i >= 0, z_i <= 0
+    and z_i of any sign there, and z_i = 0 where both are finite, it has z'y >= 0. With g = A'z, for every x in [l, u],
+
+        z'y = b'z + g'x <= b'z + sum_j max(g_j l_j, g_j u_j),
+
+    where g_j <= 0 if u_j is infinite, and g_j >= 0 if l_j is: if the right side is negative, there is no solution. A g_j that rounding
+    makes, of the terms a_ij z_i, counts as 0. The right side must be negative by `SHARE` of its terms, so that a solution that rounding
+    of A or b hides has terms a_ij x_j that are some 1e8 times as large as b.
+
+    Args:
+        data: the problem, in any units of rows and columns.
+        z: multipliers, shape (n,), of those signs or another vector.
+    """
+    below, above = np.isfinite(data.lower), np.isfinite(data.upper)
+    z = np.where(below & above, 0.0, np.where(below, np.maximum(z, 0.0), np.where(above, np.minimum(z, 0.0), z)))
+    magnitude = abs(data.A)
+    with np.errstate(over="ignore", invalid="ignore"):
+        g, terms = data.A.T @ z, magnitude.T @ np.abs(z)
+        noise = ROUNDING * np.sqrt(entries_of_columns(data.A)) * EPS * terms
+        if (g > noise)[~above].any() or (g < -noise)[~below].any():
+            return False
+        low, high = np.where(below, data.lower, 0.0), np.where(above, data.upper, 0.0)
+        gains = np.maximum(g, 0.0) * high + np.minimum(g, 0.0) * low
+        doubt = SHARE * (np.abs(data.b) @ np.abs(z) + np.abs(gains).sum()) + noise @ np.maximum(np.abs(low), np.abs(high))
+        return bool(data.b @ z + gains.sum() < -doubt)
+
+
+def inconsistent(data: DenseProblem) -> bool:
+    """Return whether it is proved that no solution exists: `certifies` accepts multipliers that a linear program suggests.
+
+    A problem with a positive semi-definite A, symmetric or not, has a solution wherever there is no such proof. The program minimizes the
+    bound of `certifies`, with g = p - q, p, q >= 0, of which p_j is 0 where u_j is infinite, and q_j where l_j is:
+
+        minimize b'z + u'p - l'q   where A'z = p - q, |z_i| <= 1.
+
+    It is posed in units in which the rows of [A b] have entries near 1, so that a large row hides no other. That a linear program's solver
+    calls the problem infeasible is no proof: its tolerances are absolute.
     """
     from scipy.optimize import linprog  # a fifth of a second to import, and seldom needed
 
-    data, _ = data.scaled()
     below, above = np.isfinite(data.lower), np.isfinite(data.upper)
-    parts = {"ub": [(-1.0, below & ~above), (1.0, above & ~below)], "eq": [(1.0, ~below & ~above)]}
-    stack = scipy.sparse.vstack if scipy.sparse.issparse(data.A) else np.vstack
-    rows: dict[str, Any] = {}
-    for name, pieces in parts.items():
-        rows[f"A_{name}"] = stack([sign * data.A[mask] for sign, mask in pieces])
-        rows[f"b_{name}"] = np.concatenate([-sign * data.b[mask] for sign, mask in pieces])
-    limits = np.stack([data.lower, data.upper], axis=1)
-    found = linprog(np.zeros(len(data.b)), **rows, bounds=limits, method="highs", options={"time_limit": seconds_left()})
+    rows = np.flatnonzero(~(below & above))
+    A, b = data.A[rows], data.b[rows]
+    if not len(rows):
+        return False
+    R, C, beta = _units_with_right_side(A, b)
+    up, low = np.flatnonzero(above), np.flatnonzero(below)
+    identity = scipy.sparse.eye_array(len(data.b), format="csc")
+    system = scipy.sparse.hstack([scipy.sparse.csc_array(scaled(A, R, C).T), -identity[:, up], identity[:, low]], format="csc")
+    cost = np.concatenate([R * b, data.upper[up] / C[up], -data.lower[low] / C[low]]) / beta
+    signs = [(-float(not below[i]), float(not above[i])) for i in rows] + [(0.0, None)] * (len(up) + len(low))
+    options = dict.fromkeys(("primal_feasibility_tolerance", "dual_feasibility_tolerance"), TOLERANCE)
+    options["time_limit"] = min(seconds_left(), PROOF_SECONDS)
+    found = linprog(cost, A_eq=system, b_eq=np.zeros(len(data.b)), bounds=signs, method="highs", options=options)
     check_time()
-    return bool(found.status == 2)  # HiGHS: infeasible
+    if found.x is None or not found.fun < 0:
+        return False
+    z, multipliers = np.zeros(len(data.b)), found.x[: len(rows)]
+    for _ in range(1 + REFINEMENTS):
+        z[rows] = R * multipliers
+        if certifies(data, z):
+            return True
+        multipliers = _refined(system[:, : len(rows)], multipliers)
+    return False
+
+
+def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
+    """Return the multipliers nearest to z, among those that are 0 where z is, with (A'z)_j = 0 where a vertex has it but for errors.
+
+    Where a vertex of the linear program has 0, its solver leaves 1e-10 of the terms at most.
+    """
+    g, terms = transpose @ z, abs(transpose) @ np.abs(z)
+    zero, support = np.flatnonzero(np.abs(g) <= VERTEX * terms), np.flatnonzero(np.abs(z) > VERTEX)
+    block, out = transpose[zero][:, support], np.zeros(len(z))
+    out[support] = z[support] - scipy.sparse.linalg.lsmr(block, block @ z[support], atol=0.0, btol=0.0, conlim=0.0)[0]
+    return out
+
+
+def _units_with_right_side(A: Any, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return R, C and beta > 0, powers of 2, so that the rows and columns of R [A b] diag(C, 1 / beta) have largest entries near 1."""
+    magnitude, R, C = abs(A), np.ones(A.shape[0]), np.ones(A.shape[1])
+    size, beta = np.abs(b), 1.0
+    sparse = scipy.sparse.issparse(A)
+    for _ in range(EQUILIBRATIONS):
+        check_time()
+        now, right = scaled(magnitude, R, C), R * size / beta
+        rows, columns = (now.max(axis=k).toarray().ravel() if sparse else now.max(axis=k) for k in (1, 0))
+        R, C = R / power_of_two(np.sqrt(np.maximum(rows, right))), C / power_of_two(np.sqrt(columns))
+        beta *= float(power_of_two(np.sqrt(right.max())))
+    return R, C, beta
+
+
+def entries_of_columns(A: Any) -> np.ndarray:
+    """Return how many entries other than 0 each column has."""
+    return np.bincount(A.indices, minlength=A.shape[1]) if scipy.sparse.issparse(A) else np.count_nonzero(A, axis=0)
+
+
+def without_contact(data: DenseProblem, x: np.ndarray) -> np.ndarray:
+    """Return x with y = 0 on each connected component on which A is singular and that has such a solution within the bounds.
+
+    Where z'A = 0 with z > 0 and b'z = 0, as of a Laplacian that nothing holds and a b that sums to 0, z'y = 0 makes y >= 0 vanish: no
+    point is strictly feasible, and neither active sets nor a central path lead there. With one unknown of each component held at 0 and the
+    others R, x_R = -A_RR^-1 b_R solves it; z, with A z = 0 and 1 at the unknown held, moves it within the bounds.
+    """
+    A = scipy.sparse.csr_array(data.A)
+    count, label = scipy.sparse.csgraph.connected_components(A, directed=False)
+    order = np.lexsort((-np.abs(A.diagonal()), label))  # the largest diagonal entry of each component first
+    held = order[np.searchsorted(label[order], np.arange(count))]
+    rest = np.setdiff1d(np.arange(len(x)), held)
+    sides = np.stack([-data.b[rest], -np.asarray(A[rest][:, held].sum(axis=1)).ravel()], axis=1)
+    found, z = np.zeros(len(x)), np.zeros(len(x))
+    solved = solved_or_none(A[rest][:, rest], sides) if len(rest) else sides
+    if solved is None:
+        return x
+    found[rest], z[rest], z[held] = solved[:, 0], solved[:, 1], 1.0
+    zero = np.abs(A @ z) <= NULL * (abs(A) @ np.abs(z))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.sort([(bound - found) / z for bound in (data.lower, data.upper)], axis=0)
+    low, high = np.full(count, -np.inf), np.full(count, np.inf)
+    np.maximum.at(low, label, np.where(z == 0, -np.inf, ends[0]))
+    np.minimum.at(high, label, np.where(z == 0, np.inf, ends[1]))
+    works = low <= high
+    works[label[~zero]] = False
+    shift = np.clip(0.0, low, np.maximum(low, high))
+    moved = np.where(works[label], found + np.where(works[label], shift[label], 0.0) * z, x)
+    return np.clip(moved, data.lower, data.upper)
 
 
 def proved_infeasible(problem: LCP) -> bool:
-    """Return whether `inconsistent` says so of a dense or sparse problem; False where that would take long."""
+    """Return whether `inconsistent` proves it of a dense or sparse problem; False where that would take long."""
+    return within_reach(problem) and inconsistent(DenseProblem.read(problem, keep_sparse=True))
+
+
+def within_reach(problem: LCP) -> bool:
+    """Return whether a dense or sparse matrix has so few entries other than 0 that a linear program, or a factorization, takes seconds."""
     sparse = sparse_matrix(problem)
-    entries = sparse.nnz if sparse is not None else problem.layout.size**2
-    return entries <= PROVABLE and inconsistent(DenseProblem.read(problem, keep_sparse=True))
+    if sparse is None and problem.layout.size > SIDE:
+        return False
+    return (np.count_nonzero(assemble(problem, np.arange(problem.layout.size))) if sparse is None else sparse.nnz) <= PROVABLE
 
 
 def check_size(problem: LCP, method: str, most: int) -> int:

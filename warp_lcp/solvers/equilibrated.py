@@ -19,7 +19,7 @@ from warp_lcp.problem.scale import scaled
 from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import rows_of
-from warp_lcp.solvers.dense_problem import power_of_two, proved_infeasible, unit_rows_and_columns
+from warp_lcp.solvers.dense_problem import DenseProblem, power_of_two, proved_infeasible, unit_rows_and_columns, within_reach, without_contact
 
 UNITS = RowPass(
     "equilibrated.units", Path(__file__).parent / "headers" / "units.h", wp.float64, reads={"x": wp.float64, "units": wp.float64},
@@ -28,6 +28,7 @@ UNITS = RowPass(
 ALIKE = 4.0  # rows whose units differ by no more stay as they are
 WAIT = 6  # steps without a residual below FALL times the smallest after which it is asked whether there is a solution
 FALL = 0.9
+HALF = 0.5  # of the residual, below which that of equations on singular components is worth another start
 GROWN = 1e4  # growth of the residual after which it is
 EARLY = 10  # steps before which a residual says little: a path is joined far from the start
 
@@ -59,7 +60,9 @@ class EquilibratedWorkspace(IterateMemory):
         self._inner = LCP(self._operator, layout.zeros(wp.float64), *limits)
         self.inner = make(self._inner)
         self._version = version_of(problem.A)
+        self._target = 0.0
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
+        self._tried = False
 
     @staticmethod
     def suits(problem: LCP) -> bool:
@@ -82,8 +85,10 @@ class EquilibratedWorkspace(IterateMemory):
         self._multiply(self.x, self.inner.x, inverse=True)
         self.inner.floating = None
         self.inner.residual.evaluate(self.inner.x)
-        self.inner.start(warm=warm, tolerance=tolerance * float(self._rows.numpy().min()))
+        self._target = tolerance * float(self._rows.numpy().min())
+        self.inner.start(warm=warm, tolerance=self._target)
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
+        self._tried = False
 
     def step(self, advance: Callable[[LCP, Any, wp.array[Any]], Step]) -> Step:
         """Take a step of the method on the scaled problem."""
@@ -92,7 +97,12 @@ class EquilibratedWorkspace(IterateMemory):
         inner.residual.current = False
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is seen below
             step = advance(self._inner, inner, inner.x)
+        alone = self.x.numpy()[self._alone] if self._alone.size else None
         self._multiply(inner.x, self.x)
+        if alone is not None:  # any x will do where row and column are empty and b = 0: it stays
+            x = self.x.numpy().copy()
+            x[self._alone] = alone
+            self.x.assign(x)
         self._round(self.x)
         norm = self.residual.evaluate(self.x)
         if not math.isfinite(norm):
@@ -103,10 +113,30 @@ class EquilibratedWorkspace(IterateMemory):
         self._waited = 0 if norm <= FALL * self._smallest else self._waited + 1
         self._smallest = min(self._smallest, norm)
         if not self._asked and (self._waited >= WAIT or norm > GROWN * self._smallest):
+            if not self._tried and self._take_without_contact():
+                return Step("equations", 1, None)
             self._asked = True
             if self._ended() is SolveStatus.INFEASIBLE:
                 return Step(step.name, step.linear_iterations, None, SolveStatus.INFEASIBLE)
         return replace(step, interim=True) if self._steps <= EARLY else step
+
+    def _take_without_contact(self) -> bool:
+        """Take the solution with y = 0 where A is singular, if the residual falls; return whether it does."""
+        self._tried = True
+        if not within_reach(self.problem):
+            return False
+        data = DenseProblem.read(self.problem, keep_sparse=True)
+        before, norm = self.x.numpy(), self.residual.norm
+        self.x.assign(without_contact(data, before[data.rows]))
+        if not self.residual.evaluate(self.x) <= HALF * norm:
+            self.x.assign(before)
+            self.residual.evaluate(self.x)
+            return False
+        self._multiply(self.x, self.inner.x, inverse=True)
+        self.inner.residual.evaluate(self.inner.x)
+        self.inner.start(warm=True, tolerance=self._target)
+        self._smallest, self._waited = self.residual.norm, 0
+        return True
 
     def _ended(self) -> SolveStatus:
         """Return how a solve ends that leads nowhere."""
@@ -119,6 +149,7 @@ class EquilibratedWorkspace(IterateMemory):
         R, C = (power_of_two(1 / np.sqrt(A.scale())),) * 2 if A.symmetric else unit_rows_and_columns(matrix)
         if max(R.max() / R.min(), C.max() / C.min()) <= ALIKE:
             R = C = np.ones(len(R))
+        self._alone = np.flatnonzero((np.asarray(abs(matrix).sum(axis=0)).ravel() == 0) & (np.asarray(abs(matrix).sum(axis=1)).ravel() == 0))
         self._rows.assign(R)
         self._units.assign(C)
         return scaled(matrix, R, C)

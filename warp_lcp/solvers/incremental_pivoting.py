@@ -13,7 +13,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
 from warp_lcp.settings import Count, Settings
-from warp_lcp.solvers.dense_problem import DenseWorkspace, assemble, check_size, pivots_of, semidefinite
+from warp_lcp.solvers.dense_problem import DenseWorkspace, assemble, certifies, check_size, inconsistent, pivots_of, semidefinite
 from warp_lcp.solvers.principal_inverse import PrincipalInverse
 
 ZERO = 1e-11  # a rate below this part of the terms that it is a sum of is rounding: nothing changes there
@@ -30,7 +30,8 @@ class IncrementalPivoting(Settings):
     The most violated row j is driven to y_j = 0 or to its bound while all rows that hold keep holding: dx_F = -A_FF^-1 A_Fj, dy = A dx, and
     the longest step is taken that keeps x_F within its bounds and the signs of y at bounds; what blocks it changes sides. Each change
     of F updates the inverse of A_FF in O(n^2). Boxed bounds and equations are driven from either side. A positive semi-definite A needs
-    no care: whatever joins F leaves A_FF regular; where y_j cannot change and nothing blocks, no solution exists (INFEASIBLE).
+    no care: whatever joins F leaves A_FF regular; where y_j cannot change and nothing blocks, no solution exists: INFEASIBLE if multipliers
+    prove it beyond rounding (`certifies`), else STAGNATED.
 
     A warm start begins with the rows of x0 that are violated. The last step solves A_FF x_F = -(b + A x_bound)_F afresh. A step is a block
     of pivots; `linear_iterations` counts pivots.
@@ -143,7 +144,9 @@ class PivotingWorkspace(DenseWorkspace):
         steps = self._steps(dx, dy, noise)
         length = steps.min()
         if not np.isfinite(length):
-            self.ended = SolveStatus.INFEASIBLE
+            z = np.where(np.abs(dx) > ZERO * np.abs(dx).max(), dx, 0.0)  # A z = 0 and b'z < 0: a proof, if no rounding has made it
+            proved = certifies(data, z) or inconsistent(data)
+            self.ended = SolveStatus.INFEASIBLE if proved else SolveStatus.STAGNATED
             return
         self.idle = self.idle + 1 if length <= EPS * np.abs(self.values).max() else 0
         ties = np.flatnonzero(steps <= length * (1 + 4 * EPS))

@@ -17,7 +17,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
 from warp_lcp.settings import Count, Settings
-from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of, semidefinite
+from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of
 
 REGULAR = 1e-10  # reciprocal condition number above which the equations' block is eliminated
 
@@ -178,9 +178,8 @@ class Lemke(Settings):
 
     z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It processes every problem with a
     copositive-plus matrix, positive semi-definite ones among them, symmetric or not, and every P-matrix; for others it may end in a ray.
-    A ray is believed only when further covering vectors, random in [.5, 1.5], end in one too; the status is then INFEASIBLE if the
-    symmetric part of A is positive semi-definite, or if a linear program shows that no x meets the inequalities; STAGNATED if neither is
-    known.
+    A ray is believed only when further covering vectors, random in [.5, 1.5], end in one too; the status is then INFEASIBLE if multipliers
+    prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED.
 
     Boxes add a pair of variables, equations are eliminated or, where their block is singular, split (see LemkeForm). x0 is not used. A
     pivot costs O(m^2), m <= 2n. A step is a block of pivots; `linear_iterations` counts pivots.
@@ -441,9 +440,4 @@ class LemkeWorkspace(DenseWorkspace):
             self.rays += 1
             self._cover(self._random.uniform(0.5, 1.5, len(self.form.q)))
             return
-        self.ended = SolveStatus.INFEASIBLE if self._has_none() else SolveStatus.STAGNATED
-
-    def _has_none(self) -> bool:
-        """Return whether there is surely no solution: the ray proves it if A is positive semi-definite, a linear program else."""
-        A = self.data.A
-        return semidefinite(A.toarray() if scipy.sparse.issparse(A) else A) or inconsistent(self.data)
+        self.ended = SolveStatus.INFEASIBLE if inconsistent(self.data) else SolveStatus.STAGNATED

@@ -17,7 +17,6 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
-from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
@@ -26,7 +25,6 @@ from warp_lcp.solvers.phases import CoarseProblem, CoarseStencilProblem, Gradien
 from warp_lcp.solvers.principal_system import (
     CLASSIFY,
     ON_FREE,
-    BandedSystem,
     DenseSystem,
     GridSystem,
     LineSystem,
@@ -299,11 +297,7 @@ class NewtonWorkspace(IterateMemory):
     def _resort(self, x: wp.array[Any]) -> Step:
         """Take a step of the last resort."""
         if self.resort is None:
-            if isinstance(self.system, BandedSystem):  # a step of the path costs little
-                self.resort = InteriorSteps(self.problem, self.residual, self.target, patience=StoppingCriteria.patience)
-            else:
-                made = ProximalPoint if self.problem.A.symmetric else InteriorSteps
-                self.resort = made(self.problem, self.residual, self.target)
+            self.resort = InteriorSteps(self.problem, self.residual, self.target)
         step = self.resort.step(x)
         self._round(x)
         return step

@@ -46,6 +46,7 @@ IDLE = 4  # centers without progress before the end
 PATIENCE = StoppingCriteria.patience  # gradient steps that neither lower the energy nor the residual before the end
 # of interior-point steps
 PATH_IDLE = 10  # steps without progress before the proximal-point iteration: a path is joined far from the start
+CREEPS = 0.97  # of the residual that many steps ago: above it, a path that was joined far from the start leads nowhere
 # of problems on coarse points
 ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)  # of a correction that interpolation blurs by a layer or two anyway
 # a set creeps while more than this share of what the last step moved moves again: at that rate a dozen steps or more are still to
@@ -312,23 +313,23 @@ class InteriorSteps:
     """Follow the central path from its own start; where that leads nowhere, iterate by ProximalPoint from where the method was.
 
     Linear programs and other saddle points, A skew but for a block or a small shift, have free blocks that are singular or nearly so
-    on the way to the solution's own. The central path exists for every positive semi-definite A, and asks for none.
+    on the way to the solution's own; so have matrices of low rank, and Laplacians that nothing holds, whose active set creeps by a layer
+    of unknowns a step. The central path exists for every positive semi-definite A, and asks for none.
 
     Args:
         problem: with a dense or sparse operator.
         residual: the problem's own.
         tolerance: the norm of it that is asked for.
-        patience: steps without progress before the proximal-point iteration.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float, *, patience: int = PATH_IDLE) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float) -> None:
         from warp_lcp.solvers.interior_point import InteriorPoint  # which knows the active-set methods
 
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
         self._inner = Inner(InteriorPoint(precision="double"), problem)
         self._inner.work.residual.start(self._inner.work.x, keep=False)
         self._inner.begin(self._inner.work.x, tolerance, warm=False)
-        self._smallest, self._idle, self._patience = math.inf, 0, patience
+        self._smallest, self._idle, self._norms = math.inf, 0, list[float]()
         self._begun: wp.array[Any] | None = None
         self._next: ProximalPoint | None = None
 
@@ -344,7 +345,9 @@ class InteriorSteps:
         norm = self._inner.work.residual.norm
         self._idle = 0 if norm <= FALL * self._smallest else self._idle + 1
         self._smallest = min(norm, self._smallest)
-        over = step.failure is not None or self._idle >= self._patience
+        self._norms = [*self._norms, norm][-1 - PATH_IDLE :]
+        creeps = len(self._norms) > PATH_IDLE and norm > CREEPS * self._norms[0]
+        over = step.failure is not None or (self._idle >= PATH_IDLE and creeps)
         wp.copy(x, self._begun if over else self._inner.work.x)
         if over:
             self._residual.evaluate(x)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import scipy.linalg
 import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
@@ -290,7 +291,7 @@ def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
         S = equilibration(block)
         block, r = S[:, None] * block * S, S * r
         solution = factored(block, r)
-        solution = S * (np.linalg.lstsq(block, r, rcond=1e-12)[0] if solution is None else solution)
+        solution = S * (scipy.linalg.lstsq(block, r, cond=1e-12, lapack_driver="gelsy")[0] if solution is None else solution)
     return solution
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any, Protocol
 
@@ -23,6 +24,7 @@ from warp_lcp.rows.program import Launch
 # symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
 FAR_FROM_M = partial(AlgebraicSettings, strength=0.08, interval=(0.05, 1.0))
 DROP, FILL = 1e-4, 10.0  # share of a column below which entries of the factors go, and the most of them in units of A's
+NUDGE, GOLDEN = 1e-14, (math.sqrt(5) - 1) / 2  # share of a row's largest entry; its multiples modulo 1 are all different
 DIRECT = 2000  # unknowns up to which factors are complete: that costs less than the iterations it saves
 
 
@@ -93,7 +95,7 @@ class IncompleteFactors:
         self._free = np.zeros(0, dtype=np.intp)
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
-        """Factor the free block; where a factor is singular, with a small multiple of its largest entry on the diagonal."""
+        """Factor the free block, its diagonal nudged where a factor might be singular."""
         self._free = np.flatnonzero(free.numpy())
         matrix = self._A.matrix()
         if shift is not None:
@@ -118,13 +120,30 @@ class IncompleteFactors:
 
     def _factor(self, block: Any) -> Any:
         """Return what applies the factors' inverse; nothing is done where they cannot be had."""
-        size = float(np.abs(block.data).max(initial=0.0)) or 1.0
-        for nudge in (0.0, 1e-10, 1e-6):
-            try:
-                nudged = block if nudge == 0 else (block + nudge * size * scipy.sparse.eye_array(block.shape[0])).tocsc()
-                if block.shape[0] <= DIRECT:
-                    return scipy.sparse.linalg.splu(nudged).solve
-                return scipy.sparse.linalg.spilu(nudged, drop_tol=DROP, fill_factor=FILL).solve
-            except RuntimeError:  # a factor is exactly singular
-                continue
-        return np.asarray
+        try:
+            if block.shape[0] <= DIRECT:
+                return scipy.sparse.linalg.splu(nudged(block, NUDGE)).solve
+            return scipy.sparse.linalg.spilu(nudged(block, NUDGE, small=100 * DROP), drop_tol=DROP, fill_factor=FILL).solve
+        except RuntimeError:  # a factor is exactly singular after all
+            return np.asarray
+
+
+def nudged(block: Any, share: float, *, small: float = 0.0) -> Any:
+    """Return a block without exactly singular factors: SuperLU, given those, writes to stderr, and may crash the process.
+
+    A strictly diagonally dominant block is regular and stays as it is. Of others the diagonal grows by a share of each row's largest entry,
+    another one in each row, so that no two rows become alike.
+
+    Args:
+        block: square, in compressed columns.
+        share: of a row's largest entry.
+        small: the share where the diagonal entry itself is less than that: incomplete factors drop smaller ones.
+    """
+    magnitude, diagonal = abs(block), block.diagonal()
+    off = np.asarray(magnitude.sum(axis=1)).ravel() - np.abs(diagonal)
+    if (np.abs(diagonal) > (1 + 1e-12) * off).all():
+        return block
+    largest = magnitude.max(axis=1).toarray().ravel()
+    largest = np.where(largest > 0, largest, 1.0)
+    shares = np.where(np.abs(diagonal) <= small * largest, max(share, small), share) * (1 + np.arange(len(off)) * GOLDEN % 1)
+    return (block + scipy.sparse.diags_array(np.where(diagonal < 0, -1.0, 1.0) * shares * largest)).tocsc()

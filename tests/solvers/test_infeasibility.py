@@ -1,0 +1,151 @@
+"""INFEASIBLE is a proof: drawn problems with a planted solution, with a planted proof that there is none, and singular Laplacians."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import warp_lcp as wl
+from warp_lcp.solvers.dense_problem import DenseProblem, certifies, inconsistent
+
+NONE = wl.SolveStatus.INFEASIBLE
+
+
+def units(rng, n):
+    """Return scales of rows and columns over 12 decades, or 1."""
+    D = 10 ** rng.uniform(-6, 6, n) if rng.random() < 0.5 else np.ones(n)
+    return D, 10 ** rng.uniform(-6, 6, n) if rng.random() < 0.3 else D
+
+
+def planted_solution(seed):
+    """Return A, b, l, u with b = y - A x for a solution x, y; A is positive semi-definite, of low rank, and perhaps reducible."""
+    rng = np.random.default_rng([5, seed])
+    n = int(rng.integers(1, 30))
+    F, K = rng.standard_normal((n, int(rng.integers(0, n + 1)))), rng.standard_normal((n, n))
+    A = F @ F.T + (rng.random() < 0.3) * (K - K.T)
+    if rng.random() < 0.3:
+        k = int(rng.integers(0, n))
+        A[:k, k:] = A[k:, :k] = 0
+    below, above = rng.random((2, n)) < 0.5
+    lower, upper = np.where(below, -rng.random(n) * rng.integers(0, 2), -np.inf), np.where(above, rng.random(n) * rng.integers(1, 3), np.inf)
+    x = np.clip(rng.standard_normal(n) * 10 ** rng.uniform(0, 6 if rng.random() < 0.3 else 0), lower, upper)
+    low = below & (rng.random(n) < 0.5)
+    high = above & ~low & (rng.random(n) < 0.5)
+    x = np.where(low, lower, np.where(high, upper, x))
+    return A, np.where(low, rng.random(n), np.where(high, -rng.random(n), 0.0)) - A @ x, lower, upper
+
+
+def planted_proof(seed):
+    """Return A, b, l, u without a solution: z, of signs that the bounds ask for, has b'z + max g'x < 0, g = A'z; None where z = 0."""
+    A, b, lower, upper = planted_solution(seed)
+    rng, n = np.random.default_rng([6, seed]), len(b)
+    below, above = np.isfinite(lower), np.isfinite(upper)
+    sign = np.where(below & above, 0, np.where(below, 1, np.where(above, -1, rng.choice([-1, 1], n))))
+    z = sign * rng.integers(0, 2, n) * rng.integers(1, 5, n)
+    if not z.any():
+        return None
+    g, drawn = A.T @ z, rng.random(n) * rng.integers(0, 2, n)
+    A = A - np.outer(z, g - np.where(below & above, g, np.where(below, -drawn, np.where(above, drawn, 0.0)))) / (z @ z)
+    g = A.T @ z
+    gains = np.where(g > 0, np.where(above, upper, 0.0) * g, np.where(below, lower, 0.0) * g).sum()
+    return A, b - z * (b @ z + gains + 0.01 * (np.abs(b) @ np.abs(z) + abs(gains) + 1)) / (z @ z), lower, upper
+
+
+def in_units(drawn, seed, sparse=False):
+    A, b, lower, upper = drawn
+    R, C = units(np.random.default_rng([7, seed]), len(b))
+    matrix = R[:, None] * A * C
+    return DenseProblem(np.arange(len(b)), scipy.sparse.csr_array(matrix) if sparse else matrix, R * b, lower / C, upper / C, False)
+
+
+def check(seeds):
+    proved = drawn = 0
+    for seed in seeds:
+        assert not inconsistent(in_units(planted_solution(seed), seed)), seed
+        other = planted_proof(seed)
+        if other is not None:
+            drawn, proved = drawn + 1, proved + inconsistent(in_units(other, seed, sparse=seed % 2 == 0))
+    assert proved >= 0.99 * drawn, (proved, drawn)
+
+
+def test_drawn_problems():
+    """No false proof, and nearly all proofs are found, in any units."""
+    check(range(60))
+
+
+@pytest.mark.slow
+def test_more_drawn_problems():
+    check(range(1000, 2000))
+
+
+@pytest.mark.parametrize(
+    ("A", "b", "lower", "upper", "none"),
+    [
+        ([[0.0, 0.0], [0.0, 1.0]], [-1.0, 1e16], 0.0, np.inf, True),  # y_1 = -1, whatever the large row says
+        ([[0.0, 0.0], [0.0, 1.0]], [1.0, -1e16], 0.0, np.inf, False),
+        ([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [-1.0, -1.0, 1e16], 0.0, np.inf, True),
+        ([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [-1.0, 1.0, -1e16], 0.0, np.inf, False),
+        ([[1.0, -1.0], [-1.0, 1.0]], [-1.0, 1.0 - 1e-15], 0.0, np.inf, False),  # rounding
+        ([[1e-17, 0.0], [0.0, 1.0]], [-1.0, -1.0], 0.0, np.inf, False),  # x = (1e17, 1)
+        ([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0], -np.inf, 0.0, True),
+        ([[1.0, -1.0], [-1.0, 1.0]], [-1.0, -1.0], -np.inf, 0.0, False),
+        ([[-1.0]], [-1.0], 0.0, np.inf, True),  # y = -x - 1
+        ([[0.0, 1.0], [0.0, 0.0]], [-3.0, 1.0], [0.0, 0.0], [np.inf, 2.0], True),  # y_1 = x_2 - 3 <= -1
+        ([[0.0, 1.0], [0.0, 0.0]], [-1.0, 1.0], [0.0, 0.0], [np.inf, 2.0], False),
+    ],
+)
+def test_small_cases(A, b, lower, upper, none):
+    n = len(b)
+    bounds = (np.broadcast_to(np.asarray(side, dtype=float), (n,)) for side in (lower, upper))
+    assert inconsistent(DenseProblem(np.arange(n), np.array(A), np.array(b), *bounds, False)) is none
+
+
+def test_multipliers_of_a_wrong_sign_prove_nothing():
+    A, b = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0])
+    lower, upper = np.zeros(2), np.full(2, np.inf)
+    data = DenseProblem(np.arange(2), A, b, lower, upper)
+    assert not certifies(data, -np.ones(2)) and not certifies(data, np.ones(2))
+    assert certifies(DenseProblem(np.arange(2), A, -b, lower, upper), np.ones(2))
+    assert certifies(DenseProblem(np.arange(2), A, b, -upper, -lower), -np.ones(2))
+
+
+def ring(n, face=None):
+    """Return the matrix of a periodic chain with coefficients between i and i + 1."""
+    face, here = np.ones(n) if face is None else face, np.arange(n)
+    off = scipy.sparse.csr_array((face, (here, np.roll(here, -1))), shape=(n, n))
+    return scipy.sparse.csr_array(scipy.sparse.diags_array(face + np.roll(face, 1)) - off - off.T)
+
+
+def reynolds(n, eccentricity):
+    """Return A, b of a journal bearing's film: b sums to 0 but for rounding, and a full film plus a constant is a solution."""
+    h = 1 + eccentricity * np.cos(2 * np.pi * np.arange(n) / n)
+    b = np.roll(h, -1) - np.roll(h, 1)
+    return ring(n, ((h + np.roll(h, -1)) / 2) ** 3), b - b.mean()
+
+
+@pytest.mark.parametrize("method", [None, wl.InteriorPoint()], ids=["default", "interior point"])
+@pytest.mark.parametrize(("n", "eccentricity"), [(360, 0.999), (90, 0.99), (200, 0.9)])
+def test_a_full_film(n, eccentricity, method):
+    A, b = reynolds(n, eccentricity)
+    result = wl.solve(wl.LCP(A, b), method)
+    x = result.x.numpy()
+    assert result and (x >= 0).all(), result.status
+    assert np.linalg.norm(np.minimum(x, (A @ x + b) / A.diagonal())) <= 1e-5 * np.linalg.norm(b / A.diagonal())
+
+
+@pytest.mark.parametrize("dense", [False, True])
+@pytest.mark.parametrize("lower", [0.0, -np.inf])
+@pytest.mark.parametrize("method", [None, wl.InteriorPoint()], ids=["default", "interior point"])
+def test_a_ring(method, lower, dense):
+    n = 240 if dense else 720
+    A, b = ring(n), np.sin(2 * np.pi * np.arange(n) / n)
+    A = A.toarray() if dense else A
+    assert wl.solve(wl.LCP(A, b, lower), method)
+    less = np.full(n, 0.1) if np.isneginf(lower) else np.full(n, -0.1)
+    assert wl.solve(wl.LCP(A, b + less, lower), method).status is NONE
+
+
+def test_an_empty_row_stays():
+    """Any x_2 is a solution: the central path once led it to 1e23."""
+    A = scipy.sparse.csr_array(np.array([[2.0, 0.0, -1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 2.0]]))
+    result = wl.solve(wl.LCP(A, np.array([-1.0, 0.0, 1.0])), wl.InteriorPoint())
+    assert result and abs(result.x.numpy()[1]) <= 1.0
