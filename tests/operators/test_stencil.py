@@ -12,7 +12,6 @@ import warp_lcp as wl
 from drawn_stencils import KINDS, border_sums, drawn, rising, rising_in_space
 from warp_lcp.operators.grid_matrix import grid_matrix
 
-
 NINE = np.array([[-1.0, -4.0, -1.0], [-4.0, 20.0, -4.0], [-1.0, -4.0, -1.0]]) / 6
 
 

@@ -151,7 +151,6 @@ class Stencil(GridOperator):
 
     def transposed(self) -> Stencil:
         """Return A' as a stencil of arrays, without SOLID cells: its diagonal has what closed sides add."""
-        counts = self.layout.padding.counts
         fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
         found: dict[tuple[int, ...], Any] = {(0,) * len(self.shape): np.where(fluid.reshape(self.shape), self.diagonal().numpy(), 1.0)}
         for offset, here in self._full().items():
