@@ -17,7 +17,7 @@ import warp as wp
 from warp_lcp.gradients.names import flat
 from warp_lcp.operators import SparseOperator, Stencil
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasBlocks, HasCoefficients, HasRows, HasStencil, NamesComponents, Operator, has, layout_of, version_of
+from warp_lcp.problem.protocol import HasBlocks, HasCells, HasCoefficients, HasRows, HasStencil, NamesComponents, Operator, has, layout_of, version_of
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.stopping import StoppingCriteria
@@ -218,6 +218,7 @@ def _projected(A: Operator, g: wp.array[Any], cells: wp.array[Any]) -> wp.array[
     """Return g without its mean on the components on which A is singular and that are free as a whole."""
     floating = A.floating_components() if has(A, NamesComponents) else None
     if floating is not None:
+        floating = floating.transposed()
         g = wp.clone(g)
         floating.project(g, cells.view(wp.uint8))
     return g
@@ -241,6 +242,8 @@ class Transpose(Operator):
 
     def __init__(self, A: Operator) -> None:
         self._A, self.shape, self.dtype, self.device, self.layout = A, A.shape, A.dtype, A.device, layout_of(A)
+        if has(A, HasCells):  # ghost cells, which products fill along periodic axes, are no unknowns
+            self.cells = A.cells
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return A'x."""
