@@ -17,7 +17,18 @@ import warp as wp
 from warp_lcp.gradients.names import flat
 from warp_lcp.operators import SparseOperator, Stencil
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasBlocks, HasCells, HasCoefficients, HasRows, HasStencil, NamesComponents, Operator, has, layout_of, version_of
+from warp_lcp.problem.protocol import (
+    HasBlocks,
+    HasCells,
+    HasCoefficients,
+    HasRows,
+    HasStencil,
+    NamesComponents,
+    Operator,
+    has,
+    layout_of,
+    version_of,
+)
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.stopping import StoppingCriteria

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, no_type_check
+from typing import TYPE_CHECKING, Any, NamedTuple, no_type_check
 
 import numpy as np
+import scipy.sparse.csgraph
+import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.problem.protocol import FLUID
@@ -318,3 +320,65 @@ def _roots(parent: np.ndarray) -> np.ndarray:
     while not np.array_equal(roots, roots[roots]):
         roots = roots[roots]
     return roots
+
+
+def numbered_components(
+    number: np.ndarray, held: np.ndarray, device: wp.Device, *, left: np.ndarray | None = None, right: np.ndarray | None = None
+) -> FloatingComponents | None:
+    """Return those of numbered components that nothing holds, None if there are none.
+
+    Args:
+        number: of each stored cell, 0 where there is none.
+        held: of each number, 0 included, whether something does.
+        device: where fields live.
+        left: as of `FloatingComponents`.
+        right: likewise.
+    """
+    held[0] = True
+    if held.all():
+        return None
+    names = np.where(held, -1, np.cumsum(~held) - 1).astype(np.int32)
+    return FloatingComponents(names[number], device, left=left, right=right)
+
+
+class NullVectors(NamedTuple):
+    """Connected components of a matrix: the number of each row, which are not known to be singular, and w'A = 0, A v = 0 on the others."""
+
+    number: np.ndarray
+    held: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+
+
+def null_vectors(matrix: scipy.sparse.csr_array, rows: np.ndarray, columns: np.ndarray, *, most: int) -> NullVectors:
+    """Find null vectors of components of a matrix whose rows or columns sum to 0.
+
+    Where both do, they are the constants. Where one does, the other vector is computed if the component is an irreducible M-matrix, for
+    then it is unique and positive (Berman & Plemmons 1994, theorem 6.4.16).
+
+    Args:
+        matrix: of which rows and columns are known to sum to 0:
+        rows: bool, one for each.
+        columns: likewise.
+        most: unknowns of a component for which a vector is computed; 0 where off-diagonal entries may be positive.
+    """
+    count, number = scipy.sparse.csgraph.connected_components(matrix, directed=False)
+    of_rows, of_columns = (np.bincount(number, ~vanish, count) == 0 for vanish in (rows, columns))
+    held, left, right = ~(of_rows & of_columns), np.ones(len(number)), np.ones(len(number))
+    for c in np.flatnonzero(of_rows != of_columns) if most else ():
+        places = np.flatnonzero(number == c)
+        block = matrix[places][:, places]
+        if len(places) <= most and scipy.sparse.csgraph.connected_components(block, connection="strong")[0] == 1:
+            vector = _null_vector(block.T if of_rows[c] else block)
+            (left if of_rows[c] else right)[places], held[c] = vector, not (vector > 0).all()
+    return NullVectors(number, held, left, right)
+
+
+def _null_vector(block: scipy.sparse.csr_array) -> np.ndarray:
+    """Return v with A v = 0 and a mean of 1, of an irreducible M-matrix whose columns sum to 0: one entry is given, the others follow."""
+    away = scipy.sparse.csc_array(block - scipy.sparse.diags_array(block.diagonal()))
+    exact = (away - scipy.sparse.diags_array(np.asarray(away.sum(axis=0)).ravel())).tocsc()
+    v = np.ones(block.shape[0])
+    if len(v) > 1:
+        v[1:] = scipy.sparse.linalg.splu(exact[1:, 1:].tocsc()).solve(-exact[1:, [0]].toarray().ravel())
+    return v / v.mean()

@@ -13,7 +13,8 @@ import numpy as np
 import scipy.ndimage
 import warp as wp
 
-from warp_lcp.operators.components import FloatingComponents
+from warp_lcp.operators.components import FloatingComponents, null_vectors, numbered_components
+from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
@@ -33,6 +34,7 @@ GRADIENT = RowPass(
     "stencil.gradient", HEADERS / "stencil_gradient.h", wp.float64, reads={"cells": wp.int8, "multiplier": wp.float64, "x": wp.float64},
     writes={"part": wp.float64}, optional=("part",), numbers=dict.fromkeys(("step", "row", "plane"), int), sums=("sum",),
 )  # fmt: skip
+MOST_IN_PLANE, MOST_IN_SPACE = 1 << 17, 1 << 14  # unknowns of a component whose null vectors are had by sparse factors, in a second or two
 CENTER = (0, 0, 0)
 AROUND = Pattern(tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y), symmetric=False, kind="arrays")  # all neighbors in 2-D
 Offset = tuple[int, int, int]  # along x, y, z
@@ -295,25 +297,42 @@ class Stencil(GridOperator):
         return found
 
     def _find_floating(self) -> FloatingComponents | None:
-        """Look for components that no row's sum holds, of a symmetric A: on the host, for all that is needed are sums of rows."""
-        if not self.symmetric or any(self.periodic):
+        """Look for components on which all rows sum to 0, or all columns: on the host."""
+        fluid = (self.cells.numpy() == FLUID) & (self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0)
+        inside = fluid.ravel()
+        rows = self._sums_vanish(inside, transposed=False)
+        columns = rows if self.symmetric else self._sums_vanish(inside, transposed=True)
+        if not (rows[inside].any() or columns[inside].any()):
             return None
-        ones = self.layout.load(np.ones(self.shape), wp.float64).numpy()
-        inside = (self.cells.numpy() == FLUID) & (self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0)
-        x, sums = wp.array(np.where(inside.ravel(), ones, 0), dtype=wp.float64, device=self.device), self.layout.zeros(wp.float64)
-        self.stencil.product(x, sums)
+        places = np.flatnonzero(inside)
+        if self.symmetric and not any(self.periodic) and all((w.numpy()[places] != 0).all() for w in self.stencil.weights or ()):
+            structure = np.zeros((3, 3, 3), dtype=bool)  # of all neighbors that are coupled
+            for offset in (o for kept in self._pattern.offsets for o in (kept, CENTER, _opposite(kept))):
+                structure[tuple(step + 1 for step in offset[::-1])] = True
+            number, count = scipy.ndimage.label(fluid, structure)
+            number = number.ravel()
+            return numbered_components(number, np.bincount(number, inside & ~rows, count + 1) > 0, self.device)
+        matrix = grid_matrix(self)
+        if len(places) < matrix.shape[0]:  # a principal system
+            kept = inside[self.cells.numpy().ravel() == FLUID]
+            matrix = matrix[kept][:, kept]
+        most = MOST_IN_SPACE if self.layout.padding.counts[0] > 1 else MOST_IN_PLANE
+        found = null_vectors(matrix, rows[places], columns[places], most=most if self.monotone else 0)
+        number, fields = np.zeros(inside.size, dtype=np.int32), [np.ones(inside.size) for _ in range(2)]
+        number[places] = found.number + 1
+        for field, vector in zip(fields, (found.left, found.right), strict=True):
+            field[places] = vector
+        left, right = (None if (field == 1).all() else field for field in fields)
+        return numbered_components(number, np.r_[True, found.held], self.device, left=left, right=right)
+
+    def _sums_vanish(self, inside: np.ndarray, *, transposed: bool) -> np.ndarray:
+        """Return which rows, or columns, of a flat stored field sum to 0 but for rounding."""
+        x, sums = wp.array(np.where(inside, 1.0, 0.0), dtype=wp.float64, device=self.device), self.layout.zeros(wp.float64)
+        self._product(x, sums, transposed=transposed)
         rounding = 8 * float(np.finfo(wp.dtype_to_numpy(self.dtype)).eps)
-        held = (np.abs(sums.numpy()) > rounding * self.stencil.d.numpy()).reshape(inside.shape)
-        if not (inside & ~held).any():
-            return None
-        number, count = scipy.ndimage.label(inside, np.ones((3, 3, 3)))
-        holding = np.zeros(count + 1, dtype=bool)
-        holding[np.unique(number[held & inside])] = True
-        holding[0] = True
-        if holding.all():
-            return None
-        names = np.where(holding, -1, np.cumsum(~holding) - 1).astype(np.int32)
-        return FloatingComponents(names[number].ravel(), self.device)
+        center = np.abs(self._number) if self._center is None else np.abs(self._center.numpy())
+        size = np.maximum(self.stencil.d.numpy(), center)  # closed sides cancel some of it
+        return inside & (np.abs(sums.numpy()) <= rounding * size)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle cells and coefficients; those that are Warp functions as arrays."""
