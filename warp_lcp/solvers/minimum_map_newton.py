@@ -21,7 +21,7 @@ from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.phases import CoarseProblem, CoarseStencilProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
+from warp_lcp.solvers.phases import AlgebraicSteps, CoarseProblem, CoarseStencilProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
 from warp_lcp.solvers.principal_system import (
     CLASSIFY,
     ON_FREE,
@@ -110,7 +110,7 @@ class NewtonWorkspace(IterateMemory):
     """
 
     last_resort = True
-    resort: InteriorSteps | ProximalPoint | None = None
+    resort: AlgebraicSteps | InteriorSteps | ProximalPoint | None = None
     descends = False
     gradients: GradientPhase | None = None
 
@@ -288,13 +288,15 @@ class NewtonWorkspace(IterateMemory):
         return self._waited >= STALLED
 
     def _may_resort(self) -> bool:
-        """Return whether the proximal-point iteration can be had, and the residual is above what rounding leaves."""
+        """Return whether another iteration can be had, and the residual is above what rounding leaves."""
         floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
-        return self.last_resort and self.residual.norm > floor and ProximalPoint.suits(self.problem)
+        return self.last_resort and self.residual.norm > floor and (ProximalPoint.suits(self.problem) or AlgebraicSteps.suits(self.problem))
 
     def _resort(self, x: wp.array[Any]) -> Step:
         """Take a step of the last resort."""
-        if self.resort is None:
+        if self.resort is None and AlgebraicSteps.suits(self.problem):
+            self.resort = AlgebraicSteps(self.problem, self.problem.A, x, self.target)  # type: ignore[arg-type]
+        elif self.resort is None:
             made = ProximalPoint if self.problem.A.symmetric else InteriorSteps
             self.resort = made(self.problem, self.residual, self.target)
         step = self.resort.step(x)

@@ -161,6 +161,11 @@ class AlgebraicSteps:
         self._inner = Inner(MinimumMapNewton(precision="double"), LCP(matrix, b, lower, upper))
         self._inner.begin(start, tolerance, warm=False)
 
+    @staticmethod
+    def suits(problem: LCP) -> bool:
+        """Return whether A is a grid's, all of it in this process."""
+        return has(problem.A, HasStencil) and problem.A.stencil.ghosts is None
+
     def step(self, x: wp.array[Any]) -> Step:
         """Take a step, and write the iterate to x."""
         done, stored = self._inner.step(), x.numpy()
