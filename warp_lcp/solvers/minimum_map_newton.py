@@ -39,6 +39,7 @@ LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projec
 # many. With 4, 8, 16 and 32 cycles a membrane on 600,000 nodes takes 16, 15, 12 and 6 Newton steps, 7.0, 5.4, 4.8 and 4.4 s
 HUGE = 1 << 16
 WEAK = 30  # iterations of a linear solve that say that its preconditioner is weak
+RISEN = 10.0  # growth of the residual by which a projected cycle on a matrix that is not symmetric is undone
 STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
@@ -163,9 +164,15 @@ class NewtonWorkspace(IterateMemory):
             self._round(x)
             return Step("monotone cycle", 1, None)
         assert isinstance(system, GridSystem)
+        before = residual.norm
+        if not p.A.symmetric:
+            wp.copy(self.trial, x)
         projected_cycle(p, system, x, residual.y, residual.norm, self.free, self._sums, restrict=self.stale)
         self.stale = True  # the next Newton step takes cells out again
-        self._correct(x, system.z, residual.norm, x)
+        self._correct(x, system.z, before, x)
+        if not p.A.symmetric and not residual.evaluate(x) <= RISEN * before:  # no energy falls there
+            wp.copy(x, self.trial)
+            self.cycles_left, residual.current = 0, False
         if self.cycles_left > 0:
             self.stale = False
         return Step("monotone cycle", 1, None)
