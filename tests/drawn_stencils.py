@@ -157,3 +157,79 @@ def drawn(seed, kind=None, *, thin=True):
             given[offset], plain[offset] = FUNCTIONS[n][pick : pick + 2]
     shift = rng.random(shape) if rng.random() < 0.5 else None
     return DrawnStencil(cells, given, plain, shift, periodic, int(rng.choice([wl.AIR, wl.SOLID])))
+
+
+def beside(values, offset, periodic):
+    """What each cell's neighbor has, 0 beyond the array."""
+    moved = np.roll(values, tuple(-s for s in offset), tuple(range(values.ndim)))
+    for axis, step in enumerate(offset):
+        if step and not periodic[values.ndim - 1 - axis]:
+            np.moveaxis(moved, axis, 0)[-1 if step > 0 else 0] = 0
+    return moved
+
+
+def drawn_offsets(dimension, rng):
+    """All neighbors, or those across faces."""
+    offsets = [o for o in itertools.product((-1, 0, 1), repeat=dimension) if any(o)]
+    return offsets if rng.random() < 0.5 else [o for o in offsets if sum(map(abs, o)) == 1]
+
+
+SINGULAR = ("symmetric", "numbers", "rows", "columns", "circulant")  # what sums to 0; of the last one both, without symmetry
+
+
+def drawn_singular(seed, kind):
+    """A stencil between closed sides and periodic ones, whose rows or columns sum to 0."""
+    rng = np.random.default_rng([seed, 21])
+    shape = (16 + seed % 3, 16) if rng.random() < 0.7 else (6, 7, 6)
+    n, decades = len(shape), int(rng.integers(3))
+    periodic = [(False,) * 3, (True, False, False), (False, True, False), (True,) * 3][int(rng.integers(4))]
+    periodic = (True,) * 3 if kind == "circulant" else periodic
+    offsets, cells = drawn_offsets(n, rng), np.ones(shape, dtype=int)
+    if rng.random() < 0.5 and kind in ("symmetric", "numbers", "rows"):
+        fluid = rng.random(shape) > 0.15
+        cells = np.where(fluid & (sum(beside(fluid.astype(int), o, periodic) for o in offsets) > 0), wl.FLUID, wl.SOLID)
+    given: dict[tuple[int, ...], Any] = {}
+    for o in offsets:
+        opposite = tuple(-s for s in o)
+        if kind in ("numbers", "circulant"):
+            given[o] = given[opposite] if kind == "numbers" and opposite in given else -rng.uniform(0.2, 1)
+        else:
+            given[o] = -(10 ** rng.uniform(-decades, 0, shape))
+            if kind == "symmetric" and opposite in given:
+                given[o] = beside(given[opposite], o, periodic)
+            elif kind == "columns":
+                given[o] = given[o] * beside(np.ones(shape), o, periodic)
+    across = [beside(given[tuple(-s for s in o)], o, periodic) if kind == "columns" else given[o] for o in offsets]
+    given[(0,) * n] = -sum(across)
+    return DrawnStencil(cells, given, given, None, periodic, wl.SOLID)
+
+
+def drawn_dominant(seed, side=40, side_in_space=10):
+    """An M-matrix that need not be symmetric: random coefficients, winds or anisotropy over up to four decades; and its data."""
+    rng = np.random.default_rng([seed, 31])
+    shape = (side_in_space, side_in_space, side_in_space + 3) if seed % 3 == 2 else (side, side + 7)
+    n, decades, form = len(shape), int(rng.integers(0, 5)), rng.choice(["random", "wind", "anisotropic"])
+    periodic = [(False,) * 3, (False,) * 3, (True, False, False), (True,) * 3][int(rng.integers(4))]
+    offsets = drawn_offsets(n, rng)
+    cells = np.ones(shape, dtype=int) if rng.random() < 0.6 else rng.choice([wl.AIR, *[wl.FLUID] * 4, wl.SOLID], shape)
+    wind, strength = rng.standard_normal(n) * 10 ** rng.uniform(0, decades), 10 ** rng.uniform(-decades, 0, n)
+    turning = np.sin(3 * (np.indices(shape) / max(shape)).sum(0) + rng.uniform(0, 6))
+    given: dict[tuple[int, ...], Any] = {}
+    for o in offsets:
+        if form == "random":
+            given[o] = -(10 ** rng.uniform(-decades, 0, shape))
+        elif form == "wind":
+            given[o] = -(1 + np.maximum(0, -sum(o[a] * wind[a] * (turning if a % 2 else np.ones(shape)) for a in range(n))))
+        else:
+            given[o] = -np.prod([strength[a] for a in range(n) if o[a]]) * rng.uniform(0.5, 1, shape)
+    given[(0,) * n] = -(1 + 10.0 ** rng.integers(-5, 0)) * sum(given.values())
+    bounded = rng.random() < 0.5
+    upper = float(10 ** rng.uniform(-2, 0)) if bounded and rng.random() < 0.3 else np.inf
+    b = rng.standard_normal(shape) * (cells == wl.FLUID)
+    return DrawnStencil(cells, given, given, None, periodic, int(rng.choice([wl.AIR, wl.SOLID]))), b, 0.0 if bounded else -np.inf, upper
+
+
+def natural_residual(matrix, diagonal, x, b, lower, upper):
+    """||d (x - clip(x - (A x + b)/d, l, u))||."""
+    y = matrix @ x + b
+    return float(np.linalg.norm(diagonal * (x - np.clip(x - y / diagonal, lower, upper))))

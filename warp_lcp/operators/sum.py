@@ -158,7 +158,7 @@ def grid_and_low_rank(A: Any) -> tuple[HasStencil, LowRankOperator] | None:
 
 
 def _felt(label: np.ndarray, count: int, low: LowRankOperator, *, weighted: bool) -> np.ndarray:
-    """Return for each component whether a column's sum over it is more than what rounding leaves; of weighted ones, whether there is any."""
+    """Return for each component whether a column's sum over it is more than what rounding leaves; of weighted ones, if any."""
     rows, blocks, values = low.columns.entries()
     at, k = label[rows], low.columns.width
     found = np.zeros((2, count, low.rank))

@@ -21,7 +21,16 @@ from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.phases import AlgebraicSteps, CoarseProblem, CoarseStencilProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
+from warp_lcp.solvers.phases import (
+    AlgebraicSteps,
+    CoarseProblem,
+    CoarseStencilProblem,
+    GradientPhase,
+    InteriorSteps,
+    Pace,
+    ProximalPoint,
+    projected_cycle,
+)
 from warp_lcp.solvers.principal_system import (
     CLASSIFY,
     ON_FREE,
@@ -147,6 +156,7 @@ class NewtonWorkspace(IterateMemory):
         self.norms: list[float] = []
         self.target = tolerance
         self.resort, self._smallest, self._waited = None, math.inf, 0
+        self._pace = Pace(tolerance) if AlgebraicSteps.suits(self.problem) else None
         self.system.refresh()
 
     def step(self, x: wp.array[Any]) -> Step:
@@ -288,8 +298,12 @@ class NewtonWorkspace(IterateMemory):
         return Step("regularized", iterations, active, None if descended else SolveStatus.NON_DESCENT)
 
     def _stalls(self) -> bool:
-        """Return whether no residual of the last steps is below all those before."""
+        """Return whether no residual of the last steps is below all those before, or on a grid they fall too slowly."""
         norm = self.residual.norm
+        if self._pace is not None:
+            self._pace.record(norm)
+            if self._pace.crawls:
+                return True
         self._waited = 0 if norm <= 0.999 * self._smallest else self._waited + 1
         self._smallest = min(self._smallest, norm)
         return self._waited >= STALLED

@@ -482,4 +482,5 @@ class CoarseStencilProblem(CoarseProblem):
         A = StoredStencil(cells, stored, weights, AROUND, symmetric=self._A.symmetric)
         b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
         self._work = self._settings.init(LCP(A, b.reshape(A.layout.stored_shape), lower, upper))
+        self._work.last_resort = False  # a rough correction is not worth it
         return True

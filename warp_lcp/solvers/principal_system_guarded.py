@@ -1,10 +1,11 @@
-"""Systems of grid operators whose geometric cycles may fail: algebraic multigrid, then incomplete factors, of the matrix take over."""
+"""Systems of grid operators whose geometric cycles may fail: algebraic multigrid, then factors, of the matrix take over."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.krylov.gmres import GMRES
@@ -17,6 +18,10 @@ from warp_lcp.solvers.principal_system_sparse import IncompleteFactors, SparseSy
 
 REDUCED = 1e-2  # of a right-hand side: what any preconditioner worth its name comes to, whatever rounding leaves
 ENOUGH = 60  # iterations by which it should
+
+
+FACTORED_IN_PLANE, FACTORED_IN_SPACE = 1 << 17, 1 << 14  # unknowns up to which factors are complete: a second or two
+RAISED = 1e-13  # share by which diagonals are raised then
 
 
 class GuardedSystem(KrylovSystem):
@@ -68,6 +73,7 @@ class MatrixSystem:
 
     def __init__(self, A: HasStencil, *, shifted: bool) -> None:
         self._rows = np.flatnonzero(A.cells.numpy().ravel() == FLUID)
+        self._most = FACTORED_IN_SPACE if A.stencil.padding.counts[0] > 1 else FACTORED_IN_PLANE
         self._operator, self._shifted = SparseOperator(grid_matrix(A), device=A.device, dtype=wp.float64), shifted
         self._system: KrylovSystem = SparseSystem(self._operator, wp.float64, shifted=shifted)
         self._preconditioner: Any = self._system.preconditioner  # type: ignore[attr-defined]
@@ -80,11 +86,12 @@ class MatrixSystem:
         self._preconditioner.restrict(self._free, self._shift)
 
     def solve(self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Solve for e, by incomplete factors from the first failure on; fields of the grid."""
+        """Solve for e, by factors from the first failure on; fields of the grid."""
         right = r.numpy()[self._rows].astype(np.float64)
         iterations, norm = self._solve(right, tolerance, max_iterations)
         if not norm <= max(tolerance, REDUCED * self._start) and not isinstance(self._preconditioner, IncompleteFactors):
-            self._preconditioner = IncompleteFactors(self._operator, wp.float64)
+            made = _CompleteFactors if len(self._rows) <= self._most else IncompleteFactors
+            self._preconditioner = made(self._operator, wp.float64)
             self._preconditioner.restrict(self._free, self._shift)
             self._system = _Factored(self._preconditioner, weighted=self._shifted)
             more, norm = self._solve(right, tolerance, max_iterations)
@@ -100,8 +107,18 @@ class MatrixSystem:
         return self._system.solve(tolerance, max_iterations)
 
 
+class _CompleteFactors(IncompleteFactors):
+    """Complete factors of matrices that others fail on; of slightly raised diagonals, for a component may be singular."""
+
+    def _factor(self, block: Any) -> Any:
+        try:
+            return scipy.sparse.linalg.splu((block + RAISED * scipy.sparse.diags_array(np.abs(block.diagonal()))).tocsc()).solve
+        except RuntimeError:
+            return super()._factor(block)
+
+
 class _Factored(KrylovSystem):
-    """GMRES with incomplete factors."""
+    """GMRES with factors."""
 
     def __init__(self, factors: IncompleteFactors, *, weighted: bool) -> None:
         weight = factors.weight if weighted else None
