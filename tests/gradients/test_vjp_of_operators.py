@@ -6,7 +6,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from drawn_stencils import KINDS, drawn, neighbor
+from drawn_stencils import KINDS, drawn, drawn_singular, neighbor
 from warp_lcp.operators.grid_matrix import grid_matrix
 
 F64 = {"device": "cpu", "dtype": wp.float64}
@@ -91,8 +91,6 @@ def test_more_gradients_are_those_of_the_matrix(kind, seed):
 @pytest.mark.parametrize("kind", ["rows", "columns", "circulant"])
 def test_gradients_of_singular_stencils_are_those_of_the_pseudo_inverse(kind):
     """With g compatible, mu is defined but for a left null vector, which neither b nor a step of x sees."""
-    from drawn_stencils import drawn_singular
-
     stencil = drawn_singular(18, kind)
     A, inside, rng = stencil.operator(), stencil.inside, np.random.default_rng(19)
     M = grid_matrix(A).toarray()
