@@ -1,101 +1,112 @@
 """`wl.Stencil` against matrices that NumPy assembles cell by cell."""
 
 import copy
-import itertools
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import warp as wp
 
 import warp_lcp as wl
+from drawn_stencils import KINDS, border_sums, drawn, rising, rising_in_space
 from warp_lcp.operators.grid_matrix import grid_matrix
 
-
-@wp.func
-def rising(j: int, i: int):
-    return 40.0 + float(i) * 0.5 + float(j)
-
-
-@wp.func
-def falling(j: int, i: int):
-    return -1.0 - float(j) * 0.25
-
-
-@wp.func
-def rising_in_space(k: int, j: int, i: int):
-    return 80.0 + float(i) * 0.5 + float(k)
-
-
-@wp.func
-def falling_in_space(k: int, j: int, i: int):
-    return -1.0 - float(j) * 0.25 - float(k)
-
-
-FUNCTIONS = {
-    2: (rising, lambda j, i: 40 + 0.5 * i + j, falling, lambda j, i: -1 - 0.25 * j),
-    3: (rising_in_space, lambda k, j, i: 80 + 0.5 * i + k, falling_in_space, lambda k, j, i: -1 - 0.25 * j - k),
-}
 NINE = np.array([[-1.0, -4.0, -1.0], [-4.0, 20.0, -4.0], [-1.0, -4.0, -1.0]]) / 6
 
 
-def assembled(cells, coefficients, shift, periodic, outside):
-    """The matrix on the FLUID cells, row by row from the definition."""
-    n, number = cells.ndim, {tuple(c): q for q, c in enumerate(np.argwhere(cells == wl.FLUID))}
-    A = np.zeros((len(number), len(number)))
-    for cell, q in number.items():
-        for offset, a in coefficients.items():
-            value = a(*cell) if callable(a) else np.broadcast_to(a, cells.shape)[cell]
-            there, kind = list(np.add(cell, offset)), None
-            for axis in range(n):
-                if not 0 <= there[axis] < cells.shape[axis]:
-                    there[axis], kind = (there[axis] % cells.shape[axis], kind) if periodic[n - 1 - axis] else (0, outside)
-            kind = cells[tuple(there)] if kind is None else kind
-            if kind == wl.FLUID:
-                A[q, number[tuple(there)]] += value
-            elif kind == wl.SOLID:
-                A[q, q] += value
-        A[q, q] += 0 if shift is None else shift[cell]
-    return A
+def changed(A, cells):
+    """Let the operator take other cells."""
+    A.update(wp.array(np.pad(cells.reshape(A.layout.padding.counts), 1).astype(np.int8), device=A.device))
 
 
-def drawn(seed):
-    """Cells, coefficients as users give them and as NumPy evaluates them, shift, periodic axes, what lies outside."""
-    rng = np.random.default_rng(seed)
-    n, kind = int(rng.integers(2, 4)), rng.choice(["numbers", "arrays", "symmetric", "functions"])
-    shape = tuple(int(v) for v in rng.integers(3, 7, n))
-    cells = rng.choice([wl.AIR, wl.FLUID, wl.FLUID, wl.FLUID, wl.SOLID], shape)
-    cells.flat[0] = wl.FLUID
-    given = {(0,) * n: 60.0}
-    for offset in itertools.product((-1, 0, 1), repeat=n):
-        if offset != (0,) * n and rng.random() < 0.7:
-            given[offset] = -rng.random(shape if kind == "arrays" else ())
-    if kind == "symmetric":
-        given = {o: given.get(max(o, tuple(-s for s in o)), 0.0) for o in given}
-    plain = dict(given)
-    if kind == "functions":
-        for offset in list(given)[:3]:
-            pick = 0 if offset == (0,) * n else 2
-            given[offset], plain[offset] = FUNCTIONS[n][pick : pick + 2]
-    shift = rng.random(shape) if rng.random() < 0.5 else None
-    return cells, given, plain, shift, tuple(rng.random(3) < 0.3), int(rng.choice([wl.AIR, wl.SOLID]))
+def same(found, expected, kind):
+    """Compare with what functions of float32, or arrays of float64, allow."""
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=2e-5 if kind == "functions" else 1e-11)
 
 
-@pytest.mark.parametrize("seed", range(41, 65))
-def test_products_and_matrices_are_those_of_the_definition(seed, device):
-    cells, given, plain, shift, periodic, outside = drawn(seed)
-    A = wl.Stencil(cells, given, shift=shift, periodic=periodic, outside=outside, device=device, dtype=wp.float64)
-    expected, inside = assembled(cells, plain, shift, periodic, outside), cells == wl.FLUID
-    x = np.random.default_rng(seed).standard_normal(cells.shape)
+def check_definition(seed, kind, device):
+    """Compare all that a stencil computes with the definition, on other cells, too."""
+    stencil, rng = drawn([seed, 9], kind), np.random.default_rng(seed)
+    A, expected, inside = stencil.operator(device), stencil.matrix(), stencil.inside
+    x = rng.standard_normal(stencil.cells.shape)
     field = wp.array(x, dtype=wp.float64, device=device)
-    within = {"atol": 1e-5 if any(callable(a) for a in plain.values()) else 1e-12, "rtol": 0}  # functions compute in float32
-    np.testing.assert_allclose(A.apply(field).numpy()[inside], expected @ x[inside], **within)
-    np.testing.assert_allclose(A.apply_transpose(field).numpy()[inside], expected.T @ x[inside], **within)
-    np.testing.assert_allclose(A.diagonal().numpy()[inside], expected.diagonal(), **within)
-    np.testing.assert_allclose(grid_matrix(A).toarray(), expected, **within)
-    assert not A.symmetric or np.allclose(expected, expected.T, atol=1e-14)
-    around = [v(*np.argwhere(inside).T) if callable(v) else np.broadcast_to(v, cells.shape)[inside] for o, v in plain.items() if any(o)]
+    same(A.apply(field).numpy()[inside], expected @ x[inside], kind)
+    same(A.apply_transpose(field).numpy()[inside], expected.T @ x[inside], kind)
+    same(A.diagonal().numpy()[inside], expected.diagonal(), kind)
+    same(grid_matrix(A).toarray(), expected, kind)
+    same(grid_matrix(A.transposed()).toarray(), expected.T, kind)
+    same(grid_matrix(pickle.loads(pickle.dumps(A))).toarray(), expected, kind)
+    assert A.symmetric <= np.allclose(expected, expected.T, atol=1e-14)
+    assert A.symmetric or kind not in ("mirrored", "half mirrored")
+    around = [v(*np.argwhere(inside).T) if callable(v) else np.broadcast_to(v, x.shape)[inside] for o, v in stencil.plain.items() if any(o)]
     assert A.monotone == all((np.ravel(v) <= 0).all() for v in around)
+    padded = rng.standard_normal([n + 2 for n in x.shape])
+    same(A.boundary_term(padded).numpy(), border_sums(stencil, padded), kind)
+    cells = rng.choice([wl.AIR, wl.FLUID, wl.FLUID, wl.SOLID], x.shape)
+    cells.flat[0] = wl.FLUID
+    other = replace(stencil, cells=cells)
+    again, where = A.on_cells(np.pad(cells.reshape(A.layout.padding.counts), 1)), other.inside
+    changed(A, cells)
+    for B in (A, again):
+        same(grid_matrix(B).toarray(), other.matrix(), kind)
+        same(B.apply_transpose(field).numpy()[where], other.matrix().T @ x[where], kind)
+        assert B.symmetric <= np.allclose(other.matrix(), other.matrix().T, atol=1e-14)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(5200, 5205))
+def test_products_and_matrices_are_those_of_the_definition(seed, kind, device):
+    check_definition(seed, kind, device)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(5300, 5340))
+def test_more_products_and_matrices_are_those_of_the_definition(seed, kind, device):
+    check_definition(seed, kind, device)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", [5403, 5404])
+def test_solutions_are_those_of_the_matrix(seed, kind, device):
+    stencil = drawn([seed, 9], kind)
+    b = np.random.default_rng(seed).standard_normal(stencil.cells.shape)
+    result = wl.solve(wl.LCP(stencil.operator(device), b, -np.inf, np.inf), stopping=wl.StoppingCriteria(rtol=1e-10))
+    assert result
+    same(result.x.numpy()[stencil.inside], np.linalg.solve(stencil.matrix(), -b[stencil.inside]), kind)
+
+
+def test_sides_towards_solid_and_air_have_the_coefficients_given(device):
+    """Between the two cells the coefficients are one, so that A is symmetric; at the sides they are not."""
+    given = {(0, 0): np.full((1, 2), 20.0), (0, 1): np.array([[-1.0, -5.0]]), (0, -1): np.array([[-3.0, -1.0]])}
+    options = {"device": device, "dtype": wp.float64}
+    closed = wl.Stencil(np.ones((1, 2), dtype=int), given, **options)
+    assert closed.symmetric
+    np.testing.assert_array_equal(closed.diagonal().numpy(), [[17.0, 15.0]])
+    term = wl.Stencil(np.ones((1, 2), dtype=int), given, outside=wl.AIR, **options).boundary_term(
+        np.pad([[0.0, 0.0]], 1, constant_values=2.0)
+    )
+    np.testing.assert_array_equal(term.numpy(), [[-6.0, -10.0]])
+
+
+def test_a_periodic_axis_of_one_cell_is_beside_itself(device):
+    given = {(0, 0): 9.0, (1, 0): -1.0, (1, 1): -2.0, (0, 1): -3.0}
+    A = wl.Stencil(np.ones((1, 3), dtype=int), given, periodic=(False, True), outside=wl.AIR, device=device, dtype=wp.float64)
+    np.testing.assert_array_equal(grid_matrix(A).toarray(), [[8, -5, 0], [0, 8, -5], [0, 0, 8]])
+
+
+def test_other_cells_may_make_a_stencil_unsymmetric(device):
+    """A pair of cells with two coefficients, one of them SOLID at first."""
+    right, left = np.full((1, 3), -1.0), np.full((1, 3), -1.0)
+    right[0, 1] = -2.0
+    cells = np.array([[wl.FLUID, wl.FLUID, wl.SOLID]])
+    A = wl.Stencil(cells, {(0, 0): 6.0, (0, 1): right, (0, -1): left}, outside=wl.AIR, device=device, dtype=wp.float64)
+    assert A.symmetric
+    np.testing.assert_array_equal(grid_matrix(A).toarray(), [[6, -1], [-1, 4]])
+    changed(A, np.ones((1, 3), dtype=int))
+    assert not A.symmetric
+    np.testing.assert_array_equal(grid_matrix(A).toarray(), [[6, -1, 0], [-1, 6, -2], [0, -1, 6]])
 
 
 def test_the_five_point_stencil_is_grid_poisson(device):
@@ -146,8 +157,7 @@ def test_cells_change_in_place(device):
 
 
 def test_pickles_and_copies_are_the_same(device):
-    cells, given, _, shift, _, outside = drawn(53)
-    A = wl.Stencil(cells, given, shift=shift, outside=outside, device=device)
+    A = drawn([53, 9]).operator(device, wp.float32)
     for twin in (pickle.loads(pickle.dumps(A)), copy.deepcopy(A)):
         np.testing.assert_array_equal(grid_matrix(twin).toarray(), grid_matrix(A).toarray())
 

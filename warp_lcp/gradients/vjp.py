@@ -17,7 +17,18 @@ import warp as wp
 from warp_lcp.gradients.names import flat
 from warp_lcp.operators import SparseOperator, Stencil
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.protocol import HasBlocks, HasCoefficients, HasRows, HasStencil, NamesComponents, Operator, has, layout_of, version_of
+from warp_lcp.problem.protocol import (
+    HasBlocks,
+    HasCells,
+    HasCoefficients,
+    HasRows,
+    HasStencil,
+    NamesComponents,
+    Operator,
+    has,
+    layout_of,
+    version_of,
+)
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.stopping import StoppingCriteria
@@ -185,7 +196,7 @@ def _adjoint(problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stoppi
         return solve(LCP(np.ones((1, 1)), np.zeros(1), -np.inf)), layout.zeros(f64)
     if has(A, HasBlocks):
         block = _transposed(A).on_cells(cells.numpy())
-        right = _projected(block, g, cells)  # what it has in AIR does not count
+        right = _projected(_floating(block), g, cells)  # what it has in AIR does not count
         result = solve(LCP(block, right.reshape(layout.stored_shape), -np.inf, np.inf), stopping=stopping)
         return result, result.x.flatten()
     free = cells.numpy() == 1
@@ -197,7 +208,8 @@ def _adjoint(problem: LCP, cells: Any, g: Any, count: int, on_grid: bool, stoppi
         multiplier = np.zeros(layout.size)
         multiplier[free] = result.x.numpy()
         return result, wp.array(multiplier, dtype=f64, device=problem.device)
-    b = _projected(A, g, cells).numpy()
+    floating = _floating(A)
+    b = _projected(None if floating is None else floating.transposed(), g, cells).numpy()
     held = np.where(free, b, np.abs(b[free]).max() or 1.0).reshape(layout.stored_shape)  # not 0, or it would seem to be free
     sides = (np.where(free, side, 0.0).reshape(layout.stored_shape) for side in (-np.inf, np.inf))
     result = solve(LCP(_transposed(A), held, *sides), stopping=stopping)
@@ -214,9 +226,13 @@ def _gather(problem: LCP, multiplier: wp.array[Any], g: wp.array[Any], z: wp.arr
         ADD.bind(rows_of(z), z=g, x=z).launch()
 
 
-def _projected(A: Operator, g: wp.array[Any], cells: wp.array[Any]) -> wp.array[Any]:
-    """Return g without its mean on the components on which A is singular and that are free as a whole."""
-    floating = A.floating_components() if has(A, NamesComponents) else None
+def _floating(A: Operator) -> Any:
+    """Return the components on which an operator is singular, None if it knows of none."""
+    return A.floating_components() if has(A, NamesComponents) else None
+
+
+def _projected(floating: Any, g: wp.array[Any], cells: wp.array[Any]) -> wp.array[Any]:
+    """Return g without what A' cannot meet on its singular components that are free as a whole: its mean where those are the constants."""
     if floating is not None:
         g = wp.clone(g)
         floating.project(g, cells.view(wp.uint8))
@@ -241,6 +257,8 @@ class Transpose(Operator):
 
     def __init__(self, A: Operator) -> None:
         self._A, self.shape, self.dtype, self.device, self.layout = A, A.shape, A.dtype, A.device, layout_of(A)
+        if has(A, HasCells):  # ghost cells, which products fill along periodic axes, are no unknowns
+            self.cells = A.cells
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return A'x."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, no_type_check
+from typing import TYPE_CHECKING, Any, NamedTuple, no_type_check
 
 import numpy as np
+import scipy.sparse.csgraph
+import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.problem.protocol import FLUID
@@ -75,6 +77,7 @@ if TYPE_CHECKING:
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]
 HEADERS = Path(__file__).parent / "headers"
+ROUNDED = 1e-10  # of the terms of a sum whose weights were computed
 FACES, UNIFORM = dict.fromkeys(("face_x", "face_y", "face_z"), "F"), dict.fromkeys(("cx", "cy", "cz"), wp.float64)
 SINGLETONS = RowPass("components.singletons", HEADERS / "singletons.h", wp.float32, writes={"parent": wp.int32, "grounded": wp.uint8})
 UNITE = RowPass(
@@ -95,16 +98,23 @@ class FloatingComponents:
     """The floating components of an operator, numbered from 0, and what keeps a solve on them well posed.
 
     Summing y = A x + b over such a component leaves the sum of b: without bounds a solution exists only if that is 0, with lower bounds
-    alone only if it is >= 0, with upper bounds alone only if it is <= 0.
+    alone only if it is >= 0, with upper bounds alone only if it is <= 0. Where A is not symmetric, sums are weighted by w > 0 with
+    w'A = 0, and A v = 0 with v > 0 in place of the constants; both by components, on the host.
 
     Args:
         label: component of each stored cell, -1 where there is none.
         device: where fields live.
         across: who has other parts of the components; None: nobody.
+        left: w, a flat stored field; None: 1.
+        right: v, likewise.
     """
 
-    def __init__(self, label: np.ndarray, device: wp.Device, across: Across | None = None) -> None:
+    def __init__(
+        self, label: np.ndarray, device: wp.Device, across: Across | None = None, *, left: np.ndarray | None = None,
+        right: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         self.device, self.label, self._across = device, label, across
+        self.left, self.right = left, right
         self.count = int(self._largest(label.max())) + 1
         self.sizes = self._total(np.bincount(label[label >= 0], minlength=self.count).astype(np.float64))
         self._label = wp.array(label, dtype=wp.int32, device=device)
@@ -132,7 +142,14 @@ class FloatingComponents:
         if gone.all():
             return None
         number = np.where(gone, -1, np.cumsum(~gone) - 1).astype(np.int32)
-        return FloatingComponents(np.where(self.label >= 0, number[self.label], -1).astype(np.int32), self.device, self._across)
+        label = np.where(self.label >= 0, number[self.label], -1).astype(np.int32)
+        return FloatingComponents(label, self.device, self._across, left=self.left, right=self.right)
+
+    def transposed(self) -> FloatingComponents:
+        """Return those of A'."""
+        if self.left is None and self.right is None:
+            return self
+        return FloatingComponents(self.label, self.device, self._across, left=self.right, right=self.left)
 
     def unattainable(self, b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> float:
         """Return a norm that the natural residual cannot go below; 0 if b is compatible everywhere.
@@ -144,17 +161,24 @@ class FloatingComponents:
         """
         inside = self.label >= 0
         label = self.label[inside]
-        values = b.numpy()[inside], np.abs(b.numpy()[inside]), *(np.isfinite(bound.numpy()[inside]) for bound in (lower, upper))
+        w = np.ones(1) if self.left is None else self.left[inside]
+        terms = w * b.numpy()[inside]
+        values = terms, np.abs(terms), *(np.isfinite(bound.numpy()[inside]) for bound in (lower, upper))
         mine = np.stack([np.bincount(label, v, self.count) for v in values])  # of nothing NumPy 1 makes integers
         sums = self._total(mine.astype(np.float64))
         rest, scale, below, above = sums[0], sums[1], sums[2] > 0, sums[3] > 0
         self._net = rest.copy()
         rest[(below & (rest > 0)) | (above & (rest < 0))] = 0
-        rest[np.abs(rest) <= 4 * np.finfo(np.float64).eps * scale * np.sqrt(self.sizes)] = 0  # the rounding of a sum
-        return float(np.sqrt(np.sum(rest**2 / self.sizes)))
+        rounding = 4 * np.finfo(np.float64).eps if self.left is None else ROUNDED
+        rest[np.abs(rest) <= rounding * scale * np.sqrt(self.sizes)] = 0  # the rounding of a sum
+        squares = self.sizes if self.left is None else np.bincount(label, w**2, self.count)
+        return float(np.sqrt(np.sum(rest**2 / squares)))
 
     def project(self, r: wp.array[Any], free: wp.array[Any]) -> None:
         """Take the mean off r on every component whose unknowns are all free: the right-hand sides a singular block can meet."""
+        if self.left is not None:
+            self._project_weighted(self.left, r, free)
+            return
         self._sums.zero_()
         self._held.zero_()
         n = r.size
@@ -164,21 +188,52 @@ class FloatingComponents:
             self._held.assign(self._across.max(self._held.numpy()))
         wp.launch(remove_means_kernel, n, [self._label, self._sums, self._held, self._sizes, r], device=self.device)
 
+    def _project_weighted(self, w: np.ndarray, r: wp.array[Any], free: wp.array[Any]) -> None:
+        """Take w (w'r)/(w'w) off r on every component whose unknowns are all free."""
+        inside = self.label >= 0
+        label, weights, host = self.label[inside], w[inside], r.numpy()
+        held = np.bincount(label, free.numpy()[inside] == 0, self.count) > 0
+        self._held.assign(held.astype(np.int32))
+        shares = np.bincount(label, weights * host[inside], self.count) / np.bincount(label, weights**2, self.count)
+        changed = host.copy()
+        changed[inside] -= (np.where(held, 0.0, shares)[label] * weights).astype(host.dtype)
+        r.assign(changed)
+
+    def _settle_weighted(self, v: np.ndarray, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
+        """As `settle`, with multiples of v in place of the constants."""
+        inside, moved = self.label >= 0, x.numpy().copy()
+        label, weights, held = self.label[inside], v[inside], self._held.numpy() != 0
+        low, here, high = lower.numpy()[inside], moved[inside], upper.numpy()[inside]
+        below, above = (np.full(self.count, np.inf) for _ in range(2))
+        np.minimum.at(below, label, (here - low) / weights)
+        np.minimum.at(above, label, (high - here) / weights)
+        mean = np.bincount(label, weights * here, self.count) / np.bincount(label, weights**2, self.count)
+        constants = np.where(held, 0.0, self._constants(below, above, mean))
+        moved[inside] = np.clip(here + constants[label] * weights, low, high)
+        x.assign(moved)
+
+    def _constants(self, below: np.ndarray, above: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Return what is added to each component, whose distance to its bounds is `below` and `above`."""
+        # what is left of b pushes x down where it is positive, up where it is negative: the bound on that side is the one to touch
+        up = np.isfinite(above) & ((self._net < 0) | ~np.isfinite(below))
+        found: np.ndarray = np.where(up, above, np.where(np.isfinite(below), -below, -mean))
+        return found
+
     def settle(self, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
         """Choose the constants that the last `project` left open.
 
         The mean is 0 without bounds; else x touches the bound that the sum of b pushes it to. Only components that were free as a
         whole move.
         """
+        if self.right is not None:
+            self._settle_weighted(self.right, x, lower, upper)
+            return
         below, above = (wp.full(self.count, np.inf, dtype=wp.float64, device=self.device) for _ in range(2))
         wp.launch(smallest_gap_kernel, x.size, [self._label, x, lower, upper, below, above], device=self.device)
         gap_below, gap_above = -self._largest(-below.numpy()), -self._largest(-above.numpy())
         inside = self.label >= 0
         mean = self._total(np.bincount(self.label[inside], x.numpy()[inside], self.count)) / self.sizes
-        # what is left of b pushes x down where it is positive, up where it is negative: the bound on that side is the one to touch
-        up = np.isfinite(gap_above) & ((self._net < 0) | ~np.isfinite(gap_below))
-        constant = np.where(up, gap_above, np.where(np.isfinite(gap_below), -gap_below, -mean))
-        constants = wp.array(constant, dtype=wp.float64, device=self.device)
+        constants = wp.array(self._constants(gap_below, gap_above, mean), dtype=wp.float64, device=self.device)
         wp.launch(shift_components_kernel, x.size, [self._label, self._held, constants, lower, upper, x], device=self.device)
 
 
@@ -265,3 +320,65 @@ def _roots(parent: np.ndarray) -> np.ndarray:
     while not np.array_equal(roots, roots[roots]):
         roots = roots[roots]
     return roots
+
+
+def numbered_components(
+    number: np.ndarray, held: np.ndarray, device: wp.Device, *, left: np.ndarray | None = None, right: np.ndarray | None = None
+) -> FloatingComponents | None:
+    """Return those of numbered components that nothing holds, None if there are none.
+
+    Args:
+        number: of each stored cell, 0 where there is none.
+        held: of each number, 0 included, whether something does.
+        device: where fields live.
+        left: as of `FloatingComponents`.
+        right: likewise.
+    """
+    held[0] = True
+    if held.all():
+        return None
+    names = np.where(held, -1, np.cumsum(~held) - 1).astype(np.int32)
+    return FloatingComponents(names[number], device, left=left, right=right)
+
+
+class NullVectors(NamedTuple):
+    """Connected components of a matrix: the number of each row, which are not known to be singular, and w'A = 0, A v = 0 on the others."""
+
+    number: np.ndarray
+    held: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+
+
+def null_vectors(matrix: scipy.sparse.csr_array, rows: np.ndarray, columns: np.ndarray, *, most: int) -> NullVectors:
+    """Find null vectors of components of a matrix whose rows or columns sum to 0.
+
+    Where both do, they are the constants. Where one does, the other vector is computed if the component is an irreducible M-matrix, for
+    then it is unique and positive (Berman & Plemmons 1994, theorem 6.4.16).
+
+    Args:
+        matrix: of which rows and columns are known to sum to 0:
+        rows: bool, one for each.
+        columns: likewise.
+        most: unknowns of a component for which a vector is computed; 0 where off-diagonal entries may be positive.
+    """
+    count, number = scipy.sparse.csgraph.connected_components(matrix, directed=False)
+    of_rows, of_columns = (np.bincount(number, ~vanish, count) == 0 for vanish in (rows, columns))
+    held, left, right = ~(of_rows & of_columns), np.ones(len(number)), np.ones(len(number))
+    for c in np.flatnonzero(of_rows != of_columns) if most else ():
+        places = np.flatnonzero(number == c)
+        block = matrix[places][:, places]
+        if len(places) <= most and scipy.sparse.csgraph.connected_components(block, connection="strong")[0] == 1:
+            vector = _null_vector(block.T if of_rows[c] else block)
+            (left if of_rows[c] else right)[places], held[c] = vector, not (vector > 0).all()
+    return NullVectors(number, held, left, right)
+
+
+def _null_vector(block: scipy.sparse.csr_array) -> np.ndarray:
+    """Return v with A v = 0 and a mean of 1, of an irreducible M-matrix whose columns sum to 0: one entry is given, the others follow."""
+    away = scipy.sparse.csc_array(block - scipy.sparse.diags_array(block.diagonal()))
+    exact = (away - scipy.sparse.diags_array(np.asarray(away.sum(axis=0)).ravel())).tocsc()
+    v = np.ones(block.shape[0])
+    if len(v) > 1:
+        v[1:] = scipy.sparse.linalg.splu(exact[1:, 1:].tocsc()).solve(-exact[1:, [0]].toarray().ravel())
+    return v / v.mean()

@@ -57,7 +57,7 @@ class GridOperator(Pickled):
         self.dtype, self.shape = dtype, host.shape
         self.layout = PaddedLayout(host.shape, self.device, self._across)
         counts = self.layout.padding.counts
-        flags = (*(bool(p) for p in periodic), False, False, False)[:3]
+        self._wraps = flags = (*(bool(p) for p in periodic), False, False, False)[:3]  # axes of one cell, too
         self.periodic = (flags[0] and counts[2] > 1, flags[1] and counts[1] > 1, flags[2] and counts[0] > 1)
         self._take_coefficients(host, **coefficients)
         padded = np.full(self.layout.stored_shape, self.outside, dtype=np.int8)
@@ -180,7 +180,7 @@ class GridOperator(Pickled):
     def on_cells(self, cells: np.ndarray) -> Self:
         """Return the operator of other cells, padded as `cells` is, with the same coefficients, its arrays in place."""
         inner = cells.reshape(self.layout.stored_shape)[1:-1, 1:-1, 1:-1].reshape(self.shape)
-        return type(self)(inner, periodic=self.periodic, device=self.device, dtype=self.dtype, **self._arguments())
+        return type(self)(inner, periodic=self._wraps, device=self.device, dtype=self.dtype, **self._arguments())
 
     def _arguments(self) -> dict[str, Any]:
         """Return the coefficients as arguments of the class."""
@@ -201,7 +201,7 @@ class GridOperator(Pickled):
             raise TypeError(f"{type(self).__name__} is a part of a grid that ranks share: pickle its cells and coefficients on each rank")
         if self._mask is not None:
             raise TypeError("a masked operator is not pickled: pickle the one it was made from, and mask that again")
-        return self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape).copy(), {"periodic": self.periodic, "dtype": self.dtype}
+        return self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape).copy(), {"periodic": self._wraps, "dtype": self.dtype}
 
     @property
     def unknowns(self) -> int:

@@ -13,7 +13,8 @@ import numpy as np
 import scipy.ndimage
 import warp as wp
 
-from warp_lcp.operators.components import FloatingComponents
+from warp_lcp.operators.components import FloatingComponents, null_vectors, numbered_components
+from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
@@ -33,6 +34,7 @@ GRADIENT = RowPass(
     "stencil.gradient", HEADERS / "stencil_gradient.h", wp.float64, reads={"cells": wp.int8, "multiplier": wp.float64, "x": wp.float64},
     writes={"part": wp.float64}, optional=("part",), numbers=dict.fromkeys(("step", "row", "plane"), int), sums=("sum",),
 )  # fmt: skip
+MOST_IN_PLANE, MOST_IN_SPACE = 1 << 17, 1 << 14  # unknowns of a component whose null vectors are had by sparse factors, in a second or two
 CENTER = (0, 0, 0)
 AROUND = Pattern(tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y), symmetric=False, kind="arrays")  # all neighbors in 2-D
 Offset = tuple[int, int, int]  # along x, y, z
@@ -97,20 +99,25 @@ class Stencil(GridOperator):
         if functions and any(f.ndim for f in values.values()):
             raise ValueError("coefficients: arrays and Warp functions do not mix, evaluate the functions or make the arrays functions")
         fluid = cells.reshape(self.layout.padding.counts) == FLUID
+        self._around_itself = [
+            a for a in range(cells.ndim) if self._wraps[a] and fluid.shape[2 - a] == 1
+        ]  # its cells are their own neighbors
+        if functions and (any(self.periodic) or self._around_itself):  # ghost cells, and sums, are had of arrays
+            values, functions = values | {o: self._evaluated(f) for o, f in functions.items()}, {}
+        values = _folded({o: f.reshape(fluid.shape) if f.ndim else f for o, f in values.items()}, self._around_itself)
         evaluated = {o: self._evaluated(f) for o, f in functions.items()}  # to look at, not to keep
-        full = {o: np.broadcast_to(f.reshape(fluid.shape) if f.ndim else f, fluid.shape) for o, f in values.items()} | evaluated
+        full = {o: np.broadcast_to(f, fluid.shape) for o, f in values.items()} | evaluated
         self._center = self._stored(full[CENTER]) if evaluated.keys() & {CENTER} or values[CENTER].ndim else None
         self._number = 0.0 if self._center is not None else float(values[CENTER])
-        around = [o for o in sorted(full, key=lambda o: o[::-1]) if o != CENTER and full[o][fluid].any()]
-        self.symmetric = all(self._mirrored(full, o, fluid) for o in around)
-        self.monotone = all(bool((full[o][fluid] <= 0).all()) for o in around)
-        stored = any(values[o].ndim for o in around if o in values) or (functions and any(self.periodic))
+        around = [o for o in sorted(full, key=lambda o: o[::-1]) if o != CENTER and full[o].any()]
+        halves = self._pair_up(full, around) and not functions
+        halves = halves and not any(values[o].ndim == values[_opposite(o)].ndim == 0 and values[o] != values[_opposite(o)] for o in around)
+        stored = any(values[o].ndim for o in around if o in values)
         kind = "arrays" if stored else "functions" if any(o in functions for o in around) else "numbers"
-        halves = kind != "functions" and self.symmetric
         offsets = tuple(o for o in around if not halves or o[::-1] < CENTER)
         kept = tuple(functions.get(o, float(values[o]) if o in values else 0.0) for o in offsets) if kind == "functions" else ()
         self._pattern = Pattern(offsets, halves, kind, kept)
-        self._weights = tuple(self._stored(-full[o], wrapped=True) for o in offsets) if stored else None
+        self._weights = tuple(self._stored_weight(full, o, halves) for o in offsets) if stored else None
         self._numbers = tuple(-float(values[o]) for o in offsets) if kind == "numbers" else ()
         sizes = {o: float(np.abs(full[o][fluid]).mean()) if fluid.any() else 0.0 for o in around}
         self._strength: Any = tuple(sum(size for o, size in sizes.items() if o[axis]) / 2 for axis in range(3))
@@ -134,7 +141,8 @@ class Stencil(GridOperator):
 
         def of(offset: Offset, shape: tuple[int, ...]) -> Any:
             part = self.layout.zeros(wp.float64) if shape else None
-            place = dict(zip(("step", "row", "plane"), offset, strict=True))
+            steps = (0 if axis in self._around_itself else step for axis, step in enumerate(offset))
+            place = dict(zip(("step", "row", "plane"), steps, strict=True))
             total = Sums(rows, 1).of(GRADIENT, cells=cells, multiplier=multiplier, x=x, part=part, **place)
             return total.item() if part is None else part.reshape(shape) if part.size == math.prod(shape) else self.layout.unload(part)
 
@@ -145,32 +153,53 @@ class Stencil(GridOperator):
 
     def transposed(self) -> Stencil:
         """Return A' as a stencil of arrays, without SOLID cells: its diagonal has what closed sides add."""
-        counts = self.layout.padding.counts
         fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
         found: dict[tuple[int, ...], Any] = {(0,) * len(self.shape): np.where(fluid.reshape(self.shape), self.diagonal().numpy(), 1.0)}
-        for offset, value in self._given.items():
-            if offset == CENTER:
-                continue
-            function = isinstance(value, wp.Function)
-            here = self._evaluated(_of_three(value, len(self.shape))) if function else real_array(value, "coefficients")
-            here = np.where(fluid, here.reshape(counts) if here.ndim else here, 0.0)
-            for axis, step in enumerate(offset[::-1]):  # a_o(i) is the neighbor's coefficient for i
-                here = np.roll(here, step, axis)
-                if step and not self.periodic[2 - axis]:
-                    np.moveaxis(here, axis, 0)[0 if step > 0 else -1] = 0.0
-            found[tuple(-step for step in _named(offset, len(self.shape)))] = here.reshape(self.shape)
+        for offset, here in self._full().items():
+            if offset != CENTER:  # a_o(i) is the neighbor's coefficient for i; between FLUID cells, so that any of them may be left out
+                there = self._beside(np.where(fluid, here, 0.0), _opposite(offset))
+                found[_named(_opposite(offset), len(self.shape))] = np.where(fluid, there, 0.0).reshape(self.shape)
         cells = np.where(fluid, FLUID, AIR).reshape(self.shape)
         return Stencil(cells, found, periodic=self.periodic, outside=AIR, device=self.device, dtype=self.dtype)
 
-    def _mirrored(self, full: dict[Offset, np.ndarray], offset: Offset, fluid: np.ndarray) -> bool:
-        """Return whether the coefficients of an offset are those of the opposite one, seen from the neighbor, between unknowns."""
-        steps = tuple(-step for step in offset[::-1])
-        here, there = full[offset], full.get((-offset[0], -offset[1], -offset[2]), np.zeros(()))
-        moved, both = np.roll(np.broadcast_to(there, fluid.shape), steps, (0, 1, 2)), fluid & np.roll(fluid, steps, (0, 1, 2))
-        for axis, step in enumerate(steps):
+    def _pair_up(self, full: dict[Offset, np.ndarray], around: list[Offset]) -> bool:
+        """Find where a_o(i) is not a_-o(i + o), and where it is positive; return whether all sides between cells have one coefficient."""
+        differing = [(o, self._beside(np.ones_like(full[o], dtype=bool), o)) for o in around]
+        differing = [
+            (o, between & (full[o] != self._beside(full[_opposite(o)], o) if _opposite(o) in full else full[o] != 0))
+            for o, between in differing
+        ]
+        self._differing = [(o, where) for o, where in differing if where.any()]
+        positive = functools.reduce(np.logical_or, [full[o] > 0 for o in around], np.zeros_like(full[CENTER], dtype=bool))
+        self._positive = positive if positive.any() else None
+        self.symmetric = self.monotone = True  # until `_fill_stencil` has seen the cells
+        return not self._differing and all(_opposite(o) in around for o in around)
+
+    def _find_signs(self) -> None:
+        """Find whether A is symmetric and monotone on the FLUID cells that there are."""
+        if self._differing or self._positive is not None:
+            fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
+            self.symmetric = self.symmetric and not any((where & fluid & self._beside(fluid, o)).any() for o, where in self._differing)
+            self._differing = self._differing if self.symmetric else []
+            self.monotone = self._positive is None or not (self._positive & fluid).any()
+
+    def _beside(self, values: np.ndarray, offset: Offset) -> np.ndarray:
+        """Return what each cell's neighbor has, 0 where it is beyond the array."""
+        moved: np.ndarray = np.roll(values, tuple(-step for step in offset[::-1]), (0, 1, 2))
+        for axis, step in enumerate(offset[::-1]):
             if step and not self.periodic[2 - axis]:
-                np.moveaxis(both, axis, 0)[0 if step > 0 else -1] = False
-        return bool(np.array_equal(here[both], moved[both]))
+                np.moveaxis(moved, axis, 0)[-1 if step > 0 else 0] = 0
+        return moved
+
+    def _full(self) -> dict[Offset, np.ndarray]:
+        """Return the coefficients of all cells by offset, (nz, ny, nx)."""
+        n, counts = len(self.shape), self.layout.padding.counts
+        values = {
+            o: self._evaluated(_of_three(f, n)) if isinstance(f, wp.Function) else real_array(f, "coefficients")
+            for o, f in self._given.items()
+        }
+        folded = _folded({o: f.reshape(counts) if f.ndim else f for o, f in values.items()}, self._around_itself)
+        return {o: np.broadcast_to(f, counts) for o, f in folded.items()}
 
     def _evaluated(self, function: Any) -> np.ndarray:
         """Return the values of a Warp function at all cells."""
@@ -184,14 +213,32 @@ class Stencil(GridOperator):
         """Return the values of one of the pattern's functions as a stored field."""
         return np.pad(self._evaluated(function), 1).ravel()
 
-    def _stored(self, values: np.ndarray, *, wrapped: bool = False) -> wp.array[Any]:
-        """Return coefficients of all cells as a stored field; ghost cells of periodic axes have those of the cells they stand for."""
-        padded = np.pad(values, 1)
-        for axis in range(3) if wrapped else ():
-            if self.periodic[2 - axis]:
-                lines = np.moveaxis(padded, axis, 0)
-                lines[0], lines[-1] = lines[-2], lines[1]
+    def _stored(self, values: np.ndarray) -> wp.array[Any]:
+        """Return coefficients of all cells as a stored field."""
+        return wp.array(np.pad(values, 1).ravel(), dtype=self.dtype, device=self.device)
+
+    def _stored_weight(self, full: dict[Offset, np.ndarray], offset: Offset, halves: bool) -> wp.array[Any]:
+        """Return an offset's weights as a stored field.
+
+        Ghost cells of periodic axes have those of the cells they stand for. A weight that serves two cells is stored at the upper one:
+        ghost cells beyond the array have those of the cells' upper sides there.
+        """
+        padded = self._wrapped(-full[offset])
+        if halves:
+            steps = tuple(-step for step in offset[::-1])
+            lower = np.roll(self._wrapped(-full[_opposite(offset)]), steps, (0, 1, 2))  # of the cell below, seen from the upper one
+            for axis in (a for a in range(3) if offset[2 - a] and not self.periodic[2 - a]):
+                ghosts = (slice(None),) * axis + (-1 if offset[2 - axis] < 0 else 0,)
+                padded[ghosts] = lower[ghosts]
         return wp.array(padded.ravel(), dtype=self.dtype, device=self.device)
+
+    def _wrapped(self, values: np.ndarray) -> np.ndarray:
+        """Return a padded field whose ghost cells of periodic axes have what the cells that they stand for have."""
+        padded = np.pad(values, 1)
+        for axis in (a for a in range(3) if self.periodic[2 - a]):
+            lines = np.moveaxis(padded, axis, 0)
+            lines[0], lines[-1] = lines[-2], lines[1]
+        return padded
 
     def _empty_stencil(self) -> PaddedStencil:
         layout = self.layout
@@ -201,6 +248,7 @@ class Stencil(GridOperator):
     def _fill_stencil(self) -> None:
         s = self.stencil
         self._wrap_cells()
+        self._find_signs()
         shift = self.shift.flatten() if self.shift.size else None
         given = {"cells": self.cells_around.flatten(), "center": self._center, "shift": shift, "number": self._number}
         DIAGONAL.bind(self._rows_in_reach, stencil=s, **given, made=s.d).launch()
@@ -249,25 +297,42 @@ class Stencil(GridOperator):
         return found
 
     def _find_floating(self) -> FloatingComponents | None:
-        """Look for components that no row's sum holds, of a symmetric A: on the host, for all that is needed are sums of rows."""
-        if not self.symmetric or any(self.periodic):
+        """Look for components on which all rows sum to 0, or all columns: on the host."""
+        fluid = (self.cells.numpy() == FLUID) & (self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0)
+        inside = fluid.ravel()
+        rows = self._sums_vanish(inside, transposed=False)
+        columns = rows if self.symmetric else self._sums_vanish(inside, transposed=True)
+        if not (rows[inside].any() or columns[inside].any()):
             return None
-        ones = self.layout.load(np.ones(self.shape), wp.float64).numpy()
-        inside = (self.cells.numpy() == FLUID) & (self.stencil.d.numpy().reshape(self.layout.stored_shape) != 0)
-        x, sums = wp.array(np.where(inside.ravel(), ones, 0), dtype=wp.float64, device=self.device), self.layout.zeros(wp.float64)
-        self.stencil.product(x, sums)
+        places = np.flatnonzero(inside)
+        if self.symmetric and not any(self.periodic) and all((w.numpy()[places] != 0).all() for w in self.stencil.weights or ()):
+            structure = np.zeros((3, 3, 3), dtype=bool)  # of all neighbors that are coupled
+            for offset in (o for kept in self._pattern.offsets for o in (kept, CENTER, _opposite(kept))):
+                structure[tuple(step + 1 for step in offset[::-1])] = True
+            number, count = scipy.ndimage.label(fluid, structure)
+            number = number.ravel()
+            return numbered_components(number, np.bincount(number, inside & ~rows, count + 1) > 0, self.device)
+        matrix = grid_matrix(self)
+        if len(places) < matrix.shape[0]:  # a principal system
+            kept = inside[self.cells.numpy().ravel() == FLUID]
+            matrix = matrix[kept][:, kept]
+        most = MOST_IN_SPACE if self.layout.padding.counts[0] > 1 else MOST_IN_PLANE
+        found = null_vectors(matrix, rows[places], columns[places], most=most if self.monotone else 0)
+        number, fields = np.zeros(inside.size, dtype=np.int32), [np.ones(inside.size) for _ in range(2)]
+        number[places] = found.number + 1
+        for field, vector in zip(fields, (found.left, found.right), strict=True):
+            field[places] = vector
+        left, right = (None if (field == 1).all() else field for field in fields)
+        return numbered_components(number, np.r_[True, found.held], self.device, left=left, right=right)
+
+    def _sums_vanish(self, inside: np.ndarray, *, transposed: bool) -> np.ndarray:
+        """Return which rows, or columns, of a flat stored field sum to 0 but for rounding."""
+        x, sums = wp.array(np.where(inside, 1.0, 0.0), dtype=wp.float64, device=self.device), self.layout.zeros(wp.float64)
+        self._product(x, sums, transposed=transposed)
         rounding = 8 * float(np.finfo(wp.dtype_to_numpy(self.dtype)).eps)
-        held = (np.abs(sums.numpy()) > rounding * self.stencil.d.numpy()).reshape(inside.shape)
-        if not (inside & ~held).any():
-            return None
-        number, count = scipy.ndimage.label(inside, np.ones((3, 3, 3)))
-        holding = np.zeros(count + 1, dtype=bool)
-        holding[np.unique(number[held & inside])] = True
-        holding[0] = True
-        if holding.all():
-            return None
-        names = np.where(holding, -1, np.cumsum(~holding) - 1).astype(np.int32)
-        return FloatingComponents(names[number].ravel(), self.device)
+        center = np.abs(self._number) if self._center is None else np.abs(self._center.numpy())
+        size = np.maximum(self.stencil.d.numpy(), center)  # closed sides cancel some of it
+        return inside & (np.abs(sums.numpy()) <= rounding * size)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle cells and coefficients; those that are Warp functions as arrays."""
@@ -323,6 +388,20 @@ class StoredStencil(GridOperator):
 
     def _fill_stencil(self) -> None:
         self._wrap_cells()
+
+
+def _opposite(offset: Offset) -> Offset:
+    """Return the offset by which a neighbor sees a cell."""
+    return -offset[0], -offset[1], -offset[2]
+
+
+def _folded(values: dict[Offset, np.ndarray], axes: list[int]) -> dict[Offset, np.ndarray]:
+    """Return coefficients without steps along axes of one cell that wrap around: such a neighbor is the one without that step."""
+    found: dict[Offset, np.ndarray] = {}
+    for offset, value in values.items():
+        place = tuple(0 if axis in axes else step for axis, step in enumerate(offset))
+        found[place] = found[place] + value if place in found else value  # type: ignore[index]
+    return found
 
 
 def _named(offset: Offset, dimension: int) -> tuple[int, ...]:

@@ -114,7 +114,11 @@ class SumOperator(Pickled):
         if not (isinstance(low, LowRankOperator) and has(plain, NamesComponents)):
             return None
         found = plain.floating_components(scratch)
-        return None if found is None else found.without(_felt(found.label, found.count, low))
+        return (
+            None
+            if found is None
+            else found.without(_felt(found.label, found.count, low, weighted=found.left is not None or found.right is not None))
+        )
 
     def masked(self, free: Any, shift: Any = None) -> SumOperator:
         """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift); of terms that have that."""
@@ -153,12 +157,14 @@ def grid_and_low_rank(A: Any) -> tuple[HasStencil, LowRankOperator] | None:
     return (A.grid, A.low) if has(A, HasColumns) and A.symmetric else None
 
 
-def _felt(label: np.ndarray, count: int, low: LowRankOperator) -> np.ndarray:
-    """Return for each component whether a column's sum over it is more than what rounding leaves."""
+def _felt(label: np.ndarray, count: int, low: LowRankOperator, *, weighted: bool) -> np.ndarray:
+    """Return for each component whether a column's sum over it is more than what rounding leaves; of weighted ones, if any."""
     rows, blocks, values = low.columns.entries()
     at, k = label[rows], low.columns.width
     found = np.zeros((2, count, low.rank))
     inside = at >= 0
+    if weighted:
+        return np.bincount(at[inside], minlength=count) > 0
     columns = (blocks[inside, None] * k + np.arange(k)).astype(np.int64)
     np.add.at(found[0], (at[inside, None], columns), values[inside])
     np.add.at(found[1], (at[inside, None], columns), np.abs(values[inside]))

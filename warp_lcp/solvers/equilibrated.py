@@ -19,7 +19,14 @@ from warp_lcp.problem.scale import scaled
 from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import rows_of
-from warp_lcp.solvers.dense_problem import DenseProblem, power_of_two, proved_infeasible, unit_rows_and_columns, within_reach, without_contact
+from warp_lcp.solvers.dense_problem import (
+    DenseProblem,
+    power_of_two,
+    proved_infeasible,
+    unit_rows_and_columns,
+    within_reach,
+    without_contact,
+)
 
 UNITS = RowPass(
     "equilibrated.units", Path(__file__).parent / "headers" / "units.h", wp.float64, reads={"x": wp.float64, "units": wp.float64},

@@ -21,7 +21,16 @@ from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.phases import CoarseProblem, CoarseStencilProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
+from warp_lcp.solvers.phases import (
+    AlgebraicSteps,
+    CoarseProblem,
+    CoarseStencilProblem,
+    GradientPhase,
+    InteriorSteps,
+    Pace,
+    ProximalPoint,
+    projected_cycle,
+)
 from warp_lcp.solvers.principal_system import (
     CLASSIFY,
     ON_FREE,
@@ -40,6 +49,7 @@ LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projec
 # many. With 4, 8, 16 and 32 cycles a membrane on 600,000 nodes takes 16, 15, 12 and 6 Newton steps, 7.0, 5.4, 4.8 and 4.4 s
 HUGE = 1 << 16
 WEAK = 30  # iterations of a linear solve that say that its preconditioner is weak
+RISEN = 10.0  # growth of the residual by which a projected cycle on a matrix that is not symmetric is undone
 STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
@@ -112,7 +122,7 @@ class NewtonWorkspace(IterateMemory):
     """
 
     last_resort = True
-    resort: InteriorSteps | ProximalPoint | None = None
+    resort: AlgebraicSteps | InteriorSteps | ProximalPoint | None = None
     descends = False
     gradients: GradientPhase | None = None
 
@@ -148,6 +158,7 @@ class NewtonWorkspace(IterateMemory):
         self.norms: list[float] = []
         self.target = tolerance
         self.resort, self._smallest, self._waited = None, math.inf, 0
+        self._pace = Pace(tolerance) if AlgebraicSteps.suits(self.problem) else None
         self.system.refresh()
 
     def step(self, x: wp.array[Any]) -> Step:
@@ -165,9 +176,15 @@ class NewtonWorkspace(IterateMemory):
             self._round(x)
             return Step("monotone cycle", 1, None)
         assert isinstance(system, GridSystem)
+        before = residual.norm
+        if not p.A.symmetric:
+            wp.copy(self.trial, x)
         projected_cycle(p, system, x, residual.y, residual.norm, self.free, self._sums, restrict=self.stale)
         self.stale = True  # the next Newton step takes cells out again
-        self._correct(x, system.z, residual.norm, x)
+        self._correct(x, system.z, before, x)
+        if not p.A.symmetric and not residual.evaluate(x) <= RISEN * before:  # no energy falls there
+            wp.copy(x, self.trial)
+            self.cycles_left, residual.current = 0, False
         if self.cycles_left > 0:
             self.stale = False
         return Step("monotone cycle", 1, None)
@@ -283,21 +300,28 @@ class NewtonWorkspace(IterateMemory):
         return Step("regularized", iterations, active, None if descended else SolveStatus.NON_DESCENT)
 
     def _stalls(self) -> bool:
-        """Return whether no residual of the last steps is below all those before."""
+        """Return whether no residual of the last steps is below all those before, or on a grid they fall too slowly."""
         norm = self.residual.norm
+        if self._pace is not None:
+            self._pace.record(norm)
+            if self._pace.crawls:
+                return True
         self._waited = 0 if norm <= 0.999 * self._smallest else self._waited + 1
         self._smallest = min(self._smallest, norm)
         return self._waited >= STALLED
 
     def _may_resort(self) -> bool:
-        """Return whether the proximal-point iteration can be had, and the residual is above what rounding leaves."""
+        """Return whether another iteration can be had, and the residual is above what rounding leaves."""
         floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
-        return self.last_resort and self.residual.norm > floor and ProximalPoint.suits(self.problem)
+        return self.last_resort and self.residual.norm > floor and (ProximalPoint.suits(self.problem) or AlgebraicSteps.suits(self.problem))
 
     def _resort(self, x: wp.array[Any]) -> Step:
         """Take a step of the last resort."""
         if self.resort is None:
-            self.resort = InteriorSteps(self.problem, self.residual, self.target)
+            if AlgebraicSteps.suits(self.problem):
+                self.resort = AlgebraicSteps(self.problem, self.problem.A, x, self.target)  # type: ignore[arg-type]
+            else:
+                self.resort = InteriorSteps(self.problem, self.residual, self.target)
         step = self.resort.step(x)
         self._round(x)
         return step

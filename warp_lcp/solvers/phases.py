@@ -162,6 +162,11 @@ class AlgebraicSteps:
         self._inner = Inner(MinimumMapNewton(precision="double"), LCP(matrix, b, lower, upper))
         self._inner.begin(start, tolerance, warm=False)
 
+    @staticmethod
+    def suits(problem: LCP) -> bool:
+        """Return whether A is a grid's, all of it in this process."""
+        return has(problem.A, HasStencil) and problem.A.stencil.ghosts is None
+
     def step(self, x: wp.array[Any]) -> Step:
         """Take a step, and write the iterate to x."""
         done, stored = self._inner.step(), x.numpy()
@@ -485,4 +490,5 @@ class CoarseStencilProblem(CoarseProblem):
         A = StoredStencil(cells, stored, weights, AROUND, symmetric=self._A.symmetric)
         b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
         self._work = self._settings.init(LCP(A, b.reshape(A.layout.stored_shape), lower, upper))
+        self._work.last_resort = False  # a rough correction is not worth it
         return True

@@ -36,6 +36,7 @@ from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.dense_problem import equilibration, factored
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
+from warp_lcp.solvers.principal_system_guarded import GuardedSystem
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 
@@ -106,7 +107,7 @@ class PrincipalSystem(Protocol):
         """Solve until the residual's norm is at most `tolerance`; return iterations and the norm reached."""
 
 
-class GridSystem(KrylovSystem):
+class GridSystem(GuardedSystem):
     """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set; of `hierarchy` where there is one."""
 
     def __init__(
@@ -121,6 +122,8 @@ class GridSystem(KrylovSystem):
         # one CPU thread, no ghost cells to fill
         self.fused = self.hierarchy.open_cycle is not None and A.symmetric and A.stencil.ghosts is None
         self._iterate_by(self._krylov_method(), self._weight)
+        if not A.symmetric:
+            self._guard()
 
     def _krylov_method(self) -> Any:
         """Return what iterates: it has `solve`, and the solution in `x`."""
@@ -132,7 +135,7 @@ class GridSystem(KrylovSystem):
     def refresh(self) -> None:
         """Take the rows and the weights again if the operator has changed."""
         if self._version != self._A.version:
-            self._version = self._A.version
+            self._version, self._matrix = self._A.version, None
             self.hierarchy.refresh()
             if isinstance(self._krylov, GridConjugateGradient):
                 self._krylov.clear()
@@ -143,6 +146,7 @@ class GridSystem(KrylovSystem):
         Raises:
             ValueError: a shift, but the system was not made for one.
         """
+        self._note(free, shift)
         source, target = self._A.stencil, self.hierarchy.finest.stencil.d
         if self._weight is None:
             if shift is not None:
@@ -168,7 +172,7 @@ class GridSystem(KrylovSystem):
         self.hierarchy.monotone_cycle.run()
 
 
-class LineSystem(KrylovSystem):
+class LineSystem(GuardedSystem):
     """Conjugate gradients on a compact stencil in 2-D, or GMRES if A is not symmetric, preconditioned by cycles over lines."""
 
     def __init__(self, A: HasStencil, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False) -> None:
@@ -179,12 +183,17 @@ class LineSystem(KrylovSystem):
         self._weight = zeros_like(self.r) if shifted else None
         method = ConjugateGradient if A.symmetric else GMRES
         self._iterate_by(method(finest.stencil.product, self, weight=self._weight), self._weight)
+        self._guard()
+        self._version = A.version
 
     def refresh(self) -> None:
-        """Nothing is kept: `restrict` takes A's entries."""
+        """Try cycles over lines again if the operator has changed; `restrict` takes A's entries."""
+        if self._version != self._A.version:
+            self._version, self._matrix = self._A.version, None
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take another free set and shift, and coarsen."""
+        self._note(free, shift)
         self.hierarchy.restrict(free, shift, self._weight)
 
     @property

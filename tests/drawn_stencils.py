@@ -1,0 +1,235 @@
+"""Stencils drawn at random, and the matrices that NumPy assembles from the definition of `wl.Stencil`, cell by cell."""
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+
+
+@wp.func
+def rising(j: int, i: int):
+    return 40.0 + float(i) * 0.5 + float(j)
+
+
+@wp.func
+def falling(j: int, i: int):
+    return -1.0 - float(j) * 0.25
+
+
+@wp.func
+def rising_in_space(k: int, j: int, i: int):
+    return 80.0 + float(i) * 0.5 + float(k)
+
+
+@wp.func
+def falling_in_space(k: int, j: int, i: int):
+    return -1.0 - float(j) * 0.25 - float(k)
+
+
+FUNCTIONS = {  # as Warp has them, and as NumPy does: of the center, of a neighbor
+    2: (rising, lambda j, i: 40 + 0.5 * i + j, falling, lambda j, i: -1 - 0.25 * j),
+    3: (rising_in_space, lambda k, j, i: 80 + 0.5 * i + k, falling_in_space, lambda k, j, i: -1 - 0.25 * j - k),
+}
+KINDS = ("numbers", "arrays", "mirrored", "half mirrored", "functions")
+
+
+@dataclass
+class DrawnStencil:
+    """Arguments of `wl.Stencil`; `plain` are the coefficients with Python functions in place of Warp's."""
+
+    cells: np.ndarray
+    given: dict[tuple[int, ...], Any]
+    plain: dict[tuple[int, ...], Any]
+    shift: Any
+    periodic: tuple[bool, ...]
+    outside: int
+
+    def operator(self, device="cpu", dtype=wp.float64):
+        return wl.Stencil(
+            self.cells, self.given, shift=self.shift, periodic=self.periodic, outside=self.outside, device=device, dtype=dtype
+        )
+
+    def matrix(self):
+        return assembled(self.cells, self.plain, self.shift, self.periodic, self.outside)
+
+    @property
+    def inside(self):
+        return self.cells == wl.FLUID
+
+
+def neighbor(cells, cell, offset, periodic, outside):
+    """The padded index of a cell's neighbor, where an axis is periodic the one that it stands for, and its type."""
+    n, there, kind = cells.ndim, list(np.add(cell, offset)), None
+    for axis, count in enumerate(cells.shape):
+        if periodic[n - 1 - axis]:
+            there[axis] %= count
+        elif not 0 <= there[axis] < count:
+            kind = outside
+    return tuple(i + 1 for i in there), cells[tuple(there)] if kind is None else kind
+
+
+def value_at(coefficient, cell, shape):
+    """A coefficient of a cell."""
+    return coefficient(*cell) if callable(coefficient) else np.broadcast_to(coefficient, shape)[cell]
+
+
+def assembled(cells, coefficients, shift, periodic, outside):
+    """The matrix on the FLUID cells, row by row from the definition."""
+    number = {tuple(c): q for q, c in enumerate(np.argwhere(cells == wl.FLUID))}
+    A = np.zeros((len(number), len(number)))
+    for cell, q in number.items():
+        for offset, a in coefficients.items():
+            there, kind = neighbor(cells, cell, offset, periodic, outside)
+            if kind == wl.FLUID:
+                A[q, number[tuple(i - 1 for i in there)]] += value_at(a, cell, cells.shape)
+            elif kind == wl.SOLID:
+                A[q, q] += value_at(a, cell, cells.shape)
+        A[q, q] += 0 if shift is None else np.broadcast_to(shift, cells.shape)[cell]
+    return A
+
+
+def border_sums(drawn, padded):
+    """What values in AIR, a padded field, add to each row."""
+    cells = drawn.cells
+    out = np.zeros(cells.shape)
+    for cell in map(tuple, np.argwhere(cells == wl.FLUID)):
+        for offset, a in drawn.plain.items():
+            there, kind = neighbor(cells, cell, offset, drawn.periodic, drawn.outside)
+            if kind == wl.AIR:
+                out[cell] += value_at(a, cell, cells.shape) * padded[there]
+    return out
+
+
+def mirrored(given, shape, cells, rng, *, broken):
+    """Arrays with a_o(i) = a_-o(i + o), on a torus; if `broken`, between FLUID cells only."""
+    made = {}
+    for offset, a in given.items():
+        opposite = tuple(-s for s in offset)
+        if not any(offset) or offset > opposite:
+            made[offset] = np.array(np.broadcast_to(a, shape))
+            if any(offset):
+                made[opposite] = np.roll(made[offset], offset, tuple(range(len(shape))))
+    if broken:
+        for offset, a in made.items():
+            if any(offset):
+                toward = np.roll(cells, tuple(-s for s in offset), tuple(range(len(shape)))) != wl.FLUID
+                for axis, s in enumerate(offset):  # beyond the array, too
+                    if s:
+                        np.moveaxis(toward, axis, 0)[-1 if s > 0 else 0] = True
+                a[toward] = -rng.random(np.count_nonzero(toward))
+    return made
+
+
+def drawn(seed, kind=None, *, thin=True):
+    """A stencil of any shape, cells and boundaries; the diagonal dominates.
+
+    Args:
+        seed: of the draw.
+        kind: of the coefficients, one of `KINDS`; drawn if None.
+        thin: whether axes of one and two cells are drawn, too.
+    """
+    rng = np.random.default_rng(seed)
+    n, kind = int(rng.integers(2, 4)), kind or rng.choice(KINDS)
+    shape = tuple(int(v) for v in rng.integers(1 if thin else 3, 7, n))
+    cells = rng.choice([wl.AIR, wl.FLUID, wl.FLUID, wl.FLUID, wl.SOLID], shape)
+    cells.flat[0] = wl.FLUID
+    periodic = tuple(bool(p) for p in rng.random(3) < 0.3)
+    if kind in ("mirrored", "half mirrored"):  # on a torus the sides beyond the array are other cells'
+        periodic = tuple(p and shape[n - 1 - a] > 2 if a < n else p for a, p in enumerate(periodic))
+    given = {(0,) * n: 60.0}
+    chosen = int(rng.integers(3))  # few, or the kernels of each would have to be compiled: faces alone, all neighbors, some
+    for offset in itertools.product((-1, 0, 1), repeat=n):
+        places = abs(np.array(offset)).sum(), sum((s + 1) * 3**a for a, s in enumerate(offset))
+        if offset != (0,) * n and (places[0] == 1, True, places[1] % 3 != 1)[chosen]:
+            given[offset] = -rng.random() if kind in ("numbers", "functions") else -rng.random(shape)
+    if kind in ("mirrored", "half mirrored"):
+        given = mirrored(given, shape, cells, rng, broken=kind == "half mirrored" and not any(periodic))
+    elif kind == "numbers" and rng.random() < 0.5:
+        given = {o: given.get(max(o, tuple(-s for s in o)), 0.0) for o in given}
+    plain = dict(given)
+    if kind == "functions":
+        for offset in list(given)[:3]:
+            pick = 0 if offset == (0,) * n else 2
+            given[offset], plain[offset] = FUNCTIONS[n][pick : pick + 2]
+    shift = rng.random(shape) if rng.random() < 0.5 else None
+    return DrawnStencil(cells, given, plain, shift, periodic, int(rng.choice([wl.AIR, wl.SOLID])))
+
+
+def beside(values, offset, periodic):
+    """What each cell's neighbor has, 0 beyond the array."""
+    moved = np.roll(values, tuple(-s for s in offset), tuple(range(values.ndim)))
+    for axis, step in enumerate(offset):
+        if step and not periodic[values.ndim - 1 - axis]:
+            np.moveaxis(moved, axis, 0)[-1 if step > 0 else 0] = 0
+    return moved
+
+
+def drawn_offsets(dimension, rng):
+    """All neighbors, or those across faces."""
+    offsets = [o for o in itertools.product((-1, 0, 1), repeat=dimension) if any(o)]
+    return offsets if rng.random() < 0.5 else [o for o in offsets if sum(map(abs, o)) == 1]
+
+
+SINGULAR = ("symmetric", "numbers", "rows", "columns", "circulant")  # what sums to 0; of the last one both, without symmetry
+
+
+def drawn_singular(seed, kind):
+    """A stencil between closed sides and periodic ones, whose rows or columns sum to 0."""
+    rng = np.random.default_rng([seed, 21])
+    shape = (16 + seed % 3, 16) if rng.random() < 0.7 else (6, 7, 6)
+    n, decades = len(shape), int(rng.integers(3))
+    periodic = [(False,) * 3, (True, False, False), (False, True, False), (True,) * 3][int(rng.integers(4))]
+    periodic = (True,) * 3 if kind == "circulant" else periodic
+    offsets, cells = drawn_offsets(n, rng), np.ones(shape, dtype=int)
+    if rng.random() < 0.5 and kind in ("symmetric", "numbers", "rows"):
+        fluid = rng.random(shape) > 0.15
+        cells = np.where(fluid & (sum(beside(fluid.astype(int), o, periodic) for o in offsets) > 0), wl.FLUID, wl.SOLID)
+    given: dict[tuple[int, ...], Any] = {}
+    for o in offsets:
+        opposite = tuple(-s for s in o)
+        if kind in ("numbers", "circulant"):
+            given[o] = given[opposite] if kind == "numbers" and opposite in given else -rng.uniform(0.2, 1)
+        else:
+            given[o] = -(10 ** rng.uniform(-decades, 0, shape))
+            if kind == "symmetric" and opposite in given:
+                given[o] = beside(given[opposite], o, periodic)
+            elif kind == "columns":
+                given[o] = given[o] * beside(np.ones(shape), o, periodic)
+    across = [beside(given[tuple(-s for s in o)], o, periodic) if kind == "columns" else given[o] for o in offsets]
+    given[(0,) * n] = -sum(across)
+    return DrawnStencil(cells, given, given, None, periodic, wl.SOLID)
+
+
+def drawn_dominant(seed, side=40, side_in_space=10):
+    """An M-matrix that need not be symmetric: random coefficients, winds or anisotropy over up to four decades; and its data."""
+    rng = np.random.default_rng([seed, 31])
+    shape = (side_in_space, side_in_space, side_in_space + 3) if seed % 3 == 2 else (side, side + 7)
+    n, decades, form = len(shape), int(rng.integers(0, 5)), rng.choice(["random", "wind", "anisotropic"])
+    periodic = [(False,) * 3, (False,) * 3, (True, False, False), (True,) * 3][int(rng.integers(4))]
+    offsets = drawn_offsets(n, rng)
+    cells = np.ones(shape, dtype=int) if rng.random() < 0.6 else rng.choice([wl.AIR, *[wl.FLUID] * 4, wl.SOLID], shape)
+    wind, strength = rng.standard_normal(n) * 10 ** rng.uniform(0, decades), 10 ** rng.uniform(-decades, 0, n)
+    turning = np.sin(3 * (np.indices(shape) / max(shape)).sum(0) + rng.uniform(0, 6))
+    given: dict[tuple[int, ...], Any] = {}
+    for o in offsets:
+        if form == "random":
+            given[o] = -(10 ** rng.uniform(-decades, 0, shape))
+        elif form == "wind":
+            given[o] = -(1 + np.maximum(0, -sum(o[a] * wind[a] * (turning if a % 2 else np.ones(shape)) for a in range(n))))
+        else:
+            given[o] = -np.prod([strength[a] for a in range(n) if o[a]]) * rng.uniform(0.5, 1, shape)
+    given[(0,) * n] = -(1 + 10.0 ** rng.integers(-5, 0)) * sum(given.values())
+    bounded = rng.random() < 0.5
+    upper = float(10 ** rng.uniform(-2, 0)) if bounded and rng.random() < 0.3 else np.inf
+    b = rng.standard_normal(shape) * (cells == wl.FLUID)
+    return DrawnStencil(cells, given, given, None, periodic, int(rng.choice([wl.AIR, wl.SOLID]))), b, 0.0 if bounded else -np.inf, upper
+
+
+def natural_residual(matrix, diagonal, x, b, lower, upper):
+    """||d (x - clip(x - (A x + b)/d, l, u))||."""
+    y = matrix @ x + b
+    return float(np.linalg.norm(diagonal * (x - np.clip(x - y / diagonal, lower, upper))))
