@@ -16,7 +16,7 @@ from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
-from warp_lcp.solvers.default import default_method, solve
+from warp_lcp.default import default_method, solve
 from warp_lcp.solvers.registry import METHODS
 
 if TYPE_CHECKING:

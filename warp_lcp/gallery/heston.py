@@ -15,7 +15,7 @@ from warp_lcp.operators.stencil import Stencil
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import AIR, FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.solvers.default import solve
+from warp_lcp.default import solve
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 Coefficients = dict[tuple[int, int], np.ndarray]

@@ -13,7 +13,7 @@ from warp_lcp.gradients.names import flat, nested
 from warp_lcp.gradients.vjp import vjp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.solvers.default import solve as solve_problem
+from warp_lcp.default import solve as solve_problem
 
 
 def solve(

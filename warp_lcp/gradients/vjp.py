@@ -24,7 +24,7 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import Array
 from warp_lcp.rows.vectors import ADD, Sums, Tally, rows_of
-from warp_lcp.solvers.default import solve
+from warp_lcp.default import solve
 
 HEADERS = Path(__file__).parent / "headers"
 f64, i8 = wp.float64, wp.int8
