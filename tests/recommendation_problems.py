@@ -238,7 +238,7 @@ def laplacian(rng: np.random.Generator) -> wl.LCP:
     W = scipy.sparse.coo_array((rng.uniform(0.1, 1, ends.shape[1]), tuple(ends)), shape=(n, n)).tocsr()
     L = scipy.sparse.csgraph.laplacian(W + W.T)
     boxed = rng.random() < 0.5
-    b = rng.standard_normal(n) + (0.0 if boxed else 0.5)
+    b = rng.standard_normal(n) if boxed else 0.3 * rng.random(n)
     return wl.LCP(scipy.sparse.csr_array(L), b, -rng.random(n), 1.0 if boxed else np.inf)
 
 

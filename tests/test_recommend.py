@@ -165,7 +165,7 @@ def test_small_and_narrow_matrices_get_the_default(n):
 
 def test_a_budget_of_steps_is_a_limit_and_changes_the_method():
     lcp = gallery.banded(3000, bands=4, seed=78).lcp(device="cpu")
-    free = wl.recommend(lcp, accuracy=1e-8)
+    free = wl.recommend(lcp, accuracy=1e-8, budget=wl.Budget(iterations=1000))
     assert free.name == "psor"
     few = wl.recommend(lcp, accuracy=1e-8, budget=wl.Budget(iterations=8))
     assert few.name == "minimum-map-newton"

@@ -1,52 +1,42 @@
-"""The method for those who name none."""
+"""`wl.solve`: by a given method, or by the recommended one and, where that fails, by its alternatives."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Never
+from functools import partial
+from typing import Any, Never
 
 import warp as wp
 
-from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.matrix_stencil import stencil_of
 from warp_lcp.operators.renumbering import Renumbering
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasStencil, has, takes, version_of
-from warp_lcp.problem.result import Record, SolveResult
-from warp_lcp.problem.solve import ConvexSetProblem, Solver, Workspace
+from warp_lcp.problem.protocol import version_of
+from warp_lcp.problem.result import Record, SolveResult, SolveStatus
+from warp_lcp.problem.solve import EPS, ConvexSetProblem, Solver, Workspace
 from warp_lcp.problem.solve import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
+from warp_lcp.recommend import method_for, recommend, steps_allowed
 from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.minimum_map_newton_direct import suits
 from warp_lcp.solvers.mprgp import MPRGP
-from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
-from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
-from warp_lcp.solvers.psor import ProjectedSOR
 
 LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
 ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
 LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
+RESERVED, FEW = 4, 40  # one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps on
+ENDED = (SolveStatus.CONVERGED, SolveStatus.INFEASIBLE, SolveStatus.STOPPED, SolveStatus.TIME_LIMIT, SolveStatus.FLOOR)
+
+Attempt = Callable[[StoppingCriteria | MeanCriteria, Array | None, Callable[[Record], None] | None], SolveResult]
 
 
 def default_method(problem: LCP) -> Solver:
-    """Return the fastest method measured for the problem's operator: ProjectedMultigrid on grids, else MinimumMapNewton.
-
-    That is also for compact stencils that are not symmetric, or that only lines smooth.
-
-    Its systems are solved directly on the host, on CUDA devices too, where a matrix has at most 200 unknowns or a bandwidth up to 3, unless
-    the problem brings a preconditioner. Where bounds are affine in x, a method that takes them: ProjectedSOR, or ProjectedJacobi where A
-    cannot be swept.
-    """
-    if problem.bounds.affine is not None:
-        return ProjectedSOR() if takes(ProjectedSOR, problem.A) else ProjectedJacobi()
-    if has(problem.A, HasStencil):
-        return ProjectedMultigrid() if takes_points(problem.A) else MinimumMapNewton()
-    return MinimumMapNewton(direct=problem.preconditioner is None and suits(problem.A))
+    """Return the method that `wl.recommend` names for a problem, which `wl.solve` takes first if none is given."""
+    return recommend(problem).method
 
 
 def solve(
@@ -57,9 +47,11 @@ def solve(
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
-        solver: the method, say `MinimumMapNewton()`; `default_method(problem)` if None, and sparse matrices that are a compact stencil on a
-            box of cells in its natural order, x first, are then solved as such, which the result's `grid` says.
-        stopping: the criteria; defaults to `StoppingCriteria()`.
+        solver: the method, say `MinimumMapNewton()`. None: what `wl.recommend` names, and where that fails, its alternatives, each from
+            the same start: iterations and linear iterations add up, no more than `stopping` allows in all; the history has all of them,
+            each attempt's first record names its method, and the result's `method` is the one that found x. Sparse matrices that are a
+            compact stencil on a box of cells in its natural order, x first, are then solved as such, which the result's `grid` says.
+        stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that `wl.recommend` gives if there is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
         workspace: what `solver.init(problem)` returned, to use its memory again.
         callback: called with each Record as it is made; where it raises StopIteration, the solve ends with STOPPED.
@@ -83,32 +75,112 @@ def solve(
     if solver is None and isinstance(problem, ConvexSetProblem):
         raise ValueError(f"solver: a {type(problem).__name__} is solved by methods of its own, name one")
     if solver is None and isinstance(problem, LCP):
-        found = _solve_as_grid(problem, stopping, x0, callback)
-        if found is not None:
-            return found
-    solver = default_method(problem) if solver is None else solver  # type: ignore[arg-type]  # an LCP, or refused there
-    if workspace is None and isinstance(solver, ANY_NUMBERING) and isinstance(problem, LCP) and isinstance(problem.A, SparseOperator):
-        plain = problem.bounds.affine is None and problem.preconditioner is None
-        begun, found = time.perf_counter(), problem.A.renumbered() if plain else None
-        if found is not None:
-            return _solve_renumbered(problem, *found, solver, stopping or StoppingCriteria(), x0, callback, begun)
-    return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)
+        return _solve_by_choice(problem, stopping, x0, callback)
+    if workspace is None and isinstance(problem, LCP) and solver is not None:
+        return _solve_in_order(problem, solver, stopping, x0, callback)
+    return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)  # type: ignore[arg-type]  # is refused
 
 
-def _solve_as_grid(
+def _solve_by_choice(
     problem: LCP, stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None, callback: Callable[[Record], None] | None
-) -> SolveResult | None:
-    """Return the result of a large sparse matrix that is a grid's stencil, solved as one; None where it is none, or has not converged."""
+) -> SolveResult:
+    """Solve by the recommended method; where it fails, by its alternatives in turn, while limits allow; return the best x."""
+    begun, results = time.perf_counter(), list[SolveResult]()
+    for name, attempt, criteria in _attempts(problem, stopping, begun, results):
+        shifted = partial(_after, results, name, time.perf_counter() - begun)
+        told = None if callback is None else lambda record, shifted=shifted: callback(shifted(record))
+        try:
+            result = attempt(criteria, x0, told)
+        except ValueError:
+            if not results:
+                raise
+            continue  # an alternative that refuses this A
+        results.append(replace(result, method=name, history=[shifted(record) for record in result.history]))
+        if result.status in ENDED:
+            break
+    last = results[-1]
+    best = last if last.status is SolveStatus.INFEASIBLE else min(results, key=lambda result: result.residual)
+    return best if len(results) == 1 else replace(
+        best, iterations=last.history[-1].iteration, linear_iterations=last.history[-1].linear_iterations,
+        history=[record for result in results for record in result.history],
+    )  # fmt: skip
+
+
+def _attempts(
+    problem: LCP, stopping: StoppingCriteria | MeanCriteria | None, begun: float, results: list[SolveResult]
+) -> Iterator[tuple[str, Attempt, StoppingCriteria | MeanCriteria]]:
+    """Yield the names of methods, how they solve the problem, and the criteria with what earlier attempts have left of the limits."""
+    grid, rtol = _as_grid(problem), StoppingCriteria().rtol if stopping is None else stopping.rtol
+    advice = recommend(problem if grid is None else grid, accuracy=min(max(rtol, EPS), 0.5))
+    if grid is not None:
+        yield advice.name, partial(_solve_as_grid, problem, grid, advice.method), _left(stopping or advice.stopping, begun, results, True)
+        advice = recommend(problem, accuracy=min(max(rtol, EPS), 0.5))
+    names = (advice.name, *advice.alternatives)
+    for name in names if not isinstance(stopping, MeanCriteria) else names[:1]:
+        own = StoppingCriteria(max_iterations=steps_allowed(name)) if name in advice.alternatives else advice.stopping
+        keep = name != names[-1] and advice.traits.kind in ("dense", "sparse")
+        criteria = _left(stopping or own, begun, results, keep)
+        if criteria.max_iterations == 0 < len(results):
+            return
+        method = advice.method if name == advice.name else method_for(name, advice.traits)
+        yield name, partial(_solve_in_order, problem, method), criteria
+
+
+def _left(
+    stopping: StoppingCriteria | MeanCriteria, begun: float, results: list[SolveResult], reserve: bool
+) -> StoppingCriteria | MeanCriteria:
+    """Return criteria with the steps and the time that earlier attempts have left, some of them reserved for later ones."""
+    most = stopping.max_iterations - (results[-1].history[-1].iteration if results else 0)
+    most -= most // RESERVED if reserve and most >= FEW else 0
+    changed = stopping if most == stopping.max_iterations else replace(stopping, max_iterations=max(most, 0))
+    if isinstance(changed, StoppingCriteria) and changed.max_seconds < math.inf:
+        changed = replace(changed, max_seconds=max(LEAST, changed.max_seconds - (time.perf_counter() - begun)))
+    return changed
+
+
+def _after(results: list[SolveResult], name: str, seconds: float, record: Record) -> Record:
+    """Return an attempt's record with the steps and seconds of those before it added; its first record names the method."""
+    if not results:
+        return record
+    last = results[-1].history[-1]
+    return replace(
+        record, iteration=last.iteration + record.iteration, linear_iterations=last.linear_iterations + record.linear_iterations,
+        step=f"start of {name}" if record.iteration == 0 else record.step, seconds=seconds + record.seconds,
+    )  # fmt: skip
+
+
+def _as_grid(problem: LCP) -> LCP | None:
+    """Return a large sparse problem on the grid whose stencil its matrix is, None if it is none."""
     A = problem.A
     if not isinstance(A, SparseOperator) or A.unknowns < LARGE or problem.in_place or problem.preconditioner is not None:
         return None
     stencil = None if problem.bounds.affine is not None else stencil_of(A)
     if stencil is None:
         return None
-    fields = (field.numpy().reshape(stencil.shape) for field in (problem.b, problem.lower, problem.upper))
-    on_grid, start = LCP(stencil, *fields), None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy().reshape(stencil.shape)
-    result = solve_by(on_grid, default_method(on_grid), stopping=stopping, x0=start, callback=callback)
-    return replace(result, x=result.x.flatten(), grid=stencil.shape, problem=problem, version=A.version) if result else None
+    return LCP(stencil, *(field.numpy().reshape(stencil.shape) for field in (problem.b, problem.lower, problem.upper)))
+
+
+def _solve_as_grid(
+    problem: LCP, grid: LCP, method: Solver, stopping: StoppingCriteria | MeanCriteria, x0: Array | None,
+    callback: Callable[[Record], None] | None,
+) -> SolveResult:  # fmt: skip
+    """Solve a problem on the grid that its matrix is a stencil of; return x in the problem's shape."""
+    start = None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy().reshape(grid.A.shape)
+    result = solve_by(grid, method, stopping=stopping, x0=start, callback=callback)
+    return replace(result, x=result.x.flatten(), grid=grid.A.shape, problem=problem, version=version_of(problem.A))
+
+
+def _solve_in_order(
+    problem: LCP, solver: Solver, stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None,
+    callback: Callable[[Record], None] | None,
+) -> SolveResult:  # fmt: skip
+    """Solve a problem, a sparse matrix numbered at random in the order of Cuthill and McKee if the method's steps do not depend on it."""
+    plain = problem.bounds.affine is None and problem.preconditioner is None and isinstance(solver, ANY_NUMBERING)
+    begun = time.perf_counter()
+    found = problem.A.renumbered() if plain and isinstance(problem.A, SparseOperator) else None
+    if found is not None:
+        return _solve_renumbered(problem, *found, solver, stopping or StoppingCriteria(), x0, callback, begun)
+    return solve_by(problem, solver, stopping=stopping, x0=x0, callback=callback)
 
 
 def _solve_renumbered(
