@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Never
+from typing import Never
 
 import warp as wp
 
@@ -20,7 +20,7 @@ from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.solve import EPS, ConvexSetProblem, Solver, Workspace
 from warp_lcp.problem.solve import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
-from warp_lcp.recommend import method_for, recommend, steps_allowed
+from warp_lcp.recommend import Recommendation, method_for, recommend, steps_allowed
 from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
@@ -86,50 +86,79 @@ def _solve_by_choice(
 ) -> SolveResult:
     """Solve by the recommended method; where it fails, by its alternatives in turn, while limits allow; return the best x."""
     begun, results = time.perf_counter(), list[SolveResult]()
-    for name, attempt, criteria in _attempts(problem, stopping, begun, results):
-        shifted = partial(_after, results, name, time.perf_counter() - begun)
-        told = None if callback is None else lambda record, shifted=shifted: callback(shifted(record))
-        try:
-            result = attempt(criteria, x0, told)
-        except ValueError:
-            if not results:
-                raise
-            continue  # an alternative that refuses this A
-        results.append(replace(result, method=name, history=[shifted(record) for record in result.history]))
-        if result.status in ENDED:
-            break
-    last = results[-1]
-    best = last if last.status is SolveStatus.INFEASIBLE else min(results, key=lambda result: result.residual)
-    return best if len(results) == 1 else replace(
-        best, iterations=last.history[-1].iteration, linear_iterations=last.history[-1].linear_iterations,
-        history=[record for result in results for record in result.history],
-    )  # fmt: skip
-
-
-def _attempts(
-    problem: LCP, stopping: StoppingCriteria | MeanCriteria | None, begun: float, results: list[SolveResult]
-) -> Iterator[tuple[str, Attempt, StoppingCriteria | MeanCriteria]]:
-    """Yield the names of methods, how they solve the problem, and the criteria with what earlier attempts have left of the limits."""
-    grid, rtol = _as_grid(problem), StoppingCriteria().rtol if stopping is None else stopping.rtol
-    advice = recommend(problem if grid is None else grid, accuracy=min(max(rtol, EPS), 0.5))
+    grid, accuracy = _as_grid(problem), _accuracy(stopping)
+    advice = recommend(problem if grid is None else grid, accuracy=accuracy)
+    criteria = stopping or advice.stopping
     if grid is not None:
-        yield advice.name, partial(_solve_as_grid, problem, grid, advice.method), _left(stopping or advice.stopping, begun, results, True)
-        advice = recommend(problem, accuracy=min(max(rtol, EPS), 0.5))
-    names = (advice.name, *advice.alternatives)
-    for name in names if not isinstance(stopping, MeanCriteria) else names[:1]:
-        own = StoppingCriteria(max_iterations=steps_allowed(name)) if name in advice.alternatives else advice.stopping
-        keep = name != names[-1] and advice.traits.kind in ("dense", "sparse")
-        criteria = _left(stopping or own, begun, results, keep)
-        if criteria.max_iterations == 0 < len(results):
+        attempt = partial(_solve_as_grid, problem, grid, advice.method)
+        if _try(results, advice.name, attempt, _left(criteria, begun, results, reserve=stopping is not None), x0, callback, begun):
+            return _best(results)
+        advice = recommend(problem, accuracy=accuracy)
+        criteria = stopping or advice.stopping
+    spent = [] if stopping is None else results  # without limits that were given each attempt has its own
+    reserve = stopping is not None and bool(advice.alternatives) and advice.traits.kind in ("dense", "sparse")
+    attempt = partial(_solve_in_order, problem, advice.method)
+    if not _try(results, advice.name, attempt, _left(criteria, begun, spent, reserve=reserve), x0, callback, begun):
+        _try_alternatives(problem, advice, results, stopping, x0, callback, begun)
+    return _best(results)
+
+
+def solve_by_alternatives(problem: LCP, first: SolveResult, stopping: StoppingCriteria, x0: Array | None) -> SolveResult:
+    """Return the result of the recommended method, or of its alternatives where it has failed."""
+    if first.status in ENDED:
+        return first
+    begun, results = time.perf_counter() - first.history[-1].seconds, [first]
+    _try_alternatives(problem, recommend(problem, accuracy=_accuracy(stopping)), results, stopping, x0, None, begun)
+    return _best(results)
+
+
+def _try_alternatives(
+    problem: LCP, advice: Recommendation, results: list[SolveResult], stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None,
+    callback: Callable[[Record], None] | None, begun: float,
+) -> None:  # fmt: skip
+    """Solve by the alternatives of a method that has failed, until one does not or a limit has come."""
+    for name in advice.alternatives if not isinstance(stopping, MeanCriteria) else ():
+        criteria = _left(stopping or StoppingCriteria(max_iterations=steps_allowed(name)), begun, [] if stopping is None else results)
+        if criteria.max_iterations == 0:
             return
-        method = advice.method if name == advice.name else method_for(name, advice.traits)
-        yield name, partial(_solve_in_order, problem, method), criteria
+        attempt = partial(_solve_in_order, problem, method_for(name, advice.traits))
+        try:
+            if _try(results, name, attempt, criteria, x0, callback, begun):
+                return
+        except ValueError:  # a method that refuses this A
+            continue
+
+
+def _try(
+    results: list[SolveResult], name: str, attempt: Attempt, criteria: StoppingCriteria | MeanCriteria, x0: Array | None,
+    callback: Callable[[Record], None] | None, begun: float,
+) -> bool:  # fmt: skip
+    """Make an attempt, and add its result, whose records count what came before; return whether that ends the solve."""
+    shifted = partial(_after, results[-1].history[-1] if results else None, name, time.perf_counter() - begun)
+    result = attempt(criteria, x0, None if callback is None else lambda record: callback(shifted(record)))
+    results.append(replace(result, method=name, history=[shifted(record) for record in result.history]))
+    return result.status in ENDED
+
+
+def _best(results: list[SolveResult]) -> SolveResult:
+    """Return the result with the least residual, or the proof that there is none, with the steps and records of all attempts."""
+    last = results[-1]
+    if len(results) == 1:
+        return last
+    best = last if last.status is SolveStatus.INFEASIBLE else min(results, key=lambda result: result.residual)
+    status = last.status if last.status in ENDED else best.status
+    end, history = last.history[-1], [record for result in results for record in result.history]
+    return replace(best, status=status, iterations=end.iteration, linear_iterations=end.linear_iterations, history=history)
+
+
+def _accuracy(stopping: StoppingCriteria | MeanCriteria | None) -> float:
+    return min(max((stopping or StoppingCriteria()).rtol, EPS), 0.5)
 
 
 def _left(
-    stopping: StoppingCriteria | MeanCriteria, begun: float, results: list[SolveResult], reserve: bool
+    stopping: StoppingCriteria | MeanCriteria, begun: float, results: list[SolveResult], *, reserve: bool = False
 ) -> StoppingCriteria | MeanCriteria:
-    """Return criteria with the steps and the time that earlier attempts have left, some of them reserved for later ones."""
+    """Return criteria with the steps and the time that earlier attempts have left, some steps reserved for later ones."""
     most = stopping.max_iterations - (results[-1].history[-1].iteration if results else 0)
     most -= most // RESERVED if reserve and most >= FEW else 0
     changed = stopping if most == stopping.max_iterations else replace(stopping, max_iterations=max(most, 0))
@@ -138,11 +167,10 @@ def _left(
     return changed
 
 
-def _after(results: list[SolveResult], name: str, seconds: float, record: Record) -> Record:
+def _after(last: Record | None, name: str, seconds: float, record: Record) -> Record:
     """Return an attempt's record with the steps and seconds of those before it added; its first record names the method."""
-    if not results:
+    if last is None:
         return record
-    last = results[-1].history[-1]
     return replace(
         record, iteration=last.iteration + record.iteration, linear_iterations=last.linear_iterations + record.linear_iterations,
         step=f"start of {name}" if record.iteration == 0 else record.step, seconds=seconds + record.seconds,

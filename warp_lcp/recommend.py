@@ -101,14 +101,15 @@ class Rule:
 
 # fmt: off
 RULES: tuple[Rule, ...] = (
-    Rule("subspace-minimization", "Bounds that are affine in x, as friction has them, are for sweeps; systems on the free unknowns help them",
+    Rule("subspace-minimization", "Bounds that are affine in x, as friction has them, are for sweeps; systems on free unknowns help",
          lambda t: t.affine, 18, ("nncg", "blocked-gauss-seidel", "psor", "staggering")),
     Rule("projected-jacobi", "Bounds that are affine in x and no rows leave one method",
          lambda t: t.affine, None, ()),
     Rule("minimum-map-newton", "An operator that shows no rows cannot be swept, and Newton's method needs the fewest products",
          lambda t: t.kind == "operator", 8, ("mprgp", "primal-dual-active-set", "interior-point", "fischer-newton")),
     Rule("psor", "A grid or a sparse matrix that a few sweeps solve, as a trial says, needs no hierarchy and no systems",
-         lambda t: t.kind in FEW_SWEEPS and not t.direct and t.diagonal == "positive" and t.sweeps <= FEW_SWEEPS[t.kind], None, ("nncg", "minimum-map-newton")),
+         lambda t: t.kind in FEW_SWEEPS and not t.direct and t.diagonal == "positive" and t.sweeps <= FEW_SWEEPS[t.kind], None,
+         ("nncg", "minimum-map-newton")),
     Rule("projected-multigrid", "On a grid the number of multigrid cycles hardly depends on its size",
          lambda t: t.kind == "grid" and t.points, 8, ("minimum-map-newton", "mprgp")),
     Rule("minimum-map-newton", "A stencil that is not symmetric, or that only lines smooth, has a hierarchy for Newton's systems",
@@ -132,9 +133,11 @@ RULES: tuple[Rule, ...] = (
 def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget | None = None) -> Recommendation:
     """Return a method for a problem, with reasons.
 
-    The rules decide by what A and the bounds look like; `wl.solve` without a method decides by them too. Sweeps are tried only
-    on unsymmetric sparse matrices and where there is a budget; factorizations, of at most 2,048 unknowns, only on symmetric matrices. They were made from times of all methods on one core of an AMD EPYC, and hold for the CPU; docs
-    "Choosing a method" gives the decision list and how often it is right.
+    The rules decide by what A and the bounds look like; `wl.solve` without a method decides by them
+    too. Sweeps are tried only on unsymmetric sparse matrices and where there is a budget; only
+    symmetric matrices are factored, at most 2,048 rows of them. They were made from times of all
+    methods on one core of an AMD EPYC, and hold for the CPU; docs "Choosing a method" gives the
+    decision list and how often it is right.
 
     Args:
         problem: the LCP; it is not changed.

@@ -1,7 +1,8 @@
-"""What a problem's matrix and bounds look like: what `warp_lcp.recommend` decides by, each found when a rule first asks for it."""
+"""Traits of a problem's matrix and bounds, by which `warp_lcp.recommend` decides."""
 
 from __future__ import annotations
 
+import math
 from functools import cache, cached_property
 from importlib.util import find_spec
 from typing import Any
@@ -19,21 +20,23 @@ from warp_lcp.problem.protocol import HasRows, HasStencil, has, layout_of, takes
 from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.solvers.minimum_map_newton_direct import suits
-from warp_lcp.solvers.psor import ProjectedSOR
+from warp_lcp.solvers.psor import ProjectedSOR, grid_omega, has_advised_omega
 from warp_lcp.solvers.registry import METHODS
 
-MOST_FACTORED = 500  # unknowns of a matrix whose Cholesky factorization is tried: it takes 4 ms there
-SHARE_FACTORED = 2  # of more unknowns of a symmetric dense matrix every second one, up to MOST_SAMPLED: the square of 2,048 takes 0.2 s
-MOST_SAMPLED = 2048
+MOST_FACTORED = 500  # unknowns of a matrix whose Cholesky factorization is tried: 4 ms
+# of more unknowns of a dense matrix every second one, up to MOST_SAMPLED: 0.2 s
+SHARE_FACTORED, MOST_SAMPLED = 2, 2048
 TRIAL, TRIAL_RATE = 8, 4  # sweeps on trial, and how many of the last tell the rate: the first ones remove what is rough in the error
 PIVOT = 1e-11  # of the largest diagonal entry: semi-definite matrices in float64 leave squared pivots of that size
-# of a diagonal entry: where most pivots are smaller, Newton's method cycles or PIQP is faster, by 17 kernels and 39 dense matrices; the
-# second where systems are not solved directly on the host
+# of a diagonal entry: where most pivots are smaller, Newton's method cycles or PIQP is faster (17
+# kernels and 39 dense matrices tried); the second where systems are not solved on the host
 LOW_RANK, LOW_RANK_ITERATIVE = 0.1, 0.3
 
 
 class Traits:
-    """What is known of a problem. Each property is computed when it is first read, at the price of a product or less unless it says more.
+    """What is known of a problem; each property is computed when it is first read.
+
+    That costs a product or less unless it says more.
 
     Args:
         problem: the LCP; it is not changed.
@@ -87,7 +90,7 @@ class Traits:
 
     @cached_property
     def definiteness(self) -> str:
-        """Return whether A's symmetric part is "definite", "semidefinite", "indefinite", or "unknown" where finding out is too dear.
+        """Return whether A's symmetric part is "definite", "semidefinite", "indefinite" or "unknown".
 
         By dominance, or of at most MOST_FACTORED unknowns by a Cholesky factorization or two.
         """
@@ -99,10 +102,11 @@ class Traits:
 
     @cached_property
     def low_rank(self) -> bool:
-        """Return whether half of a symmetric matrix is nearly in the span of the other half: few of its eigenvalues carry the trace.
+        """Return whether A is symmetric and few of its eigenvalues carry the trace.
 
-        By whether most pivots of a Cholesky factorization are small beside the diagonal entries; beyond MOST_FACTORED unknowns of
-        dense matrices those of every second row and column, of sparse ones False.
+        By whether most pivots of a Cholesky factorization are small beside the diagonal entries;
+        beyond MOST_FACTORED unknowns, of dense matrices those of every second row and column, of
+        sparse ones False.
         """
         n = self.unknowns
         if not self.symmetric or self.diagonal != "positive" or self.kind not in ("dense", "sparse"):
@@ -132,7 +136,9 @@ class Traits:
 
     @cached_property
     def sweeps(self) -> float:
-        """Return how many sweeps of `ProjectedSOR` the accuracy would take, extrapolated from the rate of TRIAL ones, which are made.
+        """Return how many sweeps of `ProjectedSOR` the accuracy would take.
+
+        On grids by the rate omega - 1 of the advised omega, else extrapolated from the rate of TRIAL sweeps, which are made.
 
         inf where they do not converge, are not possible or are not tried.
         """
@@ -161,23 +167,14 @@ class Traits:
             return False
         if not takes(method, problem.A) or self.unknowns > getattr(method, "most_unknowns", self.unknowns):
             return False
-        asked = {
-            "preconditioned": problem.preconditioner is not None,
-            "affine_bounds": self.affine,
-            "distributed": self.ranks,
-        }
+        asked = {"preconditioned": problem.preconditioner is not None, "affine_bounds": self.affine, "distributed": self.ranks}
         return all(getattr(method, ability, False) for ability, needed in asked.items() if needed)
 
     @property
-    def singular(self) -> bool:
-        """Return whether A is symmetric without being definite; a negative entry on the diagonal is no matter of its null space."""
-        return self.symmetric and self.definiteness in ("semidefinite", "indefinite") and self.diagonal != "negative"
-
-    @property
     def pivotable(self) -> bool:
-        """Return whether A has an entry <= 0 on its diagonal, as the slip speeds of friction cones have them, and is no Hessian of a convex function.
+        """Return whether A is no Hessian of a convex function and has an entry <= 0 on its diagonal.
 
-        That is unsymmetric, or symmetric with a zero and indefinite, as a game of two players with one matrix.
+        That is unsymmetric, as with friction cones, or with a zero and indefinite, as in games.
         """
         if not self.symmetric:
             return self.diagonal != "positive"
@@ -219,7 +216,9 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
 
 
 def sweeps_to(problem: LCP, accuracy: float) -> float:
-    """Return how many sweeps would reach a relative residual, by the rate of the last of TRIAL sweeps; inf if they get nowhere."""
+    """Return how many sweeps would reach a relative residual, by theory on grids, else on trial; inf if sweeps get nowhere."""
+    if has_advised_omega(problem):
+        return math.log(accuracy) / math.log(grid_omega(problem, singular=False) - 1)
     try:
         trial = solve(problem, ProjectedSOR(), stopping=StoppingCriteria(rtol=accuracy, max_iterations=TRIAL))
     except ValueError:

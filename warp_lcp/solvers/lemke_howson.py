@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 
 
 def strategies(M: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the two players' unknowns if M = [[0, E], [F', 0]], E > 0, F > 0, q < 0 in some order: a bimatrix game of costs."""
+    """Return the unknowns of two players, None if this is no game.
+
+    A bimatrix game of costs has M = [[0, E], [F', 0]], E > 0, F > 0 and q < 0, in some order.
+    """
     if not (q < 0).all() or (M.diagonal() != 0).any():
         return None
     own = M[0] == 0
@@ -22,12 +25,14 @@ def strategies(M: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | 
 
 
 def start_game(basis: Basis) -> bool:
-    """Begin where the first player's first strategy is answered best; return False, and change nothing, if this is no game.
+    """Begin with the first player's first strategy; return False if this is no game.
 
-    w = q + M z. With d > 0 z0 makes all w >= 0, the first complement that enters then meets no row, as its block of M is 0: a ray. Lemke and
-    Howson begin with z_k alone, as large as makes w >= 0 for the other player, w_s = 0 there; then z_s, as large as makes w >= 0
-    for the first one, w_r = 0 there. That is a feasible basis, complementary but for pair k; it is the solution if r = k, else z_r enters,
-    and the path ends where a variable of pair k leaves. As E, F > 0 it meets no ray.
+    w = q + M z. Lemke's z0, with d > 0, makes all w >= 0; the first complement that enters then
+    meets no row, as its block of M is 0: a ray. Lemke and Howson begin with z_k alone, as large as
+    makes w >= 0 for the other player, w_s = 0 there; then z_s, as large as makes w >= 0 for the
+    first one, w_r = 0 there. That is a feasible basis, complementary but for pair k: the solution
+    if r = k. Else z_r enters, and the path ends where a variable of pair k leaves; as E, F > 0, it
+    meets no ray.
     """
     players = strategies(basis.M, basis.q)
     if players is None:
@@ -36,7 +41,8 @@ def start_game(basis: Basis) -> bool:
     entering = pair
     for rows in reversed(players):
         sizes = -basis.q[rows] / basis.M[rows, entering]
-        row = int(rows[np.flatnonzero(sizes >= sizes.max())[-1]])  # of ties the last: the others' rows stay lexicographically positive
+        # of ties the last: the rows of the others stay lexicographically positive
+        row = int(rows[np.flatnonzero(sizes >= sizes.max())[-1]])
         basis.exchange(row, m + entering)
         entering = row
     basis.ends = (pair, m + pair)
