@@ -183,7 +183,7 @@ def low_rank(rng: np.random.Generator, ridge: float) -> wl.LCP:
 
 
 def support_vectors(rng: np.random.Generator) -> wl.LCP:
-    """Return the dual of a support vector machine without a bias: labels times a kernel, 0 <= x <= C."""
+    """Return the dual of a support vector machine without a bias: 0 <= x <= C."""
     n, d = between(rng, 30, 400), between(rng, 2, 30)
     points = rng.standard_normal((n, d))
     labels = np.where(points[:, 0] + 0.7 * rng.standard_normal(n) > 0, 1.0, -1.0)
@@ -193,7 +193,7 @@ def support_vectors(rng: np.random.Generator) -> wl.LCP:
 
 
 def portfolio(rng: np.random.Generator) -> wl.LCP:
-    """Return Markowitz's problem: min x'Sx / 2 - mu'x, sum x = 1, 0 <= x <= c, with the multiplier of the sum as last unknown."""
+    """Return Markowitz's problem, the multiplier of sum x = 1 as last unknown."""
     n, d = between(rng, 20, 200), between(rng, 2, 10)
     F = rng.standard_normal((n, d))
     A = np.zeros((n + 1, n + 1))
@@ -204,7 +204,7 @@ def portfolio(rng: np.random.Generator) -> wl.LCP:
 
 
 def game(rng: np.random.Generator) -> wl.LCP:
-    """Return a bimatrix game of costs >= 1: x, y >= 0, E y >= 1, F'x >= 1, which is an LCP with zeros on its diagonal."""
+    """Return a bimatrix game of costs >= 1: x, y >= 0, E y >= 1, F'x >= 1."""
     p, q = between(rng, 2, 60), between(rng, 2, 60)
     A = np.zeros((p + q, p + q))
     A[:p, p:], A[p:, :p] = rng.uniform(1, 2, (p, q)), rng.uniform(1, 2, (q, p))
@@ -212,7 +212,7 @@ def game(rng: np.random.Generator) -> wl.LCP:
 
 
 def linear_program(rng: np.random.Generator) -> wl.LCP:
-    """Return min c'z, G z >= h, z >= 0 with its dual, a skew LCP; both are feasible by construction."""
+    """Return min c'z, G z >= h, z >= 0 with its dual, a skew LCP; both are feasible."""
     n, m = between(rng, 5, 80), between(rng, 3, 60)
     G = rng.standard_normal((m, n))
     z, multipliers = (np.maximum(rng.standard_normal(size), 0.0) for size in (n, m))
@@ -223,7 +223,7 @@ def linear_program(rng: np.random.Generator) -> wl.LCP:
 
 
 def p_matrix(rng: np.random.Generator, seed: int) -> wl.LCP:
-    """Return a dense P-matrix: the positive definite part of a random one plus a large skew one, in rows and columns of other sizes."""
+    """Return a dense P-matrix: definite plus large skew, rows and columns scaled."""
     n = between(rng, 10, 300)
     B, C = rng.standard_normal((2, n, n)) / n**0.5
     A = (B @ B.T + 0.1 * np.eye(n) + 2 * (C - C.T)) * 10 ** rng.uniform(-1, 1, n) * 10 ** rng.uniform(-1, 1, (n, 1))
@@ -231,7 +231,7 @@ def p_matrix(rng: np.random.Generator, seed: int) -> wl.LCP:
 
 
 def laplacian(rng: np.random.Generator) -> wl.LCP:
-    """Return the Laplacian of a random graph of some components, singular, under loads that its bounds can carry."""
+    """Return the Laplacian of a random graph, singular, under loads that bounds carry."""
     n = between(rng, 50, 3000)
     ends = rng.integers(0, n, (2, 2 * n))
     ends = ends[:, ends[0] != ends[1]]
@@ -243,7 +243,7 @@ def laplacian(rng: np.random.Generator) -> wl.LCP:
 
 
 def stack(rng: np.random.Generator, seed: int) -> wl.LCP:
-    """Return contacts without friction, more than the bodies need: J M^-1 J' with dependent rows, sparse or dense."""
+    """Return contacts without friction: J M^-1 J' with dependent rows."""
     made = frozen(rng, seed)
     normals = np.flatnonzero(np.isinf(np.asarray(made.upper)) & (np.asarray(made.lower) == 0))
     A = scipy.sparse.csr_array(made.A)[normals][:, normals]
@@ -259,7 +259,7 @@ def products(rng: np.random.Generator, seed: int) -> wl.LCP:
 
 
 def membrane(rng: np.random.Generator) -> wl.LCP:
-    """Return a membrane under a load on a random triangulation-like graph: a shifted sparse Laplacian, one-sided or between obstacles."""
+    """Return a membrane under a load: a sparse Laplacian, shifted unevenly."""
     m = between(rng, 8, 90)
     T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
     weights = scipy.sparse.diags_array(rng.uniform(0.5, 2, m * m))

@@ -1,4 +1,4 @@
-"""`wl.solve`: by a given method, or by the recommended one and, where that fails, by its alternatives."""
+"""`wl.solve`: a given method, or the recommended one and then its alternatives."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Attempt = Callable[[StoppingCriteria | MeanCriteria, Array | None, Callable[[Rec
 
 
 def default_method(problem: LCP) -> Solver:
-    """Return the method that `wl.recommend` names for a problem, which `wl.solve` takes first if none is given."""
+    """Return the method that `wl.recommend` names, which `wl.solve` takes first."""
     return recommend(problem).method
 
 
@@ -47,10 +47,11 @@ def solve(
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
-        solver: the method, say `MinimumMapNewton()`. None: what `wl.recommend` names, and where that fails, its alternatives, each from
-            the same start: iterations and linear iterations add up, no more than `stopping` allows in all; the history has all of them,
-            each attempt's first record names its method, and the result's `method` is the one that found x. Sparse matrices that are a
-            compact stencil on a box of cells in its natural order, x first, are then solved as such, which the result's `grid` says.
+        solver: the method, say `MinimumMapNewton()`. None: what `wl.recommend` names, and where that
+            fails, its alternatives, each from the same start. Their steps add up, no more than
+            `stopping` allows in all; the history has all of them, and the result's `method` names
+            the one that found x. Sparse matrices that are a compact stencil on a box of cells in its
+            natural order, x first, are then solved as such, which the result's `grid` says.
         stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that `wl.recommend` gives if there is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
         workspace: what `solver.init(problem)` returned, to use its memory again.
@@ -84,7 +85,7 @@ def solve(
 def _solve_by_choice(
     problem: LCP, stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None, callback: Callable[[Record], None] | None
 ) -> SolveResult:
-    """Solve by the recommended method; where it fails, by its alternatives in turn, while limits allow; return the best x."""
+    """Solve by the recommended method, then by its alternatives; return the best x."""
     begun, results = time.perf_counter(), list[SolveResult]()
     grid, accuracy = _as_grid(problem), _accuracy(stopping)
     advice = recommend(problem if grid is None else grid, accuracy=accuracy)
@@ -116,7 +117,7 @@ def _try_alternatives(
     problem: LCP, advice: Recommendation, results: list[SolveResult], stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None,
     callback: Callable[[Record], None] | None, begun: float,
 ) -> None:  # fmt: skip
-    """Solve by the alternatives of a method that has failed, until one does not or a limit has come."""
+    """Solve by alternatives until one succeeds or a limit has come."""
     for name in advice.alternatives if not isinstance(stopping, MeanCriteria) else ():
         criteria = _left(stopping or StoppingCriteria(max_iterations=steps_allowed(name)), begun, [] if stopping is None else results)
         if criteria.max_iterations == 0:
@@ -133,7 +134,7 @@ def _try(
     results: list[SolveResult], name: str, attempt: Attempt, criteria: StoppingCriteria | MeanCriteria, x0: Array | None,
     callback: Callable[[Record], None] | None, begun: float,
 ) -> bool:  # fmt: skip
-    """Make an attempt, and add its result, whose records count what came before; return whether that ends the solve."""
+    """Make an attempt and add its result; return whether that ends the solve."""
     shifted = partial(_after, results[-1].history[-1] if results else None, name, time.perf_counter() - begun)
     result = attempt(criteria, x0, None if callback is None else lambda record: callback(shifted(record)))
     results.append(replace(result, method=name, history=[shifted(record) for record in result.history]))
@@ -141,7 +142,7 @@ def _try(
 
 
 def _best(results: list[SolveResult]) -> SolveResult:
-    """Return the result with the least residual, or the proof that there is none, with the steps and records of all attempts."""
+    """Return the best result, or a proof of infeasibility, with all steps and records."""
     last = results[-1]
     if len(results) == 1:
         return last
@@ -158,7 +159,7 @@ def _accuracy(stopping: StoppingCriteria | MeanCriteria | None) -> float:
 def _left(
     stopping: StoppingCriteria | MeanCriteria, begun: float, results: list[SolveResult], *, reserve: bool = False
 ) -> StoppingCriteria | MeanCriteria:
-    """Return criteria with the steps and the time that earlier attempts have left, some steps reserved for later ones."""
+    """Return criteria with the steps and the time that earlier attempts have left."""
     most = stopping.max_iterations - (results[-1].history[-1].iteration if results else 0)
     most -= most // RESERVED if reserve and most >= FEW else 0
     changed = stopping if most == stopping.max_iterations else replace(stopping, max_iterations=max(most, 0))
@@ -168,7 +169,7 @@ def _left(
 
 
 def _after(last: Record | None, name: str, seconds: float, record: Record) -> Record:
-    """Return an attempt's record with the steps and seconds of those before it added; its first record names the method."""
+    """Return a record with the steps and seconds of earlier attempts added."""
     if last is None:
         return record
     return replace(
@@ -202,7 +203,7 @@ def _solve_in_order(
     problem: LCP, solver: Solver, stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None,
     callback: Callable[[Record], None] | None,
 ) -> SolveResult:  # fmt: skip
-    """Solve a problem, a sparse matrix numbered at random in the order of Cuthill and McKee if the method's steps do not depend on it."""
+    """Solve a problem; matrices numbered at random in the order of Cuthill and McKee."""
     plain = problem.bounds.affine is None and problem.preconditioner is None and isinstance(solver, ANY_NUMBERING)
     begun = time.perf_counter()
     found = problem.A.renumbered() if plain and isinstance(problem.A, SparseOperator) else None

@@ -41,7 +41,7 @@ class Traits:
     Args:
         problem: the LCP; it is not changed.
         accuracy: relative residual that `sweeps` is for, in (0, 1).
-        trial: whether sweeps may be tried on any matrix and on grids; else on unsymmetric sparse ones only.
+        trial: whether sweeps may be tried on any matrix; else on unsymmetric sparse ones only.
     """
 
     def __init__(self, problem: LCP, accuracy: float, *, trial: bool = True) -> None:
@@ -49,7 +49,7 @@ class Traits:
 
     @cached_property
     def kind(self) -> str:
-        """Return "grid", "sparse", "dense" or "operator", one that shows products only or is spread over ranks."""
+        """Return "grid", "sparse", "dense", or "operator" of products only or on ranks."""
         A = self._problem.A
         if has(A, HasStencil):
             return "grid"
@@ -138,7 +138,8 @@ class Traits:
     def sweeps(self) -> float:
         """Return how many sweeps of `ProjectedSOR` the accuracy would take.
 
-        On grids by the rate omega - 1 of the advised omega, else extrapolated from the rate of TRIAL sweeps, which are made.
+        On grids by the rate omega - 1 of the advised omega, else extrapolated from the rate of TRIAL
+        sweeps, which are made.
 
         inf where they do not converge, are not possible or are not tried.
         """
@@ -147,21 +148,21 @@ class Traits:
 
     @cached_property
     def direct(self) -> bool:
-        """Return whether the matrix is so small or narrow that its systems are solved directly on the host."""
+        """Return whether systems are solved directly on the host: A is small or narrow."""
         return self._problem.preconditioner is None and suits(self._problem.A)
 
     @cached_property
     def points(self) -> bool:
-        """Return whether point sweeps smooth on a grid: its stencil is symmetric and needs no lines."""
+        """Return whether a grid's stencil is symmetric and needs no line smoothing."""
         return takes_points(self._problem.A)
 
     @cached_property
     def able(self) -> tuple[str, ...]:
-        """Return the names of the methods that take such an operator, so many unknowns and such bounds."""
+        """Return the names of the methods that take the problem."""
         return tuple(name for name in METHODS if self.takes(name))
 
     def takes(self, name: str) -> bool:
-        """Return whether a method takes the operator, the number of unknowns, the bounds, a preconditioner and several ranks."""
+        """Return whether a method takes the operator, its size, the bounds and the rest."""
         method, problem = METHODS[name], self._problem
         if name == "quadratic-program" and not (self.symmetric and has_piqp()):
             return False
@@ -216,7 +217,7 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
 
 
 def sweeps_to(problem: LCP, accuracy: float) -> float:
-    """Return how many sweeps would reach a relative residual, by theory on grids, else on trial; inf if sweeps get nowhere."""
+    """Return how many sweeps would reach a relative residual, inf if they get nowhere."""
     if has_advised_omega(problem):
         return math.log(accuracy) / math.log(grid_omega(problem, singular=False) - 1)
     try:

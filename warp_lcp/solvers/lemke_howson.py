@@ -1,4 +1,4 @@
-"""The start of Lemke and Howson's method, for bimatrix games, on which Lemke's own start ends in a ray at once."""
+"""The start of Lemke and Howson's method, for bimatrix games."""
 
 from __future__ import annotations
 

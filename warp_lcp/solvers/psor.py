@@ -27,9 +27,10 @@ class ProjectedSOR(Settings):
     x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order otherwise. Converges for symmetric positive
     definite A and 0 < omega < 2 ([Book] 2.2.2). The iteration count grows with the grid: on 64^3 cells to 1e-3 and 1e-6 about 1,750 and
     4,000 sweeps with omega = 1, 110 and 200 with the best omega, 1.9, where ProjectedMultigrid takes 5 and 8
-    cycles; a splash of 20^3 and 32^3 cells takes 210 and 497 with 1.4, 73 and 102 with `advised_omega`, the default on grids. A time step
-    of an American put, 2,000 nodes on a line, takes 2,031 sweeps with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than
-    the 100 that StoppingCriteria allows unless told otherwise.
+    cycles; a splash of 20^3 and 32^3 cells takes 210 and 497 with 1.4, 73 and 102 with `advised_omega`,
+    the default on grids. A time step of an American put, 2,000 nodes on a line, takes 2,031 sweeps
+    with omega = 1, 851 with 1.4, 124 with `advised_omega`: more than the 100 that StoppingCriteria
+    allows unless told otherwise.
 
     Where A_ii = 0, x_i goes to the bound that the sign of y_i asks for, and stays where y_i = 0 or there is no such bound; where A_ii < 0
     it goes to the bound that solves the scalar problem, of two the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in
@@ -42,9 +43,9 @@ class ProjectedSOR(Settings):
     book names these without defining them; the definitions are ours. Sweeps in another than the operator's order are made by one thread.
 
     Args:
-        omega: relaxation factor in (0, 2); 1 is projected Gauss-Seidel. None: `advised_omega` on grids with a symmetric stencil and
-            constant bounds, at the price of 60 products whenever the operator has changed; 1.4 elsewhere, the best of the book's
-            parameter study (fig. C.4).
+        omega: relaxation factor in (0, 2); 1 is projected Gauss-Seidel. None: `advised_omega`
+            on grids with a symmetric stencil and constant bounds, at the price of 60 products
+            whenever the operator has changed; 1.4 elsewhere, the best of the book's parameter study.
         direction: "forward", "backward", or "symmetric", which follows every forward sweep with a backward one.
         order: "natural"; for sparse matrices "multicolor", whose colors are swept at once (the default on CUDA); for dense and sparse ones
             "magnitude", the largest |x_i| first, or "greedy", in which a sweep is n times the row that would change most, O(n^2).
@@ -136,15 +137,16 @@ class SORWorkspace(SweepWorkspace):
 
 
 def has_advised_omega(problem: LCP) -> bool:
-    """Return whether omega is `advised_omega` unless given: on grids with a symmetric stencil and constant bounds."""
+    """Return whether A is a symmetric grid and no bound is affine in x."""
     return has(problem.A, HasStencil) and problem.A.symmetric and problem.bounds.affine is None
 
 
 def grid_omega(problem: LCP, *, singular: bool) -> float:
     """Return the advised relaxation factor of a grid.
 
-    On a singular grid, where lambda_min = 0 would advise 2, at most what a quarter of a wave along its longest side asks for: there
-    lambda_min = 1 - cos(pi / (2 (n + 1))), which makes Young's formula 2 / (1 + sin(pi / (2 (n + 1)))).
+    On a singular grid lambda_min = 0 would advise 2: at most what a quarter of a wave along its
+    longest side asks for. There lambda_min = 1 - cos(pi / (2 (n + 1))), so that Young's formula is
+    2 / (1 + sin(pi / (2 (n + 1)))).
     """
     most = 2 / (1 + math.sin(math.pi / (2 * (max(problem.layout.shape) + 1)))) if singular else 2.0
     try:
