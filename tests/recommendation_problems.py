@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse
+import scipy.sparse.csgraph
 import warp as wp
 
 import warp_lcp as wl
@@ -171,3 +172,124 @@ def make(family: str, seed: int) -> tuple[str, wl.LCP, float]:
     if isinstance(made, wl.LCP):
         return f"{family} {made.A.shape}", made, accuracy_of(number)
     return made.name, made.lcp(device=DEVICE), accuracy_of(number)
+
+
+def low_rank(rng: np.random.Generator, ridge: float) -> wl.LCP:
+    """Return a convex box problem F F' + ridge I, n x n of rank d < n, dense."""
+    n, d = between(rng, 20, 300), between(rng, 2, 20)
+    F, low = rng.standard_normal((n, d)), -float(rng.integers(2))
+    b = -rng.random(n) if rng.random() < 0.5 else rng.standard_normal(n)
+    return wl.LCP(F @ F.T + ridge * np.eye(n), b, low, 10.0 ** float(rng.uniform(-1, 1)))
+
+
+def support_vectors(rng: np.random.Generator) -> wl.LCP:
+    """Return the dual of a support vector machine without a bias: 0 <= x <= C."""
+    n, d = between(rng, 30, 400), between(rng, 2, 30)
+    points = rng.standard_normal((n, d))
+    labels = np.where(points[:, 0] + 0.7 * rng.standard_normal(n) > 0, 1.0, -1.0)
+    squares = ((points[:, None] - points) ** 2).sum(axis=2)
+    kernel = points @ points.T if rng.random() < 0.6 else np.exp(-squares / (2 * d))
+    return wl.LCP(labels[:, None] * kernel * labels, -np.ones(n), 0.0, 10.0 ** float(rng.uniform(-1, 2)))
+
+
+def portfolio(rng: np.random.Generator) -> wl.LCP:
+    """Return Markowitz's problem, the multiplier of sum x = 1 as last unknown."""
+    n, d = between(rng, 20, 200), between(rng, 2, 10)
+    F = rng.standard_normal((n, d))
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n] = F @ F.T / d + np.diag(rng.uniform(0.01, 0.5, n))
+    A[:n, n], A[n, :n] = -1.0, 1.0
+    most = np.append(np.full(n, max(0.2, 4 / n)), np.inf)
+    return wl.LCP(A, np.append(-0.3 * rng.standard_normal(n), -1.0), np.append(np.zeros(n), -np.inf), most)
+
+
+def game(rng: np.random.Generator) -> wl.LCP:
+    """Return a bimatrix game of costs >= 1: x, y >= 0, E y >= 1, F'x >= 1."""
+    p, q = between(rng, 2, 60), between(rng, 2, 60)
+    A = np.zeros((p + q, p + q))
+    A[:p, p:], A[p:, :p] = rng.uniform(1, 2, (p, q)), rng.uniform(1, 2, (q, p))
+    return wl.LCP(A, -np.ones(p + q))
+
+
+def linear_program(rng: np.random.Generator) -> wl.LCP:
+    """Return min c'z, G z >= h, z >= 0 with its dual, a skew LCP; both are feasible."""
+    n, m = between(rng, 5, 80), between(rng, 3, 60)
+    G = rng.standard_normal((m, n))
+    z, multipliers = (np.maximum(rng.standard_normal(size), 0.0) for size in (n, m))
+    h = G @ z - np.where(multipliers > 0, 0.0, rng.random(m))
+    c = G.T @ multipliers + np.where(z > 0, 0.0, rng.random(n))
+    A = np.block([[np.zeros((n, n)), -G.T], [G, np.zeros((m, m))]])
+    return wl.LCP(scipy.sparse.csr_array(A) if rng.random() < 0.5 else A, np.concatenate([c, -h]))
+
+
+def p_matrix(rng: np.random.Generator, seed: int) -> wl.LCP:
+    """Return a dense P-matrix: definite plus large skew, rows and columns scaled."""
+    n = between(rng, 10, 300)
+    B, C = rng.standard_normal((2, n, n)) / n**0.5
+    A = (B @ B.T + 0.1 * np.eye(n) + 2 * (C - C.T)) * 10 ** rng.uniform(-1, 1, n) * 10 ** rng.uniform(-1, 1, (n, 1))
+    return planted(A, np.random.default_rng(seed), plant(rng), name="P", facts=frozenset({"p-matrix"})).lcp(device=DEVICE)
+
+
+def laplacian(rng: np.random.Generator) -> wl.LCP:
+    """Return the Laplacian of a random graph, singular, under loads that bounds carry."""
+    n = between(rng, 50, 3000)
+    ends = rng.integers(0, n, (2, 2 * n))
+    ends = ends[:, ends[0] != ends[1]]
+    W = scipy.sparse.coo_array((rng.uniform(0.1, 1, ends.shape[1]), tuple(ends)), shape=(n, n)).tocsr()
+    L = scipy.sparse.csgraph.laplacian(W + W.T)
+    boxed = rng.random() < 0.5
+    b = rng.standard_normal(n) if boxed else 0.3 * rng.random(n)
+    return wl.LCP(scipy.sparse.csr_array(L), b, -rng.random(n), 1.0 if boxed else np.inf)
+
+
+def stack(rng: np.random.Generator, seed: int) -> wl.LCP:
+    """Return contacts without friction: J M^-1 J' with dependent rows."""
+    made = frozen(rng, seed)
+    normals = np.flatnonzero(np.isinf(np.asarray(made.upper)) & (np.asarray(made.lower) == 0))
+    A = scipy.sparse.csr_array(made.A)[normals][:, normals]
+    return wl.LCP(A if rng.random() < 0.5 else A.toarray(), np.asarray(made.b)[normals])
+
+
+def products(rng: np.random.Generator, seed: int) -> wl.LCP:
+    """Return a problem whose matrix shows its products only."""
+    n = between(rng, 20, 400)
+    made = gallery.definite(n, condition=10.0 ** float(rng.uniform(0, 3)), plant=plant(rng), seed=seed)
+    A = np.asarray(made.A)
+    return wl.LCP(wl.LinearOperator(lambda x: A @ x, shape=(n,), symmetric=True), made.b, made.lower, made.upper)
+
+
+def membrane(rng: np.random.Generator) -> wl.LCP:
+    """Return a membrane under a load: a sparse Laplacian, shifted unevenly."""
+    m = between(rng, 8, 90)
+    T = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(m, m))
+    weights = scipy.sparse.diags_array(rng.uniform(0.5, 2, m * m))
+    L = scipy.sparse.kron(scipy.sparse.eye_array(m), T) + scipy.sparse.kron(T, scipy.sparse.eye_array(m))
+    A = scipy.sparse.csr_array(L + float(rng.uniform(0, 0.1)) * weights)
+    b = rng.uniform(-10, 2, m * m) / m**2
+    return wl.LCP(A, b, 0.0, float(rng.uniform(0.05, 0.3)) if rng.random() < 0.5 else np.inf)
+
+
+KINDS: dict[str, Make] = {  # plain problems of many fields, all of which have solutions
+    "pressure": lambda r, s: liquid(r, 32),
+    "membrane": lambda r, s: membrane(r),
+    "low rank": lambda r, s: low_rank(r, 0.0),
+    "ridge": lambda r, s: low_rank(r, 10.0 ** float(r.uniform(-4, -1))),
+    "support vectors": lambda r, s: support_vectors(r),
+    "portfolio": lambda r, s: portfolio(r),
+    "game": lambda r, s: game(r),
+    "linear program": lambda r, s: linear_program(r),
+    "pyramid": lambda r, s: scene(r, s, StewartTrinkleModel(int(r.choice([4, 8])))),
+    "boxed friction": lambda r, s: scene(r, s, None),
+    "flow": flow,
+    "P-matrix": p_matrix,
+    "graph": lambda r, s: laplacian(r),
+    "stack": stack,
+    "products": products,
+}
+
+
+def draw(kind: str, seed: int) -> wl.LCP:
+    """Return a problem of a kind."""
+    number = 1000 * list(KINDS).index(kind) + seed
+    made = KINDS[kind](np.random.default_rng([number, 333]), number)
+    return made if isinstance(made, wl.LCP) else made.lcp(device=DEVICE)

@@ -6,10 +6,13 @@ import scipy.sparse
 
 import warp_lcp as wl
 from oracle import natural_residual
-from recommendation_problems import FAMILIES, make
+from recommendation_problems import FAMILIES, KINDS, draw, make
 from warp_lcp import gallery
+from warp_lcp.gallery.contact_models import BoxedModel
+from warp_lcp.gallery.contact_scenes import SCENES, SETTLING
+from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.recommend import LEAN, RULES, memory_of
-from warp_lcp.traits import traits_of
+from warp_lcp.traits import Traits, traits_of
 
 SEEDS = range(700, 703)  # neither those of the rules nor those of the published check
 COUNTED = [family for family in FAMILIES if not family.startswith("scene")]  # contacts at rest are tried below
@@ -165,7 +168,7 @@ def test_small_and_narrow_matrices_get_the_default(n):
 
 def test_a_budget_of_steps_is_a_limit_and_changes_the_method():
     lcp = gallery.banded(3000, bands=4, seed=78).lcp(device="cpu")
-    free = wl.recommend(lcp, accuracy=1e-8)
+    free = wl.recommend(lcp, accuracy=1e-8, budget=wl.Budget(iterations=1000))
     assert free.name == "psor"
     few = wl.recommend(lcp, accuracy=1e-8, budget=wl.Budget(iterations=8))
     assert few.name == "minimum-map-newton"
@@ -202,3 +205,99 @@ def test_rules_name_methods_and_the_last_one_takes_all():
         assert rule.steps is None or rule.steps >= 1
     assert RULES[-1].applies(traits_of(wl.LCP(NO_INDEFINITE, np.ones(5)), 0.1))
     assert set(LEAN) <= set(wl.METHODS)
+
+
+BOXES = ("low rank", "ridge", "support vectors")
+
+
+def check_default(kind, seed):
+    """The default solves a problem to 1e-6, and takes first what is recommended."""
+    lcp = draw(kind, seed)
+    result = wl.solve(lcp)
+    assert result, f"{kind} {seed}: {result.method} ends {result.status.name} at {result.relative_residual:.1e}"
+    if kind in BOXES:
+        A, b, low, high = lcp.A.matrix.numpy(), lcp.b.numpy(), lcp.lower.numpy(), lcp.upper.numpy()
+        start = natural_residual(A, b, low, high, np.clip(0 * b, low, high))
+        assert natural_residual(A, b, low, high, result.x.numpy()) <= 1.01e-6 * start
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_default_solves_plain_problems(kind):
+    check_default(kind, 810)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(811, 821))
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_default_solves_many_plain_problems(kind, seed):
+    check_default(kind, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("piqp", [True, False])
+@pytest.mark.parametrize("seed", range(821, 841))
+@pytest.mark.parametrize("kind", BOXES)
+def test_the_default_solves_convex_boxes_of_low_rank(kind, seed, piqp, monkeypatch):
+    if not piqp:
+        monkeypatch.setattr("warp_lcp.traits.has_piqp", lambda: False)
+    check_default(kind, seed)
+
+
+@pytest.fixture
+def misled(monkeypatch):
+    """A convex box of rank 3 that is taken for one of full rank: Newton's method stagnates on it."""
+    monkeypatch.setattr(Traits, "low_rank", False)
+    rng = np.random.default_rng([60, 3, 0])
+    F = rng.standard_normal((60, 3)) * np.sign(rng.standard_normal((60, 1)))
+    return wl.LCP(F @ F.T, -np.ones(60), 0.0, 1.0)
+
+
+def test_a_method_that_fails_is_followed_by_its_alternatives(misled):
+    told, alone = [], wl.solve(misled, wl.default_method(misled), stopping=wl.StoppingCriteria(max_iterations=75))
+    assert not alone
+    result = wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=100), callback=told.append)
+    assert result
+    assert result.method in wl.recommend(misled).alternatives
+    assert result.iterations == told[-1].iteration == result.history[-1].iteration
+    assert alone.iterations < result.iterations <= 100
+    assert result.linear_iterations == result.history[-1].linear_iterations >= alone.linear_iterations
+    assert [r.iteration for r in told] == [r.iteration for r in result.history]
+    for numbers in ([r.iteration for r in told], [r.linear_iterations for r in told], [r.seconds for r in told]):
+        assert numbers == sorted(numbers)
+    assert [r.step for r in told if r.step.startswith("start")] == ["start", f"start of {result.method}"]
+    x = misled.A.matrix.numpy(), misled.b.numpy(), 0.0, 1.0, result.x.numpy()
+    assert natural_residual(*x) <= 1e-6 * natural_residual(*x[:4], np.zeros(60))
+
+
+def test_alternatives_keep_the_limits(misled):
+    """No step beyond max_iterations, none after StopIteration or a time limit; the best x of all is returned."""
+    few = wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=30))
+    assert few.status is wl.SolveStatus.MAX_ITERATIONS
+    assert few.iterations == few.history[-1].iteration == 30
+    assert few.residual <= min(record.residual for record in few.history) * (1 + 1e-9)
+    assert wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=0)).iterations == 0
+
+    def stop(record):
+        if record.step.startswith("start of"):
+            raise StopIteration
+
+    assert wl.solve(misled, callback=stop).status is wl.SolveStatus.STOPPED
+    timed = wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=1000, patience=1000, max_seconds=0.02))
+    assert timed.status is wl.SolveStatus.TIME_LIMIT
+    assert len([r for r in timed.history if r.step.startswith("start")]) == 1
+
+
+def test_scipy_s_manner_goes_on_too(misled):
+    assert wl.linear_complementarity(misled.A, misled.b.numpy(), bounds=(0.0, 1.0)).success
+
+
+@pytest.mark.parametrize("name", ["box-stack", "arched-snake", pytest.param("wall", marks=pytest.mark.slow)])
+def test_friction_is_solved_by_default(name):
+    world = SCENES[name]()
+    stepper = ContactStepper(world, wl.NNCG(), dt=0.01, device="cpu")
+    for _ in range(SETTLING.get(name, 0)):
+        stepper.step()
+    lcp = BoxedModel().problem(world.assemble(0.01).system).lcp(device="cpu")
+    result = wl.solve(lcp)
+    assert result
+    assert result.iterations <= 18

@@ -4,6 +4,7 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from warp_lcp.default import default_method, solve
 from warp_lcp.gradients.vjp import Gradients, vjp
 from warp_lcp.linear_complementarity import linear_complementarity
 from warp_lcp.multigrid.cycle_settings import CycleSettings
@@ -32,7 +33,6 @@ from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
 from warp_lcp.solvers.coupled_problem import CoupledBlock, CoupledResult, StaggeredRound, solve_coupled
-from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.default import default_method, solve, solve_by_alternatives
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.result import Record, SolveStatus
@@ -16,7 +17,6 @@ from warp_lcp.problem.solve import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
-from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.registry import METHODS
 
 if TYPE_CHECKING:
@@ -57,11 +57,13 @@ def linear_complementarity(
         tol: relative tolerance, in [0, 1): of the natural residual's norm, relative to that at the projection of 0 onto the bounds.
         atol: absolute tolerance of that norm, >= 0, in the units of b.
         method: a method with its settings, say `wl.InteriorPoint()`, or a name in `wl.METHODS`, which stands for the method with the
-            settings it has if none are given; None: `wl.default_method`. (Names are for this function and the command line alone.)
+            settings it has if none are given; None: `wl.default_method`, and its
+            alternatives where it fails. (Names are for this function and the command line alone.)
         maxiter: the most iterations of the method, >= 0.
         preconditioner: of `wl.LCP`.
-        callback: called after each iteration: `callback(intermediate_result)`, an OptimizeResult with x, nit and residual, if that is what
-            its parameter is called, else `callback(x)`. Where it raises StopIteration the best x so far is returned, with status 99.
+        callback: called after each iteration of the first method: `callback(intermediate_result)`, an
+            OptimizeResult with x, nit and residual, if that is what its parameter is called, else
+            `callback(x)`. Where it raises StopIteration the best x so far is returned, with status 99.
 
     Returns:
         `x`, a float64 array of b's shape; `success`, whether the residual, recomputed in float64, meets a tolerance; `status`, 0 for
@@ -100,6 +102,8 @@ def linear_complementarity(
 
     guess = None if x0 is None else fields.load(x0, "x0")
     result = solve(problem, solver, stopping=stopping, x0=guess, workspace=work, callback=told)
+    if method is None:
+        result = solve_by_alternatives(problem, result, stopping, guess)
     message = f"{result.status.name}: {result.status.value}"
     for word, here in WORDS.items():
         message = message.replace(word, here)

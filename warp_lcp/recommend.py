@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
+from functools import cache, lru_cache
 from typing import Literal
 
 from warp_lcp.problem.lcp import LCP
@@ -15,13 +15,16 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import Count, Positive, Settings, Share, checked
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.registry import METHODS
-from warp_lcp.traits import TRIAL, Traits, traits_of
+from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
+from warp_lcp.traits import TRIAL, Traits
 
 ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}
-FEW_SWEEPS = {"grid": 25, "sparse": 30}  # fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems with A
-LONGEST = 5000  # steps of a method that sweeps: the prediction may be too low
+FEW_SWEEPS = {"grid": 25, "sparse": 30}  # fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems
+PIVOTED = 1000  # unknowns up to which a method that fails is followed by Lemke's: it takes seconds there
+LONGEST = 5000  # steps of a method that sweeps: a prediction may be too low
 # numbers of 8 bytes besides A that methods hold for an entry of a matrix and for an unknown, rounded up from measured workspaces
 FIELDS_ONLY, SYSTEMS = (0, 18), (4, 40)
+SWEEPING = ("psor", "nncg", "blocked-gauss-seidel", "projected-jacobi", "accelerated-projected-gradient")
 LEAN = ("psor", "accelerated-projected-gradient", "projected-jacobi")  # hold fields only and take matrices
 
 
@@ -98,33 +101,31 @@ class Rule:
 
 # fmt: off
 RULES: tuple[Rule, ...] = (
-    Rule("subspace-minimization", "Bounds that are affine in x, as friction has them, are for sweeps; small systems speed up few unknowns",
-         lambda t: t.bounds == "affine" and t.unknowns <= 100, 18, ("nncg", "blocked-gauss-seidel", "psor")),
-    Rule("nncg", "Bounds that are affine in x are for sweeps; conjugate gradients speed up many unknowns",
-         lambda t: t.bounds == "affine", None, ("psor", "blocked-gauss-seidel", "staggering")),
+    Rule("subspace-minimization", "Bounds that are affine in x, as friction has them, are for sweeps; systems on free unknowns help",
+         lambda t: t.affine, 18, ("nncg", "blocked-gauss-seidel", "psor", "staggering")),
     Rule("projected-jacobi", "Bounds that are affine in x and no rows leave one method",
-         lambda t: t.bounds == "affine", None, ()),
+         lambda t: t.affine, None, ()),
     Rule("minimum-map-newton", "An operator that shows no rows cannot be swept, and Newton's method needs the fewest products",
-         lambda t: t.kind == "operator", 8, ("primal-dual-active-set", "mprgp", "fischer-newton")),
-    Rule("minimum-map-newton", "A definite matrix of at most 200 unknowns, or of a bandwidth up to 3, is solved directly on the host",
-         lambda t: t.direct and t.definiteness == "definite", 9, ("primal-dual-active-set", "lemke", "interior-point")),
+         lambda t: t.kind == "operator", 8, ("mprgp", "primal-dual-active-set", "interior-point", "fischer-newton")),
     Rule("psor", "A grid or a sparse matrix that a few sweeps solve, as a trial says, needs no hierarchy and no systems",
-         lambda t: t.bounds != "none" and t.sweeps <= FEW_SWEEPS.get(t.kind, 0), None, ("nncg", "minimum-map-newton")),
+         lambda t: t.kind in FEW_SWEEPS and not t.direct and t.diagonal == "positive" and t.sweeps <= FEW_SWEEPS[t.kind], None,
+         ("nncg", "minimum-map-newton")),
     Rule("projected-multigrid", "On a grid the number of multigrid cycles hardly depends on its size",
-         lambda t: t.kind == "grid", 8, ("minimum-map-newton", "mprgp")),
-    Rule("lemke", "Zeros on the diagonal, as friction cones have them, are for pivots where unknowns are few",
-         lambda t: t.pivotable and t.unknowns <= 200, 5, ("fischer-newton", "interior-point")),
+         lambda t: t.kind == "grid" and t.points, 8, ("minimum-map-newton", "mprgp")),
+    Rule("minimum-map-newton", "A stencil that is not symmetric, or that only lines smooth, has a hierarchy for Newton's systems",
+         lambda t: t.kind == "grid", 9, ("primal-dual-active-set", "interior-point", "mprgp")),
+    Rule("lemke", "Zeros on the diagonal, as friction cones, linear programs and games have them, are for pivots where unknowns are few",
+         lambda t: t.pivotable and t.unknowns <= 400, 5, ("fischer-newton", "interior-point", "minimum-map-newton")),
     Rule("interior-point", "Zeros on the diagonal of a sparse matrix are no obstacle to interior points, whose systems are shifted",
-         lambda t: t.pivotable and t.kind == "sparse", 8, ("fischer-newton", "minimum-map-newton")),
+         lambda t: t.pivotable and t.kind == "sparse", 8, ("fischer-newton", "minimum-map-newton", "lemke")),
     Rule("fischer-newton", "Zeros on the diagonal of a dense matrix are no obstacle to Fischer and Burmeister's function",
-         lambda t: t.pivotable, 12, ("interior-point", "lemke")),
-    Rule("quadratic-program", "A symmetric semi-definite matrix makes a convex quadratic program, which PIQP solves",
-         lambda t: t.singular and t.definiteness == "semidefinite" and find_spec("piqp") is not None, 1,
-         ("interior-point", "fischer-newton", "minimum-map-newton")),
-    Rule("interior-point", "A symmetric singular matrix has singular blocks, and interior points shift theirs",
-         lambda t: t.singular, 14, ("fischer-newton", "minimum-map-newton")),
-    Rule("minimum-map-newton", "Any other matrix takes a few systems on the free unknowns",
-         lambda t: True, 9, ("primal-dual-active-set", "interior-point", "fischer-newton", "lemke")),
+         lambda t: t.pivotable, 12, ("interior-point", "lemke", "minimum-map-newton")),
+    Rule("quadratic-program", "A symmetric matrix of low rank, or with a small ridge, makes a convex quadratic program, which PIQP solves",
+         lambda t: t.low_rank, 1, ("interior-point", "lemke", "minimum-map-newton", "mprgp")),
+    Rule("interior-point", "Free blocks of a symmetric matrix of low rank are singular, and interior points shift theirs",
+         lambda t: t.low_rank, 14, ("lemke", "fischer-newton", "minimum-map-newton", "mprgp")),
+    Rule("minimum-map-newton", "Any other matrix takes a few systems on the free unknowns, small and narrow ones directly on the host",
+         lambda t: True, 9, ("quadratic-program", "interior-point", "lemke", "fischer-newton", "primal-dual-active-set", "mprgp")),
 )
 # fmt: on
 
@@ -132,9 +133,11 @@ RULES: tuple[Rule, ...] = (
 def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget | None = None) -> Recommendation:
     """Return a method for a problem, with reasons.
 
-    The rules decide by what A and the bounds look like and by a trial of some sweeps; that costs about as much as a short solve, so ask
-    once for problems of one kind. They were made from times of all methods on one core of an AMD EPYC, and hold for the CPU; docs
-    "Choosing a method" gives the decision list and how often it is right.
+    The rules decide by what A and the bounds look like; `wl.solve` without a method decides by them
+    too. Sweeps are tried only on unsymmetric sparse matrices and where there is a budget; only
+    symmetric matrices are factored, at most 2,048 rows of them. They were made from times of all
+    methods on one core of an AMD EPYC, and hold for the CPU; docs "Choosing a method" gives the
+    decision list and how often it is right.
 
     Args:
         problem: the LCP; it is not changed.
@@ -157,7 +160,7 @@ def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget |
         raise ValueError(f"budget = {budget!r}: expected Budget(seconds=...), Budget(iterations=...) or Budget(bytes=...)")
     given = checked("accuracy", accuracy, Share | Literal[tuple(ACCURACIES)])
     rtol = ACCURACIES.get(given, given)
-    traits = traits_of(problem, rtol)
+    traits = Traits(problem, rtol, trial=budget is not None)
     found = _from_rule(next(_rules(traits)), traits, rtol)
     return _within(found, budget, problem) if budget else found
 
@@ -170,29 +173,52 @@ def memory_of(name: str, t: Traits) -> int:
 
 def _rules(t: Traits) -> Iterator[Rule]:
     """Return the rules that apply, of the methods that take such a problem."""
-    return (rule for rule in RULES if rule.method in t.able and rule.applies(t))
+    return (rule for rule in RULES if rule.applies(t) and t.takes(rule.method))
 
 
 def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     """Return what a rule says."""
-    expected, limit = None, LONGEST
+    expected = None
     if rule.steps is not None:
-        expected, limit = f"{rule.steps} steps or fewer", max(100, 10 * rule.steps)
-    elif rule.method in ("psor", "nncg") and math.isfinite(t.sweeps):
+        expected = f"{rule.steps} steps or fewer"
+    elif rule.method == "psor":
         expected = f"about {math.ceil(t.sweeps)} sweeps, by the rate of the first {TRIAL}"
-    matrix = f"{t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}, definiteness: {t.definiteness}"
-    reasons = (f"{rule.reason}.", f"The problem: {matrix}, bounds: {t.bounds}.")
-    direct = rule.method == "minimum-map-newton" and t.direct
-    method = MinimumMapNewton(direct=True) if direct else METHODS[rule.method]()
-    stopping = StoppingCriteria(rtol=rtol, max_iterations=limit, patience=max(30, limit // 10))
-    return Recommendation(rule.method, method, stopping, reasons, expected, tuple(n for n in rule.alternatives if n in t.able), t)
+    reasons = (f"{rule.reason}.", f"The problem: {t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}.")
+    limit = steps_allowed(rule.method) if rule.steps is None else max(100, 10 * rule.steps)
+    stopping = _criteria(rtol, limit)
+    alternatives = tuple(name for name in rule.alternatives if t.takes(name) and not (name == "lemke" and t.unknowns > PIVOTED))
+    return Recommendation(rule.method, method_for(rule.method, t), stopping, reasons, expected, alternatives, t)
+
+
+def steps_allowed(name: str) -> int:
+    """Return a limit of steps of a method that nothing else is known of."""
+    return LONGEST if name in SWEEPING else 100
+
+
+def method_for(name: str, t: Traits) -> Solver:
+    """Return a method with the settings that a problem asks for."""
+    return _method(name, t.direct, t.affine)
+
+
+@cache
+def _method(name: str, direct: bool, affine: bool) -> Solver:
+    if name == "minimum-map-newton" and direct:
+        return MinimumMapNewton(direct=True)
+    if name == "subspace-minimization" and affine:  # where the residual may not rise first, 4 of 11 scenes of contacts do not converge
+        return SubspaceMinimization(precision="double", backtracks=-1)
+    return METHODS[name]()
+
+
+@lru_cache(maxsize=64)
+def _criteria(rtol: float, most: int) -> StoppingCriteria:
+    return StoppingCriteria(rtol=rtol, max_iterations=most, patience=max(30, most // 10))
 
 
 def _within(found: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
     """Return a recommendation that respects a budget, or says that it cannot."""
     t = found.traits
     if budget.bytes is not None and (needs := memory_of(found.name, t)) > budget.bytes:
-        lean = next((n for n in LEAN if n in t.able and memory_of(n, t) <= budget.bytes and _takes(n, problem)), None)
+        lean = next((n for n in LEAN if t.takes(n) and memory_of(n, t) <= budget.bytes and _takes(n, problem)), None)
         if lean is None:
             found = _said(found, f"No method fits into {budget.bytes} bytes; this one takes about {needs}.")
         else:
@@ -217,7 +243,7 @@ def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendat
     if taken and took <= seconds:
         return _said(found, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed.")
     begun = time.perf_counter()
-    if "psor" not in found.traits.able or not _takes("psor", problem, steps=TRIAL):
+    if not found.traits.takes("psor") or not _takes("psor", problem, steps=TRIAL):
         return _said(found, f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no sweep is possible here.")
     many = max(1, int(seconds / ((time.perf_counter() - begun) / TRIAL)))
     why = f"{found.name} took {took:.2g} s for its first step, more than the {seconds:g} s allowed: {many} sweeps fit, each is of use."

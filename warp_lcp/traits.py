@@ -1,8 +1,10 @@
-"""What a problem's matrix and bounds look like, found at the price of some ten products: what `warp_lcp.recommend` decides by."""
+"""Traits of a problem's matrix and bounds, by which `warp_lcp.recommend` decides."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from functools import cache, cached_property
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -10,57 +12,198 @@ import scipy.linalg
 import scipy.sparse
 import warp as wp
 
+from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, has, layout_of, takes
 from warp_lcp.problem.solve import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.solvers.minimum_map_newton_direct import suits
-from warp_lcp.solvers.psor import ProjectedSOR
+from warp_lcp.solvers.psor import ProjectedSOR, grid_omega, has_advised_omega
 from warp_lcp.solvers.registry import METHODS
 
-MOST_FACTORED = 1500  # unknowns of a matrix whose Cholesky factorization is tried: it takes 0.1 s there, a Newton step's time
+MOST_FACTORED = 500  # unknowns of a matrix whose Cholesky factorization is tried: 4 ms
+# of more unknowns of a dense matrix every second one, up to MOST_SAMPLED: 0.2 s
+SHARE_FACTORED, MOST_SAMPLED = 2, 2048
 TRIAL, TRIAL_RATE = 8, 4  # sweeps on trial, and how many of the last tell the rate: the first ones remove what is rough in the error
 PIVOT = 1e-11  # of the largest diagonal entry: semi-definite matrices in float64 leave squared pivots of that size
+# of a diagonal entry: where most pivots are smaller, Newton's method cycles or PIQP is faster (17
+# kernels and 39 dense matrices tried); the second where systems are not solved on the host
+LOW_RANK, LOW_RANK_ITERATIVE = 0.1, 0.3
 
 
-@dataclass(frozen=True)
 class Traits:
-    """What is known of a problem.
+    """What is known of a problem; each property is computed when it is first read.
+
+    That costs a product or less unless it says more.
 
     Args:
-        kind: "grid", "sparse", "dense" or "operator", one that shows products only.
-        unknowns: n.
-        entries: of A that a product reads.
-        symmetric: whether A is.
-        diagonal: sign of its smallest entry: "positive", "zero" or "negative".
-        definiteness: of A's symmetric part: "definite", "semidefinite", "indefinite", or "unknown" where finding out is too dear.
-        bounds: "none", "one-sided", "box" or "affine".
-        sweeps: how many sweeps of `ProjectedSOR` the accuracy would take, extrapolated from the rate of the first ones; inf where they
-            do not converge or are not possible.
-        direct: whether the matrix is so small or narrow that its systems are solved directly on the host.
-        able: names of the methods that take such an operator, so many unknowns and such bounds.
+        problem: the LCP; it is not changed.
+        accuracy: relative residual that `sweeps` is for, in (0, 1).
+        trial: whether sweeps may be tried on any matrix; else on unsymmetric sparse ones only.
     """
 
-    kind: str
-    unknowns: int
-    entries: int
-    symmetric: bool
-    diagonal: str
-    definiteness: str
-    bounds: str
-    sweeps: float
-    direct: bool
-    able: tuple[str, ...]
+    def __init__(self, problem: LCP, accuracy: float, *, trial: bool = True) -> None:
+        self._problem, self._accuracy, self._trial = problem, accuracy, trial
+
+    @cached_property
+    def kind(self) -> str:
+        """Return "grid", "sparse", "dense", or "operator" of products only or on ranks."""
+        A = self._problem.A
+        if has(A, HasStencil):
+            return "grid"
+        if self.ranks or not has(A, HasRows):
+            return "operator"
+        if isinstance(A, (SparseOperator, DenseOperator)):
+            return "sparse" if isinstance(A, SparseOperator) else "dense"
+        return "sparse" if scipy.sparse.issparse(self._matrix) else "dense"
+
+    @cached_property
+    def ranks(self) -> bool:
+        """Return whether the unknowns are spread over several processes."""
+        return layout_of(self._problem.A).across is not None
+
+    @cached_property
+    def unknowns(self) -> int:
+        """Return n."""
+        return int(np.count_nonzero(self._known))
+
+    @cached_property
+    def entries(self) -> int:
+        """Return how many entries of A a product reads."""
+        if self.kind == "sparse":
+            A = self._problem.A
+            return A.nnz if isinstance(A, SparseOperator) else int(self._matrix.nnz)
+        return self.unknowns**2 if self.kind == "dense" else 7 * self.unknowns
+
+    @cached_property
+    def symmetric(self) -> bool:
+        """Return whether A is symmetric."""
+        return bool(self._problem.A.symmetric)
+
+    @cached_property
+    def diagonal(self) -> str:
+        """Return the sign of the smallest diagonal entry: "positive", "zero" or "negative"."""
+        least = self._entries_on_diagonal.min()
+        return "positive" if least > 0 else "zero" if least == 0 else "negative"
+
+    @cached_property
+    def definiteness(self) -> str:
+        """Return whether A's symmetric part is "definite", "semidefinite", "indefinite" or "unknown".
+
+        By dominance, or of at most MOST_FACTORED unknowns by a Cholesky factorization or two.
+        """
+        if self.kind == "grid":
+            return "definite"  # closed components apart, which are settled before the first step
+        if self.diagonal == "negative":
+            return "indefinite"
+        return "unknown" if self.kind == "operator" else _definiteness(self._matrix, self.symmetric, self._entries_on_diagonal)
+
+    @cached_property
+    def low_rank(self) -> bool:
+        """Return whether A is symmetric and few of its eigenvalues carry the trace.
+
+        By whether most pivots of a Cholesky factorization are small beside the diagonal entries;
+        beyond MOST_FACTORED unknowns, of dense matrices those of every second row and column, of
+        sparse ones False.
+        """
+        n = self.unknowns
+        if not self.symmetric or self.diagonal != "positive" or self.kind not in ("dense", "sparse"):
+            return False
+        if n > MOST_FACTORED and (self.kind == "sparse" or n > SHARE_FACTORED * MOST_SAMPLED):
+            return False
+        A, d = self._matrix, self._entries_on_diagonal
+        if n > MOST_FACTORED:
+            A, d = A[::SHARE_FACTORED, ::SHARE_FACTORED], d[::SHARE_FACTORED]
+        pivots = _pivots(_dense(A) + PIVOT * d.max() * np.eye(len(d)))
+        share = LOW_RANK if self.direct else LOW_RANK_ITERATIVE
+        return pivots is not None and bool(2 * np.count_nonzero(pivots < share * d) > len(d))
 
     @property
-    def singular(self) -> bool:
-        """Whether A is symmetric without being definite; a negative entry on the diagonal is no matter of its null space."""
-        return self.symmetric and self.definiteness in ("semidefinite", "indefinite") and self.diagonal != "negative"
+    def affine(self) -> bool:
+        """Return whether a bound is affine in x."""
+        return self._problem.bounds.affine is not None
+
+    @cached_property
+    def bounds(self) -> str:
+        """Return "affine", "none", "one-sided" or "box": which bounds are finite anywhere."""
+        problem = self._problem
+        if self.affine:
+            return "affine"
+        sides = [bool(np.isfinite(side.numpy()[self._known]).any()) for side in (problem.lower, problem.upper)]
+        return {0: "none", 1: "one-sided", 2: "box"}[sum(sides)]
+
+    @cached_property
+    def sweeps(self) -> float:
+        """Return how many sweeps of `ProjectedSOR` the accuracy would take.
+
+        On grids by the rate omega - 1 of the advised omega, else extrapolated from the rate of TRIAL
+        sweeps, which are made.
+
+        inf where they do not converge, are not possible or are not tried.
+        """
+        tried = self._trial or (self.kind == "sparse" and not self.symmetric)
+        return sweeps_to(self._problem, self._accuracy) if tried else float("inf")
+
+    @cached_property
+    def direct(self) -> bool:
+        """Return whether systems are solved directly on the host: A is small or narrow."""
+        return self._problem.preconditioner is None and suits(self._problem.A)
+
+    @cached_property
+    def points(self) -> bool:
+        """Return whether a grid's stencil is symmetric and needs no line smoothing."""
+        return takes_points(self._problem.A)
+
+    @cached_property
+    def able(self) -> tuple[str, ...]:
+        """Return the names of the methods that take the problem."""
+        return tuple(name for name in METHODS if self.takes(name))
+
+    def takes(self, name: str) -> bool:
+        """Return whether a method takes the operator, its size, the bounds and the rest."""
+        method, problem = METHODS[name], self._problem
+        if name == "quadratic-program" and not (self.symmetric and has_piqp()):
+            return False
+        if not takes(method, problem.A) or self.unknowns > getattr(method, "most_unknowns", self.unknowns):
+            return False
+        asked = {"preconditioned": problem.preconditioner is not None, "affine_bounds": self.affine, "distributed": self.ranks}
+        return all(getattr(method, ability, False) for ability, needed in asked.items() if needed)
 
     @property
     def pivotable(self) -> bool:
-        """Whether A is unsymmetric with an entry <= 0 on its diagonal, as the slip speeds of friction cones have them."""
-        return not self.symmetric and self.diagonal != "positive"
+        """Return whether A is no Hessian of a convex function and has an entry <= 0 on its diagonal.
+
+        That is unsymmetric, as with friction cones, or with a zero and indefinite, as in games.
+        """
+        if not self.symmetric:
+            return self.diagonal != "positive"
+        return self.diagonal == "zero" and self.definiteness == "indefinite"
+
+    @cached_property
+    def _known(self) -> np.ndarray:
+        return self._problem.unknown.numpy() == 1
+
+    @cached_property
+    def _entries_on_diagonal(self) -> np.ndarray:
+        A = self._problem.A
+        if self.kind == "dense":
+            return self._matrix.diagonal()
+        return layout_of(A).load(A.diagonal(), wp.float64).numpy()[self._known]
+
+    @cached_property
+    def _matrix(self) -> Any:
+        A = self._problem.A
+        if isinstance(A, DenseOperator):
+            return A.matrix.numpy()
+        return A.matrix() if isinstance(A, SparseOperator) else A.rows().matrix()  # type: ignore[attr-defined]
+
+
+@cache
+def has_piqp() -> bool:
+    """Return whether PIQP, an extra, is installed."""
+    return find_spec("piqp") is not None
 
 
 def traits_of(problem: LCP, accuracy: float) -> Traits:
@@ -70,43 +213,13 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
         problem: the LCP.
         accuracy: relative residual that the number of sweeps is for, in (0, 1).
     """
-    A, known = problem.A, problem.unknown.numpy() == 1
-    matrix: Any = A.rows().matrix() if has(A, HasRows) else None
-    shown = "operator" if matrix is None else "sparse" if scipy.sparse.issparse(matrix) else "dense"
-    kind = "grid" if has(A, HasStencil) else shown
-    n, bounds = int(np.count_nonzero(known)), bounds_of(problem)
-    d = layout_of(A).load(A.diagonal(), wp.float64).numpy()[known]
-    sign = "positive" if d.min() > 0 else "zero" if d.min() == 0 else "negative"
-    if kind == "grid":
-        definiteness = "definite"  # closed components apart, which are settled before the first step
-    elif kind == "operator" or sign == "negative":
-        definiteness = "indefinite" if sign == "negative" else "unknown"
-    else:
-        definiteness = _definiteness(matrix, A.symmetric, d)
-    entries = matrix.nnz if kind == "sparse" else n**2 if kind == "dense" else 7 * n
-    able = tuple(name for name, method in METHODS.items() if takes(method, A) and _suits(method, problem, n, bounds))
-    sweeps = sweeps_to(problem, accuracy)
-    return Traits(kind, n, entries, A.symmetric, sign, definiteness, bounds, sweeps, problem.preconditioner is None and suits(A), able)
-
-
-def bounds_of(problem: LCP) -> str:
-    """Return "affine", "none", "one-sided" or "box": which bounds are finite anywhere."""
-    if problem.bounds.affine is not None:
-        return "affine"
-    known = problem.unknown.numpy() == 1
-    sides = [bool(np.isfinite(side.numpy()[known]).any()) for side in (problem.lower, problem.upper)]
-    return {0: "none", 1: "one-sided", 2: "box"}[sum(sides)]
-
-
-def _suits(method: Any, problem: LCP, unknowns: int, bounds: str) -> bool:
-    """Return whether a method takes so many unknowns and such bounds, and makes use of a preconditioner that there is."""
-    if problem.preconditioner is not None and not getattr(method, "preconditioned", False):
-        return False
-    return unknowns <= getattr(method, "most_unknowns", unknowns) and (bounds != "affine" or getattr(method, "affine_bounds", False))
+    return Traits(problem, accuracy)
 
 
 def sweeps_to(problem: LCP, accuracy: float) -> float:
-    """Return how many sweeps would reach a relative residual, by the rate of the last of TRIAL sweeps; inf if they get nowhere."""
+    """Return how many sweeps would reach a relative residual, inf if they get nowhere."""
+    if has_advised_omega(problem):
+        return math.log(accuracy) / math.log(grid_omega(problem, singular=False) - 1)
     try:
         trial = solve(problem, ProjectedSOR(), stopping=StoppingCriteria(rtol=accuracy, max_iterations=TRIAL))
     except ValueError:
@@ -120,6 +233,16 @@ def sweeps_to(problem: LCP, accuracy: float) -> float:
     return TRIAL + float(np.log(accuracy / trial.relative_residual) / np.log(rate))
 
 
+def _dense(A: Any) -> np.ndarray:
+    return A.toarray() if scipy.sparse.issparse(A) else np.asarray(A, dtype=np.float64)
+
+
+def _pivots(A: np.ndarray) -> np.ndarray | None:
+    """Return the squared diagonal of a Cholesky factor, None where there is none."""
+    factor, info = scipy.linalg.lapack.dpotrf(A, lower=True)
+    return factor.diagonal() ** 2 if info == 0 else None
+
+
 def _definiteness(A: Any, symmetric: bool, d: np.ndarray) -> str:
     """Return what a matrix's symmetric part is, by dominance or by Cholesky factorizations; its diagonal is nowhere negative."""
     rows, columns = (np.asarray(abs(A).sum(axis=axis)).ravel() - d for axis in (1, 0))
@@ -128,9 +251,9 @@ def _definiteness(A: Any, symmetric: bool, d: np.ndarray) -> str:
         return "definite" if (beyond > slack).any() else "semidefinite"
     if len(d) > MOST_FACTORED:
         return "unknown"
-    dense = A.toarray() if scipy.sparse.issparse(A) else np.asarray(A, dtype=np.float64)
+    dense = _dense(A)
     part, shift = dense if symmetric else 0.5 * (dense + dense.T), PIVOT * float(d.max(initial=0.0)) * np.eye(len(d))
     for shifted, verdict in ((part - shift, "definite"), (part + shift, "semidefinite")):
-        if scipy.linalg.lapack.dpotrf(shifted, lower=True)[1] == 0:
+        if _pivots(shifted) is not None:
             return verdict
     return "indefinite"

@@ -13,6 +13,7 @@ import scipy.sparse
 from rich.table import Table
 
 from warp_lcp.cli.matrix_market import MarketError, read_market
+from warp_lcp.default import solve
 from warp_lcp.files.atomic import replacing
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem.lcp import LCP
@@ -21,7 +22,6 @@ from warp_lcp.problem.result import SolveResult
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.settings import SettingError, nearest
-from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.registry import METHODS
 
 MOST_ROWS = 40  # of the table of iterations: a longer history shows its first and last ones
@@ -34,8 +34,8 @@ class Outcome:
 
     Attributes:
         problem: the problem.
-        solver: the method.
-        name: its name in `METHODS`.
+        solver: the method, None where `wl.solve` has chosen it.
+        name: in `METHODS`, of the method that found x.
         result: the result.
     """
 
@@ -101,7 +101,7 @@ def solve_files(
         right_side: b, a vector of either form.
         lower: a number or the file of a vector.
         upper: likewise.
-        method: a name in `METHODS`; the default method for A if None.
+        method: a name in `METHODS`; what `wl.solve` chooses if None.
         tolerance: of the residual, relative to the one at clip(0, lower, upper).
         max_iterations: the most steps.
         max_seconds: the most wall time of the solve.
@@ -119,12 +119,11 @@ def solve_files(
         operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
         problem = LCP(operator, b, *sides)
         family = "sparse" if isinstance(operator, SparseOperator) else "dense"
-        solver = default_method(problem) if method is None else method_named(method, family)
+        solver = None if method is None else method_named(method, family)
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
-    name = next((name for name, kind in METHODS.items() if type(solver) is kind), type(solver).__name__)
-    return Outcome(problem, solver, name, result)
+    return Outcome(problem, solver, method or str(result.method), result)
 
 
 def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> StoppingCriteria:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_lcp.cli.solve_file import Outcome, criteria, method_named
+from warp_lcp.default import solve
 from warp_lcp.files.atomic import replacing
 from warp_lcp.gallery.recorded import cell_counts, load_part
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.run.problem_folder import ProblemError
-from warp_lcp.solvers.default import solve
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS
 

@@ -10,12 +10,12 @@ import numpy as np
 import scipy.interpolate
 import warp as wp
 
+from warp_lcp.default import solve
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import AIR, FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.solvers.default import solve
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 Coefficients = dict[tuple[int, int], np.ndarray]

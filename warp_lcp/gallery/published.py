@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.default import solve
 from warp_lcp.gallery.heston import Heston
 from warp_lcp.gallery.obstacle import ball_obstacle, dam, journal_bearing, sine_obstacle, torsion
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.gallery.shallow_ice import IceDome
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.solvers.default import solve
 
 PETSC, CUTEST, P4PDES = "PETSc", "CUTEst", "p4pdes"
 SPG = "CSPG.jl"  # its table of CUTEst's problems, by the spectral projected gradient method

@@ -9,10 +9,10 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
+from warp_lcp.default import solve
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.solvers.default import solve
 
 STEPS = 60  # of Newton's method, which took 7 at the most
 TIGHT = StoppingCriteria(rtol=1e-10, max_iterations=200)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.default import solve as solve_problem
 from warp_lcp.gradients.names import flat, nested
 from warp_lcp.gradients.vjp import vjp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.solvers.default import solve as solve_problem
 
 
 def solve(

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.default import solve
 from warp_lcp.gradients.names import flat
 from warp_lcp.operators import SparseOperator, Stencil
 from warp_lcp.problem.lcp import LCP, as_operator
@@ -35,7 +36,6 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import Array
 from warp_lcp.rows.vectors import ADD, Sums, Tally, rows_of
-from warp_lcp.solvers.default import solve
 
 HEADERS = Path(__file__).parent / "headers"
 f64, i8 = wp.float64, wp.int8

@@ -80,6 +80,7 @@ class SolveResult(FieldsOnHost):
         history: a Record for the start and one for each step.
         grid: cells (nz, ny, nx) or (ny, nx) of the grid whose compact stencil a sparse matrix was seen to be, and as which it was solved;
             None of others.
+        method: name in `wl.METHODS` of the method that found x, where `wl.solve` has chosen it; None where one was given.
         problem: what was solved, for `wl.vjp`; None where the result was pickled.
         version: of the problem's operator then, None where it has none.
     """
@@ -92,6 +93,7 @@ class SolveResult(FieldsOnHost):
     relative_residual: float
     history: list[Record] = field(repr=False)
     grid: tuple[int, ...] | None = None
+    method: str | None = None
     problem: Any = field(default=None, repr=False, compare=False, metadata={"pickled": False})
     version: int | None = field(default=None, repr=False, compare=False)
 

@@ -18,6 +18,7 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
 from warp_lcp.settings import Count, Settings
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of
+from warp_lcp.solvers.lemke_howson import start_game
 
 REGULAR = 1e-10  # reciprocal condition number above which the equations' block is eliminated
 
@@ -179,7 +180,8 @@ class Lemke(Settings):
     z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It processes every problem with a
     copositive-plus matrix, positive semi-definite ones among them, symmetric or not, and every P-matrix; for others it may end in a ray.
     A ray is believed only when further covering vectors, random in [.5, 1.5], end in one too; the status is then INFEASIBLE if multipliers
-    prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED.
+    prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED. On a bimatrix game,
+    M = [[0, E], [F', 0]] with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's method does.
 
     Boxes add a pair of variables, equations are eliminated or, where their block is singular, split (see LemkeForm). x0 is not used. A
     pivot costs O(m^2), m <= 2n. A step is a block of pivots; `linear_iterations` counts pivots.
@@ -236,10 +238,12 @@ class Basis:
         # the lexicographic minimum of (q_i, e_i) / d_i leaves: of equal ratios the last, whose row has the later 1
         ratios = q / d
         self.row = int(np.flatnonzero(ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])
-        self.entering = 2 * m
+        self.entering, self.ends = 2 * m, (2 * m, 2 * m)  # variables with which the path ends when they leave
 
     def pivot(self) -> bool | None:
         """Let the entering variable in; True when z0 has left, False on a ray, None to go on."""
+        if self.entering < 0:  # the start is the solution
+            return True
         first = self.entering == 2 * self.m
         direction = self._direction()
         if not first:
@@ -249,10 +253,15 @@ class Basis:
             self.row = row
         leaving = int(self.variables[self.row])
         self._replace(direction)
-        if leaving == 2 * self.m:
+        if leaving in self.ends:
             return True
         self.entering = leaving + self.m if leaving < self.m else leaving - self.m
         return None
+
+    def exchange(self, row: int, entering: int) -> None:
+        """Let a variable in at a row."""
+        self.row, self.entering = row, entering
+        self._replace(self._direction())
 
     def z(self) -> np.ndarray:
         """Return z of the basis, shape (m,)."""
@@ -301,8 +310,9 @@ class Basis:
             return None
         ratios = np.maximum(self.values[rows], 0.0) / direction[rows]
         rows = rows[ratios <= ratios.min() + TIE * max(ratios.min(), np.abs(self.q).max())]
-        if (self.variables[rows] == 2 * self.m).any():
-            return int(rows[self.variables[rows] == 2 * self.m][0])
+        ends = (self.variables[rows] == self.ends[0]) | (self.variables[rows] == self.ends[1])
+        if ends.any():
+            return int(rows[ends][0])
         inverse = self._rows_of_inverse(rows) if len(rows) > 1 else None
         for column in range(self.m):
             if inverse is None or len(rows) == 1:
@@ -420,6 +430,8 @@ class LemkeWorkspace(DenseWorkspace):
         M, q = self.form.M / self._sizes[0], self.form.q / self._sizes[1]
         made = BandedBasis if scipy.sparse.issparse(M) else Basis
         self.basis: Basis | None = made(M, q, d) if (q < 0).any() else None
+        if made is Basis and self.basis is not None and self.rays == 0:
+            start_game(self.basis)
 
     def _finish(self, z: np.ndarray) -> None:
         """Write the solution, polished where x is between its bounds; one that is none is a ray in truth: a pivot was noise."""
