@@ -125,11 +125,11 @@ class _Solve:
             if self.point is not None or self.method is not None:
                 return
         self._scaled, self._units = equilibrated(with_rows(p))
-        self._conditions = quadratic_program_to_boxed(self._scaled if _all_sparse(p) else _dense(self._scaled), device="cpu")
+        self._conditions = quadratic_program_to_boxed(self._scaled, device="cpu")
         self._by(InteriorPoint() if self.method is None else self.method)
         if self.point is not None or self.method is not None:
             return
-        if self._scaled.Q.nnz + self._scaled.G.nnz + self._scaled.C.nnz <= PROVABLE and (why := has_no_solution(self._scaled)):
+        if sum(map(_entries, (self._scaled.Q, self._scaled.G, self._scaled.C))) <= PROVABLE and (why := has_no_solution(self._scaled)):
             self.end(SolveStatus.INFEASIBLE, WORDS[why])
         elif len(self._conditions.b) <= Lemke.most_unknowns:
             self._by(Lemke())
@@ -209,12 +209,9 @@ def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
     return QuadraticProgramData(P, q, lower, upper, G, h, C, d), bounding
 
 
-def _all_sparse(program: QuadraticProgramData) -> bool:
-    return all(M is None or scipy.sparse.issparse(M) for M in (program.Q, program.G, program.C))
-
-
-def _dense(program: QuadraticProgramData) -> QuadraticProgramData:
-    return QuadraticProgramData(*(M.toarray() if scipy.sparse.issparse(M) else M for M in vars(program).values()))
+def _entries(M: Any) -> int:
+    """Return how many entries of a matrix are not 0."""
+    return int(M.nnz if scipy.sparse.issparse(M) else np.count_nonzero(M))
 
 
 def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:

@@ -5,15 +5,19 @@ All of it is in the units of `equilibrated`: x = sigma D x', multipliers of rows
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 
 from warp_lcp.problem.reformulate import QuadraticProgramData
+from warp_lcp.problem.scale import scaled
 
+SMALL = 400  # unknowns and rows up to which matrices are dense, whatever the caller's are
 SWEEPS = 20  # of Ruiz's iteration, each of which halves the logarithms of rows that differ
 CANCELED = 1e-10  # terms of a row below this part of ||a_i|| ||x|| are rounding (Arioli, Demmel and Duff 1989 take 1000 n eps)
 PROXIMAL = 1e-8  # shift of the conditions' matrix, which dependent rows make singular; refinement takes its effect off
@@ -58,12 +62,20 @@ class ProgramPoint:
 
 
 def with_rows(program: QuadraticProgramData) -> QuadraticProgramData:
-    """Return a program that has G, h, C and d, sparse, without rows where there are none."""
-    n = len(program.c)
-    empty = scipy.sparse.csr_array((0, n))
-    G, C = (empty if M is None else scipy.sparse.csr_array(M) for M in (program.G, program.C))
+    """Return a program that has G, h, C and d, without rows where there are none; all matrices sparse, or all dense if small or dense."""
+    matrices, n = (program.Q, program.G, program.C), len(program.c)
     h, d = (np.zeros(0) if v is None else v for v in (program.h, program.d))
-    return replace(program, G=G, h=h, C=C, d=d)
+    dense = n + len(h) + len(d) <= SMALL or not any(scipy.sparse.issparse(M) for M in matrices)
+
+    def made(M: Any) -> Any:
+        if M is None:
+            M = np.zeros((0, n))
+        if dense:
+            return M.toarray() if scipy.sparse.issparse(M) else M
+        return scipy.sparse.csr_array(M)
+
+    Q, G, C = map(made, matrices)
+    return replace(program, Q=Q, G=G, h=h, C=C, d=d)
 
 
 def equilibrated(program: QuadraticProgramData) -> tuple[QuadraticProgramData, ProgramUnits]:
@@ -75,29 +87,29 @@ def equilibrated(program: QuadraticProgramData) -> tuple[QuadraticProgramData, P
     Args:
         program: with rows (`with_rows`).
     """
-    n, m, Q = len(program.c), len(program.h), scipy.sparse.csr_array(program.Q)  # type: ignore[arg-type]
-    B = scipy.sparse.vstack([program.G, program.C]).tocsr()
+    n, m, Q = len(program.c), len(program.h), program.Q  # type: ignore[arg-type]
+    B = _stacked(program.G, program.C)
     E = 1 / _nonzero(_largest(B, 1))
-    curvature = abs(Q) * (1 / _nonzero(np.asarray(abs(Q).max()))) if Q.nnz else Q
+    curvature = abs(Q) / _nonzero(_largest(Q, 0).max(initial=0.0))
     D = np.ones(n)
     for _ in range(SWEEPS):
-        rows = abs(_scaled(B, E, D))
-        D = D / np.sqrt(_nonzero(np.maximum(_largest(_scaled(curvature, D, D), 0), _largest(rows, 0))))
+        rows = scaled(B, E, D)
+        D = D / np.sqrt(_nonzero(np.maximum(_largest(scaled(curvature, D, D), 0), _largest(rows, 0))))
         E = E / np.sqrt(_nonzero(_largest(rows, 1)))
     D, E = _power_of_two(D), _power_of_two(E)
     right = np.r_[E * np.r_[program.h, program.d], program.lower / D, program.upper / D]
     sizes = np.abs(right[np.isfinite(right) & (right != 0)])
-    bend = float(abs(_scaled(Q, D, D)).max()) if Q.nnz else 0.0
+    bend = float(_largest(scaled(Q, D, D), 0).max(initial=0.0))
     costs = np.abs(D * program.c)[program.c != 0]
     slope = float(np.median(costs)) if len(costs) else 0.0
     sigma = float(np.median(sizes)) if len(sizes) else slope / bend if bend and slope else 1.0
     sigma = _power_of_two(sigma)
     cost = _power_of_two(1 / (max(sigma * bend, slope) or 1.0))  # times sigma: of sigma D (Q x + c)
-    scaled = QuadraticProgramData(
-        _scaled(Q, cost * sigma * D, D), cost * D * program.c, program.lower / (sigma * D), program.upper / (sigma * D),
-        _scaled(program.G, E[:m], D), E[:m] * program.h / sigma, _scaled(program.C, E[m:], D), E[m:] * program.d / sigma,
+    made = QuadraticProgramData(
+        scaled(Q, cost * sigma * D, D), cost * D * program.c, program.lower / (sigma * D), program.upper / (sigma * D),
+        scaled(program.G, E[:m], D), E[:m] * program.h / sigma, scaled(program.C, E[m:], D), E[m:] * program.d / sigma,
     )  # fmt: skip
-    return scaled, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
+    return made, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
 
 
 def settled(program: QuadraticProgramData, point: ProgramPoint) -> ProgramPoint:
@@ -122,7 +134,7 @@ def relative_residuals(program: QuadraticProgramData, point: ProgramPoint) -> tu
     """
     p, x, z, y = program, point.x, point.z, point.y
     slack, miss = p.G @ x - p.h, p.C @ x - p.d
-    rows = scipy.sparse.vstack([p.G, p.C]).tocsr()
+    rows = _stacked(p.G, p.C)
     right, missed = np.abs(np.r_[p.h, p.d]), np.r_[np.where(z > 0, np.abs(slack), np.maximum(-slack, 0.0)), np.abs(miss)]
     primal = _relative(missed, abs(rows) @ np.abs(x) + right, _largest(abs(rows), 1) * np.abs(x).max(initial=0.0) + right)
     g, multipliers = _gradient(p, point), np.abs(np.r_[z, y])
@@ -142,7 +154,7 @@ def polished(program: QuadraticProgramData, point: ProgramPoint) -> ProgramPoint
     """Return the best point of some primal-dual active-set steps: Newton's for the equations of the active rows, the others let go.
 
     Args:
-        program: with rows, sparse.
+        program: with rows.
         point: near a solution.
     """
     p, best = program, settled(program, point)
@@ -158,9 +170,10 @@ def polished(program: QuadraticProgramData, point: ProgramPoint) -> ProgramPoint
         if found is None:
             break
         inside = ProgramPoint(np.clip(found.x, p.lower, p.upper), np.maximum(found.z, 0.0), found.y)
-        worth = max(relative_residuals(p, inside))
-        if worth < error:
-            best, error = inside, worth
+        for tried in (inside, replace(inside, x=np.where(np.abs(inside.x) > CANCELED, inside.x, np.clip(0.0, p.lower, p.upper)))):
+            worth = max(relative_residuals(p, tried))
+            if worth < error:
+                best, error = tried, worth
         slope, slack = _gradient(p, found), p.G @ found.x - p.h
         fixed = p.lower == p.upper
         low, high = fixed | np.where(low, slope > 0, found.x < p.lower), ~fixed & np.where(high, slope < 0, found.x > p.upper)
@@ -175,18 +188,18 @@ def has_no_solution(program: QuadraticProgramData) -> str:
     with Q e = 0, C e = 0, G e >= 0, within the cone of the bounds, and c'e < 0.
 
     Args:
-        program: with rows, sparse.
+        program: with rows.
     """
     from scipy.optimize import linprog  # a fifth of a second to import, and seldom needed
 
     p, n = program, len(program.c)
     low, high = np.flatnonzero(np.isfinite(p.lower)), np.flatnonzero(np.isfinite(p.upper))
     unit = scipy.sparse.eye_array(n, format="csr")
-    rows = scipy.sparse.vstack([p.G, p.C, unit[low], -unit[high]]).tocsr()
+    rows = scipy.sparse.vstack([scipy.sparse.csr_array(p.G), scipy.sparse.csr_array(p.C), unit[low], -unit[high]]).tocsr()
     worth = np.r_[p.h, p.d, p.lower[low], -p.upper[high]]
     if len(worth):
         size = _nonzero(np.abs(worth))  # each row in its own size: a far bound is no proof
-        rows_of_one, worth_of_one = _scaled(rows, 1 / size, np.ones(n)), worth / size
+        rows_of_one, worth_of_one = scaled(rows, 1 / size, np.ones(n)), worth / size
         limits = np.repeat([[0.0, 1.0]], len(worth), axis=0)
         limits[len(p.h) : len(p.h) + len(p.d), 0] = -1.0
         found = linprog(-worth_of_one, A_eq=rows_of_one.T, b_eq=np.zeros(n), bounds=limits, method="highs")
@@ -199,7 +212,7 @@ def has_no_solution(program: QuadraticProgramData) -> str:
     if not p.c.any():
         return ""
     sides = np.stack([np.where(np.isfinite(p.lower), 0.0, -1.0), np.where(np.isfinite(p.upper), 0.0, 1.0)], axis=1)
-    still = scipy.sparse.vstack([p.Q, p.C])
+    still = _stacked(p.Q, p.C)
     more = {"A_ub": -p.G, "b_ub": np.zeros(len(p.h))} if len(p.h) else {}
     found = linprog(p.c, A_eq=still, b_eq=np.zeros(still.shape[0]), bounds=sides, method="highs", **more)
     if found.status != 0:
@@ -222,26 +235,34 @@ def _newton(p: QuadraticProgramData, now: ProgramPoint, low: Any, high: Any, tig
     """
     free, active = np.flatnonzero(~low & ~high), np.flatnonzero(tight)
     x = np.where(low, p.lower, np.where(high, p.upper, now.x))
-    B, right = scipy.sparse.vstack([p.G[active], p.C]).tocsc(), np.r_[p.h[active], p.d]
-    inner, k = p.Q[free][:, free], len(right)
-    part = B[:, free]
-    M = scipy.sparse.block_array([[inner, -part.T], [part, scipy.sparse.csr_array((k, k))]], format="csc")
+    B, right = _stacked(p.G[active], p.C), np.r_[p.h[active], p.d]
     multipliers = np.r_[now.z[active], now.y]
-    if M.shape[0]:
-        try:
-            factors = scipy.sparse.linalg.splu((M + PROXIMAL * scipy.sparse.eye_array(M.shape[0])).tocsc())
-        except RuntimeError:
-            return None
-        for _ in range(REFINEMENTS):
+    if len(free) + len(right):
+        solve = _factored(p.Q[free][:, free], B[:, free])
+        for _ in range(REFINEMENTS if solve else 0):
             slope = (p.Q @ x + p.c - B.T @ multipliers)[free]
-            step = -factors.solve(np.r_[slope, B @ x - right])
-            if not np.isfinite(step).all():
-                return None
+            step = -solve(np.r_[slope, B @ x - right])  # type: ignore[misc]
             x[free] += step[: len(free)]
             multipliers = multipliers + step[len(free) :]
+        if solve is None or not (np.isfinite(x).all() and np.isfinite(multipliers).all()):
+            return None
     z = np.zeros(len(p.h))
     z[active] = multipliers[: len(active)]
     return ProgramPoint(x, z, multipliers[len(active) :])
+
+
+def _factored(Q: Any, B: Any) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return what solves [[Q + s, -B'], [B, s]] v = r, s = PROXIMAL; None where the factors are singular."""
+    n, k = Q.shape[0], B.shape[0]
+    if scipy.sparse.issparse(Q):
+        M = scipy.sparse.block_array([[Q, -B.T], [B, scipy.sparse.csr_array((k, k))]]) + PROXIMAL * scipy.sparse.eye_array(n + k)
+        try:
+            solve: Callable[[np.ndarray], np.ndarray] = scipy.sparse.linalg.splu(M.tocsc()).solve
+        except RuntimeError:
+            return None
+        return solve
+    factors, pivots, info = scipy.linalg.lapack.dgetrf(np.block([[Q, -B.T], [B, np.zeros((k, k))]]) + PROXIMAL * np.eye(n + k))
+    return None if info else lambda r: scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
 def _gradient(p: QuadraticProgramData, point: ProgramPoint) -> np.ndarray:
@@ -255,8 +276,8 @@ def _relative(values: np.ndarray, terms: np.ndarray, sizes: np.ndarray) -> float
     return float((values / np.where(whole > 0, whole, 1.0)).max(initial=0.0))
 
 
-def _scaled(M: Any, left: np.ndarray, right: np.ndarray) -> Any:
-    return (scipy.sparse.diags_array(left) @ M @ scipy.sparse.diags_array(right)).tocsr()
+def _stacked(*parts: Any) -> Any:
+    return scipy.sparse.vstack(parts).tocsr() if scipy.sparse.issparse(parts[0]) else np.vstack(parts)
 
 
 def _largest(M: Any, axis: int) -> np.ndarray:
