@@ -166,8 +166,9 @@ class _Solve:
     def _judge(self, p: QuadraticProgramData, point: ProgramPoint, units: ProgramUnits | None) -> None:
         """Take a point that is optimal, or say that it is not."""
         self.figures = relative_residuals(p, point)
-        if max(self.figures) <= max(LOOSER * self.tol, LEAST):
-            self.point = point if units is None else units.of_caller(point)
+        found = point if units is None else units.of_caller(point)
+        if max(self.figures) <= max(LOOSER * self.tol, LEAST) and found.is_finite:
+            self.point = found
             self.end(SolveStatus.CONVERGED, f"{SolveStatus.CONVERGED.value}")
         elif self.result.success:
             worst = ", ".join(f"{name} {value:.1e}" for name, value in zip(("primal", "dual", "gap"), self.figures, strict=True))

@@ -43,7 +43,8 @@ class ProgramUnits:
 
     def of_caller(self, point: ProgramPoint) -> ProgramPoint:
         """Return a point of the equilibrated program in the units of the program it was made of."""
-        return ProgramPoint(self.x * point.x, self.inequalities * point.z, self.equations * point.y)
+        with np.errstate(over="ignore"):  # a multiplier may be beyond all numbers in those
+            return ProgramPoint(self.x * point.x, self.inequalities * point.z, self.equations * point.y)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,11 @@ class ProgramPoint:
     x: np.ndarray
     z: np.ndarray
     y: np.ndarray
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all numbers are."""
+        return all(np.isfinite(part).all() for part in (self.x, self.z, self.y))
 
 
 def with_rows(program: QuadraticProgramData) -> QuadraticProgramData:
@@ -109,7 +115,8 @@ def equilibrated(program: QuadraticProgramData) -> tuple[QuadraticProgramData, P
         scaled(Q, cost * sigma * D, D), cost * D * program.c, program.lower / (sigma * D), program.upper / (sigma * D),
         scaled(program.G, E[:m], D), E[:m] * program.h / sigma, scaled(program.C, E[m:], D), E[m:] * program.d / sigma,
     )  # fmt: skip
-    return made, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
+    with np.errstate(over="ignore"):
+        return made, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
 
 
 def settled(program: QuadraticProgramData, point: ProgramPoint) -> ProgramPoint:
