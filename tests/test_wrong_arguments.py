@@ -268,7 +268,7 @@ def test_methods_by_name():
     for name, method in meant.items():
         with pytest.raises(KeyError, match=f"no method is called '{name}': did you mean '{method}'"):
             wl.METHODS[name]
-    with pytest.raises(ValueError, match="method = 'ipm': must be one of .*; did you mean 'interior-point'"):
+    with pytest.raises(ValueError, match=r"method = 'ipm': must be one of .*; did you mean 'interior-point'"):
         wl.linear_complementarity(np.eye(2), np.ones(2), method="ipm")
     assert wl.METHODS.get("foo") is None
     assert "foo" not in wl.METHODS

@@ -13,6 +13,7 @@ from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.program_optimality import (
     ProgramPoint,
     ProgramUnits,
+    ProgramWithRows,
     equilibrated,
     has_no_solution,
     polished,
@@ -163,7 +164,7 @@ class _Solve:
             return
         self._judge(p, polished(p, point) if found.success or self.method is None else settled(p, point), units)
 
-    def _judge(self, p: QuadraticProgramData, point: ProgramPoint, units: ProgramUnits | None) -> None:
+    def _judge(self, p: ProgramWithRows, point: ProgramPoint, units: ProgramUnits | None) -> None:
         """Take a point that is optimal, or say that it is not."""
         self.figures = relative_residuals(p, point)
         found = point if units is None else units.of_caller(point)

@@ -101,7 +101,10 @@ def test_the_shape_is_read_alone(tmp_path):
     assert read_shape(path, lambda rows, columns: True, "") == (700, 900)
     (tmp_path / "a.mtx.gz").write_bytes(gzip.compress(REAL + b"3 4 1\nno numbers"))
     assert read_shape(tmp_path / "a.mtx.gz", lambda rows, columns: True, "") == (3, 4)
-    for data, message in ((REAL + b"2 2 9\n1 1 1\n", "2 x 2 with 9 entries: these take 53 bytes, and the file has 6"), (b"", "does not begin")):
+    for data, message in (
+        (REAL + b"2 2 9\n1 1 1\n", "2 x 2 with 9 entries: these take 53 bytes, and the file has 6"),
+        (b"", "does not begin"),
+    ):
         path.write_bytes(data)
         with pytest.raises(ValueError, match=message):
             read_shape(path, lambda rows, columns: True, "")

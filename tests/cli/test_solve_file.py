@@ -136,7 +136,10 @@ def test_a_long_history_is_shortened(problem, tmp_path):
         (["A.mtx", "A.mtx"], "A.mtx: has shape 36 x 36: expected 36 x 1"),
         (["claims.mtx", "b.mtx"], "b.mtx: has shape 36 x 1: expected 2000000000 x 1, a number for each row of A"),
         (["A.mtx", "b.mtx", "--upper", "long.mtx"], "long.mtx: has shape 2000000000 x 1: expected 36 x 1"),
-        (["A.mtx", "b.mtx", "--lower", "1e25"], "--lower 1e25: inf, or a magnitude of 1e20 and more, which is infinite: no x could meet it"),
+        (
+            ["A.mtx", "b.mtx", "--lower", "1e25"],
+            "--lower 1e25: inf, or a magnitude of 1e20 and more, which is infinite: no x could meet it",
+        ),
         (["A.mtx", "b.mtx", "--upper=-inf"], "--upper -inf: -inf, or a magnitude of 1e20 and more"),
         (["A.mtx", "bnan.mtx"], "bnan.mtx: holds 2 values that are not finite"),
         (["A.mtx", "binf.mtx"], "binf.mtx: holds 1 values that are not finite"),

@@ -6,7 +6,7 @@ All of it is in the units of `equilibrated`: x = sigma D x', multipliers of rows
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,14 @@ REFINEMENTS = 12
 CHANGES = 30  # of the active set
 EXACT = 1e-13  # relative residual below which there is nothing to improve
 PROVED = 1e-7  # value of a certificate, relative to its terms, beyond rounding and HiGHS's tolerances
+
+
+@dataclass(frozen=True, eq=False)
+class ProgramWithRows(QuadraticProgramData):
+    """A program that has G, h, C and d, without rows where there are none."""
+
+    h: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    d: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +75,8 @@ class ProgramPoint:
         return all(np.isfinite(part).all() for part in (self.x, self.z, self.y))
 
 
-def with_rows(program: QuadraticProgramData) -> QuadraticProgramData:
-    """Return a program that has G, h, C and d, without rows where there are none; all matrices sparse, or all dense if small or dense."""
+def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
+    """Return a program with rows, all matrices sparse, or all dense if they are small or dense."""
     matrices, n = (program.Q, program.G, program.C), len(program.c)
     h, d = (np.zeros(0) if v is None else v for v in (program.h, program.d))
     dense = n + len(h) + len(d) <= SMALL or not any(scipy.sparse.issparse(M) for M in matrices)
@@ -81,10 +89,10 @@ def with_rows(program: QuadraticProgramData) -> QuadraticProgramData:
         return scipy.sparse.csr_array(M)
 
     Q, G, C = map(made, matrices)
-    return replace(program, Q=Q, G=G, h=h, C=C, d=d)
+    return ProgramWithRows(Q, program.c, program.lower, program.upper, G, h, C, d)
 
 
-def equilibrated(program: QuadraticProgramData) -> tuple[QuadraticProgramData, ProgramUnits]:
+def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnits]:
     """Return a program in units in which its rows and columns are alike, and those units, powers of 2.
 
     D and E make the largest entry of each row of diag(D, E) [[Q, B'], [B, 0]] diag(D, E) 1, B the rows of G and C (Ruiz 2001, as OSQP
@@ -93,7 +101,7 @@ def equilibrated(program: QuadraticProgramData) -> tuple[QuadraticProgramData, P
     Args:
         program: with rows (`with_rows`).
     """
-    n, m, Q = len(program.c), len(program.h), program.Q  # type: ignore[arg-type]
+    n, m, Q = len(program.c), len(program.h), program.Q
     B = _stacked(program.G, program.C)
     E = 1 / _nonzero(_largest(B, 1))
     curvature = abs(Q) / _nonzero(_largest(Q, 0).max(initial=0.0))
@@ -111,7 +119,7 @@ def equilibrated(program: QuadraticProgramData) -> tuple[QuadraticProgramData, P
     sigma = float(np.median(sizes)) if len(sizes) else slope / bend if bend and slope else 1.0
     sigma = _power_of_two(sigma)
     cost = _power_of_two(1 / (max(sigma * bend, slope) or 1.0))  # times sigma: of sigma D (Q x + c)
-    made = QuadraticProgramData(
+    made = ProgramWithRows(
         scaled(Q, cost * sigma * D, D), cost * D * program.c, program.lower / (sigma * D), program.upper / (sigma * D),
         scaled(program.G, E[:m], D), E[:m] * program.h / sigma, scaled(program.C, E[m:], D), E[m:] * program.d / sigma,
     )  # fmt: skip
@@ -119,7 +127,7 @@ def equilibrated(program: QuadraticProgramData) -> tuple[QuadraticProgramData, P
         return made, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
 
 
-def settled(program: QuadraticProgramData, point: ProgramPoint) -> ProgramPoint:
+def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     """Return a point within its bounds with each pair complementary: x on a bound, or z = 0, whichever moves less."""
     at, slope = np.clip(point.x, program.lower, program.upper), _gradient(program, point)
     x = np.where(at - program.lower <= slope, program.lower, np.where(program.upper - at <= -slope, program.upper, at))
@@ -128,7 +136,7 @@ def settled(program: QuadraticProgramData, point: ProgramPoint) -> ProgramPoint:
     return ProgramPoint(x, np.where(slack <= point.z, np.maximum(point.z, 0.0), 0.0), point.y)
 
 
-def relative_residuals(program: QuadraticProgramData, point: ProgramPoint) -> tuple[float, float, float]:
+def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[float, float, float]:
     """Return the primal and the dual residual, each the largest of its rows relative to the terms of that row, and the gap to its own.
 
     For row i of a x - b that is |a_i x - b_i| / (sum_j |a_ij x_j| + |b_i|), the componentwise backward error, which does not depend on the
@@ -157,7 +165,7 @@ def relative_residuals(program: QuadraticProgramData, point: ProgramPoint) -> tu
     return primal, dual, abs(float(parts.sum())) / size if size else 0.0
 
 
-def polished(program: QuadraticProgramData, point: ProgramPoint) -> ProgramPoint:
+def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     """Return the best point of some primal-dual active-set steps: Newton's for the equations of the active rows, the others let go.
 
     Args:
@@ -188,7 +196,7 @@ def polished(program: QuadraticProgramData, point: ProgramPoint) -> ProgramPoint
     return best
 
 
-def has_no_solution(program: QuadraticProgramData) -> str:
+def has_no_solution(program: ProgramWithRows) -> str:
     """Return why a program has no solution, proved by a certificate that was computed anew; "" where there is no proof.
 
     Infeasible: z >= 0, y and bound multipliers with G'z + C'y + v - w = 0 and h'z + d'y + l'v - u'w > 0 (Farkas). Unbounded: a direction e
@@ -235,7 +243,7 @@ def _without_rounding(values: np.ndarray) -> np.ndarray:
     return np.where(np.abs(values) > 1e-2 * PROVED * np.abs(values).max(initial=0.0), values, 0.0)
 
 
-def _newton(p: QuadraticProgramData, now: ProgramPoint, low: Any, high: Any, tight: Any) -> ProgramPoint | None:
+def _newton(p: ProgramWithRows, now: ProgramPoint, low: Any, high: Any, tight: Any) -> ProgramPoint | None:
     """Return the point where the active rows hold and the slope of the free unknowns is 0; None where it is not finite.
 
     [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step refined: of rows that depend on each other the least change.
@@ -272,7 +280,7 @@ def _factored(Q: Any, B: Any) -> Callable[[np.ndarray], np.ndarray] | None:
     return None if info else lambda r: scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
-def _gradient(p: QuadraticProgramData, point: ProgramPoint) -> np.ndarray:
+def _gradient(p: ProgramWithRows, point: ProgramPoint) -> np.ndarray:
     """Return Q x + c - G' z - C' y."""
     return p.Q @ point.x + p.c - p.G.T @ point.z - p.C.T @ point.y
 

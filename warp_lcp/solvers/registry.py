@@ -30,8 +30,15 @@ from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
-
-ALSO = {"ipm": "interior-point", "pgs": "psor", "sor": "psor", "gauss-seidel": "psor", "jacobi": "projected-jacobi", "simplex": "lemke", "piqp": "quadratic-program"}
+ALSO = {
+    "ipm": "interior-point",
+    "pgs": "psor",
+    "sor": "psor",
+    "gauss-seidel": "psor",
+    "jacobi": "projected-jacobi",
+    "simplex": "lemke",
+    "piqp": "quadratic-program",
+}
 
 
 class Methods(dict[str, type[Any]]):
