@@ -114,6 +114,65 @@ def sweeps(**options):
     return wl.linear_complementarity(A, np.sin(np.linspace(0, 20, n)), method="psor", **options)
 
 
+@pytest.mark.parametrize("infinity", [1e20, 1e30, np.inf])
+@pytest.mark.parametrize("name", ["lemke", "interior-point", "fischer-newton", "minimum-map-newton", None])
+def test_1e20_is_infinite(name, infinity):
+    rng = np.random.default_rng(23)
+    C, b = rng.standard_normal((N, N)), rng.standard_normal(N)
+    A = C @ C.T + np.eye(N)
+    lower, upper = np.where(np.arange(N) % 2, -0.1, -infinity), np.where(np.arange(N) % 3, infinity, 0.15)
+    expected = boxed(A, b, np.where(np.arange(N) % 2, -0.1, -np.inf), np.where(np.arange(N) % 3, np.inf, 0.15))
+    for given in ((lower, upper), list(zip(lower, upper, strict=True)), Bounds(lower, upper), (wp.array(lower, device="cpu"), upper)):
+        check(wl.linear_complementarity(A, b, bounds=given, tol=1e-10, method=name), A, b, lower, upper, expected)
+    for given in ((-infinity, infinity), (None, None)):
+        np.testing.assert_allclose(wl.linear_complementarity(A, b, bounds=given, tol=1e-10).x, np.linalg.solve(A, -b), atol=1e-8)
+
+
+ARRAYS = (np.zeros(2), np.array([0.4, 3.0]))
+
+
+@pytest.mark.parametrize(
+    ("bounds", "expected"),
+    [
+        ([(0, 1), (0, 1)], ([0, 0], [1, 1])),
+        ([(None, 1), (-1, None)], ([-np.inf, -1], [1, np.inf])),
+        ([(0, 0.4), (0, 3)], ([0, 0], [0.4, 3])),
+        (([0, 0], [0.4, 3]), ([0, 0], [0.4, 3])),
+        (ARRAYS, ([0, 0], [0.4, 3])),
+        (([0, 0], (0.4, 3)), ([0, 0], [0.4, 3])),
+        ((0, 1), ([0, 0], [1, 1])),
+        ([0, 1], ([0, 0], [1, 1])),
+        ((None, [0.4, 3]), ([-np.inf, -np.inf], [0.4, 3])),
+        ([None, None], ([-np.inf, -np.inf], [np.inf, np.inf])),
+        ([[0, 1], [1, 3]], ([0, 1], [1, 3])),  # both readings are one
+    ],
+)
+def test_pairs_of_two_unknowns(bounds, expected):
+    A, b = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
+    found = wl.linear_complementarity(A, b, bounds=bounds, tol=1e-10, method="lemke")
+    check(found, A, b, *map(np.array, expected), boxed(A, b, *(np.array(side, dtype=float) for side in expected)))
+
+
+@pytest.mark.parametrize("bounds", [[[0, 0], [1, 1]], list(ARRAYS), ((0, 0), (1, 1)), np.array([[0, 0], [1, 1]]), [(0, 1), [0, 1]]])
+def test_what_could_be_pairs_or_a_pair_is_refused(bounds):
+    with pytest.raises(ValueError, match=r"bounds is a .* of two .*, which could be \(lo, hi\) or a pair for each of two unknowns: write"):
+        wl.linear_complementarity(np.eye(2), np.ones(2), bounds=bounds)
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_pairs_of_other_numbers_of_unknowns(kind):
+    rng = np.random.default_rng(29)
+    C, b = rng.standard_normal((4, 4)), rng.standard_normal(4)
+    A, lower, upper = C @ C.T + np.eye(4), np.array([-0.1, 0.0, -0.3, -np.inf]), np.array([0.0, 0.2, np.inf, 0.1])
+    pairs = kind([tuple(pair) for pair in zip(lower, upper, strict=True)])
+    found = wl.linear_complementarity(A, b, bounds=pairs, tol=1e-10, method="lemke")
+    check(found, A, b, lower, upper, boxed(A, b, lower, upper))
+    square = wl.linear_complementarity(A, b.reshape(2, 2), bounds=pairs, tol=1e-10, method="lemke")
+    np.testing.assert_array_equal(square.x.ravel(), found.x)
+    one = wl.linear_complementarity(A[:1, :1], b[:1], bounds=kind([(lower[0], upper[0])]), method="lemke")
+    np.testing.assert_allclose(one.x, np.clip(-b[0] / A[0, 0], lower[0], upper[0]), atol=1e-12)
+
+
 def test_callbacks_see_each_iterate():
     seen = []
 
@@ -186,6 +245,10 @@ A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
         ((A, np.ones(3)), {}, r"b has shape \(3,\): expected \(2,\)"),
         ((A, B), {"bounds": (0.5, -0.5)}, "lower > upper in 2 unknowns"),
         ((A, B), {"bounds": (0.0, 1.0, 2.0)}, r"bounds is a tuple: expected a pair \(lo, hi\)"),
+        ((A, B), {"bounds": [(0.0, 1.0)] * 3}, "bounds is a list: expected a pair .* a list of 2 pairs, .*; it has 3 entries"),
+        ((A, B), {"bounds": np.zeros((3, 2))}, r"bounds is a ndarray: expected a pair .*; it has shape \(3, 2\)"),
+        ((A, B), {"bounds": (1e20, None)}, "bounds, lo holds 1 values of 1e20 or beyond, which is infinite: no x could meet it"),
+        ((A, B), {"bounds": [(0, 1), (0, -1e30)]}, "bounds, hi holds 1 values of -1e20 or beyond"),
         ((A, B), {"bounds": 3}, "bounds is a int: expected a pair"),
         ((A, B), {"bounds": (np.zeros(3), 1.0)}, r"bounds, lo has shape \(3,\): expected \(2,\)"),
         ((A, B), {"bounds": (0.0, np.nan)}, "upper holds"),

@@ -264,6 +264,12 @@ def test_methods_by_name():
         wl.METHODS["lemk"]
     with pytest.raises(KeyError, match=r"no method is called 'foo': choose from .*, lemke, .*, psor"):
         wl.METHODS["foo"]
+    meant = {"ipm": "interior-point", "PGS": "psor", "qp": "quadratic-program", "InteriorPoint": "interior-point", "apg": "accelerated.*"}
+    for name, method in meant.items():
+        with pytest.raises(KeyError, match=f"no method is called '{name}': did you mean '{method}'"):
+            wl.METHODS[name]
+    with pytest.raises(ValueError, match=r"method = 'ipm': must be one of .*; did you mean 'interior-point'"):
+        wl.linear_complementarity(np.eye(2), np.ones(2), method="ipm")
     assert wl.METHODS.get("foo") is None
     assert "foo" not in wl.METHODS
 

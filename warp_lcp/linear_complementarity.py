@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.default import default_method, solve, solve_by_alternatives
 from warp_lcp.problem.affine_bounds import AffineBounds
+from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.result import Record, SolveStatus
 from warp_lcp.problem.solve import Solver
@@ -52,7 +53,9 @@ def linear_complementarity(
     Args:
         A: matrix (n, n), a numpy array or scipy.sparse one in any format, a scipy.sparse.linalg.LinearOperator, or an operator of warp_lcp.
         b: n numbers in any shape, or a field of the operator's shape.
-        bounds: a pair (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None where there is none; None: (0, inf).
+        bounds: a tuple (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None where there is none; or SciPy's list of
+            pairs (lo, hi), one for each unknown, of numbers or None; None: (0, inf). For two unknowns a list of two tuples is pairs, a
+            tuple of two lists or arrays is (lo, hi), and what could be both is refused. Magnitudes of 1e20 and more are infinite.
         x0: a guess, of b's shape.
         tol: relative tolerance, in [0, 1): of the natural residual's norm, relative to that at the projection of 0 onto the bounds.
         atol: absolute tolerance of that norm, >= 0, in the units of b.
@@ -88,8 +91,8 @@ def linear_complementarity(
     tell = _told(callback)
     operator = as_operator(A, b.device if isinstance(b, wp.array) else None)
     fields = _Fields(real_array(b, "b"), tuple(operator.shape))
-    lower, upper = _pair(bounds)
-    lower, upper = fields.load(lower, "bounds, lo"), fields.load(upper, "bounds, hi")
+    lower, upper = _sides_of(bounds, fields.given)
+    lower, upper = _bound(fields.load(lower, "bounds, lo"), "lo", np.inf), _bound(fields.load(upper, "bounds, hi"), "hi", -np.inf)
     problem = LCP(operator, fields.load(b, "b"), lower, upper, preconditioner=preconditioner)
     solver = default_method(problem) if method is None else _method(method)
     stopping = StoppingCriteria(rtol=rtol, atol=least, max_iterations=most, patience=max(30, most // 10))
@@ -119,42 +122,98 @@ class _Fields:
     """Arrays of b's shape, as fields of the operator's and back."""
 
     def __init__(self, b: np.ndarray, shape: tuple[int, ...]) -> None:
-        self._given, self._shape = b.shape, shape
+        self.given, self._shape = b.shape, shape
 
     def load(self, values: Any, name: str) -> Any:
         """Return an array in the operator's shape if it has b's, else as it is."""
         if np.ndim(values) == 0 or isinstance(values, (AffineBounds, wp.array)):
             return values
         host = real_array(values, name)
-        if host.shape == self._given and host.size == int(np.prod(self._shape)):
+        if host.shape == self.given and host.size == int(np.prod(self._shape)):
             return host.reshape(self._shape)
         if np.ndim(host) and name != "b" and host.shape != self._shape:
-            raise ValueError(f"{name} has shape {host.shape}: expected {self._given}")
+            raise ValueError(f"{name} has shape {host.shape}: expected {self.given}")
         return host
 
     def unload(self, field: wp.array[Any], dtype: Any = np.float64) -> np.ndarray:
         """Return a field as an array of b's shape, where that has as many elements."""
         host = np.array(field.numpy(), dtype=dtype)
-        return host.reshape(self._given if host.size == int(np.prod(self._given)) else host.shape)
+        return host.reshape(self.given if host.size == int(np.prod(self.given)) else host.shape)
 
 
-def _pair(bounds: Any) -> tuple[Any, Any]:
-    """Return lower and upper bounds."""
+def _sides_of(bounds: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
+    """Return lower and upper bounds of unknowns of a shape."""
     if bounds is None:
         return 0.0, np.inf
     if hasattr(bounds, "lb") and hasattr(bounds, "ub"):
         return bounds.lb, bounds.ub
-    if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
-        raise ValueError(f"bounds is a {type(bounds).__name__}: expected a pair (lo, hi), a scipy.optimize.Bounds or None")
+    expected = f"expected a pair (lo, hi), a list of {int(np.prod(shape))} pairs, a scipy.optimize.Bounds or None"
+    if not isinstance(bounds, (tuple, list, np.ndarray)):
+        raise ValueError(f"bounds is a {type(bounds).__name__}: {expected}")
+    if _is_pairs(bounds, int(np.prod(shape))):
+        infinite = (-np.inf, np.inf)
+        pairs = [[infinite[k] if side is None else float(side) for k, side in enumerate(pair)] for pair in bounds]
+        lower, upper = np.array(pairs, dtype=np.float64).T
+        return lower.reshape(shape), upper.reshape(shape)
+    if isinstance(bounds, np.ndarray) or len(bounds) != 2:
+        size = f"shape {bounds.shape}" if isinstance(bounds, np.ndarray) else f"{len(bounds)} entries"
+        raise ValueError(f"bounds is a {type(bounds).__name__}: {expected}; it has {size}")
     lower, upper = bounds
     return -np.inf if lower is None else lower, np.inf if upper is None else upper
+
+
+def _is_pairs(bounds: Any, n: int) -> bool:
+    """Return whether bounds are SciPy's pairs, one for each of n unknowns.
+
+    Raises:
+        ValueError: they could be a pair (lo, hi) of arrays as well, and would mean something else.
+    """
+    if len(bounds) != n or not all(_is_pair(one) for one in bounds):
+        return False
+    if n != 2 or (isinstance(bounds, list) and all(isinstance(one, tuple) for one in bounds)):
+        return True
+    if isinstance(bounds, tuple) and not all(isinstance(one, tuple) for one in bounds):
+        return False
+    if bounds[0][1] == bounds[1][0]:  # both readings are the same
+        return True
+    kinds = f"{type(bounds).__name__} of two {type(bounds[0]).__name__}s"
+    raise ValueError(
+        f"bounds is a {kinds}, which could be (lo, hi) or a pair for each of two unknowns: "
+        "write a tuple of two lists or arrays, ([lo, lo], [hi, hi]), or a list of two tuples, [(lo, hi), (lo, hi)]"
+    )
+
+
+def _is_pair(one: Any) -> bool:
+    """Return whether this is a sequence of two numbers or None."""
+    if isinstance(one, np.ndarray):
+        return one.shape == (2,)
+    return isinstance(one, (tuple, list)) and len(one) == 2 and all(side is None or np.ndim(side) == 0 for side in one)
+
+
+def _bound(values: Any, name: str, wrong: float) -> Any:
+    """Return a bound, with infinity for 1e20 and more.
+
+    Raises:
+        ValueError: it is infinite on the wrong side.
+    """
+    if isinstance(values, AffineBounds):
+        return values
+    host = real_array(values, f"bounds, {name}").astype(np.float64)
+    found = huge_as_infinite(host)
+    if (found == wrong).any():
+        count, sign = np.count_nonzero(found == wrong), "-" if wrong < 0 else ""
+        raise ValueError(f"bounds, {name} holds {count} values of {sign}1e20 or beyond, which is infinite: no x could meet it")
+    if found is host:
+        return values
+    return wp.array(found, dtype=values.dtype, device=values.device) if isinstance(values, wp.array) else found
 
 
 def _method(method: Any) -> Solver:
     """Return the method that a name stands for, or the one given."""
     if isinstance(method, str):
         if method not in METHODS:
-            raise ValueError(f"method = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings or None")
+            meant = f"; {METHODS.nearest(method)}" if "did you mean" in METHODS.nearest(method) else ""
+            raise ValueError(f"method = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings or None{meant}")
         return METHODS[method]()
     if isinstance(method, type) or not isinstance(method, Solver):
         kind = f"the class {method.__name__}" if isinstance(method, type) else f"a {type(method).__name__}"

@@ -7,12 +7,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.linear_complementarity import linear_complementarity
+from warp_lcp.linear_complementarity import STATUSES, linear_complementarity
+from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.program_optimality import (
+    ProgramPoint,
+    ProgramUnits,
+    ProgramWithRows,
+    equilibrated,
+    has_no_solution,
+    polished,
+    relative_residuals,
+    settled,
+    with_rows,
+)
 from warp_lcp.problem.reformulate import QuadraticProgramData, quadratic_program_to_boxed
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.rows.fields import real_array
-from warp_lcp.solvers.dense_problem import DenseProblem
+from warp_lcp.solvers.dense_problem import PROVABLE, DenseProblem
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.quadratic_program import is_convex
@@ -21,6 +33,9 @@ if TYPE_CHECKING:
     from qpsolvers import Problem, Solution
 
 NAME = "warp_lcp"
+LOOSER = 10.0  # times tol: residuals row by row, where a method has met tol in the norm of all rows
+LEAST = 1e-12  # the least tolerance of rows, which rounding leaves
+WORDS = {"infeasible": "no x meets the constraints", "unbounded": "costs fall without end: the program is unbounded below"}
 
 
 def register() -> None:
@@ -44,70 +59,161 @@ def solve_problem(
 ) -> Solution:
     """Minimize x'Px / 2 + q'x subject to G x <= h, A x = b, lb <= x <= ub, P symmetric positive semi-definite.
 
-    A program with nothing but a box is the boxed LCP of P and q ([Book] eq. 1.58); others are solved by the boxed LCP of their first-order
-    conditions, in x and the multipliers (`quadratic_program_to_boxed`). Matrices stay sparse where they are all sparse.
+    A program with nothing but a box is the boxed LCP of P and q ([Book] eq. 1.58); others are equilibrated and solved by the boxed LCP of
+    their first-order conditions, in x and the multipliers (`quadratic_program_to_boxed`). Magnitudes of 1e20 and more in h, lb and ub are
+    infinite.
 
     Args:
         problem: of qpsolvers; P's symmetric part is what counts.
         initvals: a guess of x, shape (n,).
         verbose: print how the solve ended.
-        method: of `linear_complementarity`. None: what that takes for a box; with other constraints InteriorPoint, then Lemke.
-        tol: relative tolerance of the natural residual, in [0, 1).
+        method: of `linear_complementarity`. None: what that takes for a box; with other constraints, or where that fails, InteriorPoint,
+            then Lemke.
+        tol: relative tolerance, in [0, 1), of the natural residual; what is found has primal and dual residuals below 10 tol in every
+            row, relative to the terms of that row, and such a duality gap, relative to its terms.
         maxiter: the most iterations of a method.
 
     Returns:
-        x with the multipliers y, z and z_box in qpsolvers' signs, and `found` where the residual, recomputed in float64, meets the
-        tolerance; else `found` is False and they are None. `extras["result"]` is what `linear_complementarity` returned last.
+        x with the multipliers y, z and z_box in qpsolvers' signs, and `found` where residuals and gap, recomputed in float64 in all rows,
+        meet the tolerance; else `found` is False and they are None. `extras["result"]` is what `linear_complementarity` returned last,
+        with success, status and message of the program; "primal_residual", "dual_residual" and "duality_gap" are those relative figures.
 
     Raises:
-        ValueError: the program is not convex, an argument is of another kind or shape, or a bound is NaN.
+        ValueError: the program is not convex, an argument is of another kind or shape, or a bound is NaN, crossed or on the wrong side of
+            all numbers.
     """
     from qpsolvers import Solution
 
+    program, bounding = _read(problem)
+    _check_convex(program.Q, program.c)
+    x0 = None if initvals is None else _vector(initvals, "initvals", len(program.c))
+    solve = _Solve(program, method, tol, maxiter, x0)
+    if program.h is not None and np.isposinf(program.h).any():
+        rows = np.flatnonzero(bounding)[np.isposinf(program.h)]
+        solve.end(SolveStatus.INFEASIBLE, f"h[{rows[0]}] is -infinity, which no x meets")
+    else:
+        solve.run()
+    result = solve.result
+    if verbose:
+        print(f"{NAME}: {result.message} ({result.nit} iterations)")
+    figures = dict(zip(("primal_residual", "dual_residual", "duality_gap"), solve.figures, strict=True))
+    solution = Solution(problem, extras={"result": result, **figures}, found=solve.point is not None)
+    if solve.point is not None:
+        _write(solution, program, solve.point, bounding)
+    return solution
+
+
+class _Solve:
+    """Methods one after the other, until the point of one is optimal.
+
+    Attributes:
+        point: what is optimal, in the program's units; None: nothing yet.
+        result: of the last method.
+        figures: relative primal residual, dual residual and gap of the last point.
+    """
+
+    def __init__(self, program: QuadraticProgramData, method: Any, tol: float, maxiter: int, x0: np.ndarray | None) -> None:
+        self.program, self.method, self.tol, self.maxiter, self.x0 = program, method, tol, maxiter, x0
+        self.point: ProgramPoint | None = None
+        self.figures = (np.inf, np.inf, np.inf)
+        self.result: Any = None
+
+    def run(self) -> None:
+        """Solve a box as it is, and the conditions of what is no box or where that fails."""
+        p = self.program
+        if p.h is None and p.d is None:
+            self._box()
+            if self.point is not None or self.method is not None:
+                return
+        self._scaled, self._units = equilibrated(with_rows(p))
+        self._conditions = quadratic_program_to_boxed(self._scaled, device="cpu")
+        self._by(InteriorPoint() if self.method is None else self.method)
+        if self.point is not None or self.method is not None:
+            return
+        if sum(map(_entries, (self._scaled.Q, self._scaled.G, self._scaled.C))) <= PROVABLE and (why := has_no_solution(self._scaled)):
+            self.end(SolveStatus.INFEASIBLE, WORDS[why])
+        elif len(self._conditions.b) <= Lemke.most_unknowns:
+            self._by(Lemke())
+
+    def end(self, status: SolveStatus, message: str) -> None:
+        """Say how the program ended."""
+        message = f"{status.name}: {message}"
+        if self.result is None:
+            from scipy.optimize import OptimizeResult
+
+            self.result = OptimizeResult(nit=0)
+        self.result.update(success=status is SolveStatus.CONVERGED, status=STATUSES[status], message=message)
+
+    def _box(self) -> None:
+        """Solve the boxed LCP of P and q in the caller's units."""
+        p = self.program
+        sides = {"bounds": (p.lower, p.upper), "x0": self.x0, "method": self.method}
+        self.result = found = linear_complementarity(p.Q, p.c, tol=self.tol, maxiter=self.maxiter, **sides)
+        x = np.where(found.active_mask < 0, p.lower, np.where(found.active_mask > 0, p.upper, found.x))
+        self._judge(with_rows(p), ProgramPoint(x, np.zeros(0), np.zeros(0)), None)
+
+    def _by(self, method: Any) -> None:
+        """Solve the equilibrated conditions by a method."""
+        p, units, made = self._scaled, self._units, self._conditions
+        n, m = len(p.c), len(p.h)
+        x0 = None if self.x0 is None else np.r_[self.x0 / units.x, np.zeros(len(made.b) - n)]
+        sides = {"bounds": (made.lower, made.upper), "x0": x0, "method": method}
+        self.result = found = linear_complementarity(made.A, made.b, tol=self.tol, maxiter=self.maxiter, **sides)
+        point = ProgramPoint(found.x[:n], found.x[n : n + m], found.x[n + m :])
+        if not np.isfinite(found.x).all():
+            return
+        self._judge(p, polished(p, point) if found.success or self.method is None else settled(p, point), units)
+
+    def _judge(self, p: ProgramWithRows, point: ProgramPoint, units: ProgramUnits | None) -> None:
+        """Take a point that is optimal, or say that it is not."""
+        self.figures = relative_residuals(p, point)
+        found = point if units is None else units.of_caller(point)
+        if max(self.figures) <= max(LOOSER * self.tol, LEAST) and found.is_finite:
+            self.point = found
+            self.end(SolveStatus.CONVERGED, f"{SolveStatus.CONVERGED.value}")
+        elif self.result.success:
+            worst = ", ".join(f"{name} {value:.1e}" for name, value in zip(("primal", "dual", "gap"), self.figures, strict=True))
+            self.end(SolveStatus.FLOOR, f"the conditions are solved, but a row is not to 10 tol: relative residuals {worst}")
+
+
+def _write(solution: Solution, program: QuadraticProgramData, point: ProgramPoint, bounding: np.ndarray) -> None:
+    """Write x, its objective and the multipliers."""
+    problem, x, p = solution.problem, point.x, program
+    slope = p.Q @ x + p.c
+    solution.x, solution.obj = x, float(0.5 * x @ (p.Q @ x) + p.c @ x)
+    if problem.G is not None:
+        solution.z = np.zeros(len(bounding))
+        if p.G is not None:
+            solution.z[bounding] = point.z
+            slope = slope - p.G.T @ point.z
+    if problem.A is not None:
+        solution.y = np.zeros(0) if p.C is None else -point.y
+        slope = slope if p.C is None else slope - p.C.T @ point.y
+    if problem.lb is not None or problem.ub is not None:
+        at_lower, at_upper = (x <= p.lower) & ((slope > 0) | (x < p.upper)), x >= p.upper
+        solution.z_box = np.where(at_lower, np.minimum(-slope, 0.0), np.where(at_upper, np.maximum(-slope, 0.0), 0.0))
+
+
+def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
+    """Return the program, without rows that bound nothing, and which rows of G it has; its G and h have the opposite sign."""
     P, q, lower, upper = _objective(problem)
     n = len(q)
     G, h = _rows(problem.G, problem.h, "G", "h", n)
     C, d = _rows(problem.A, problem.b, "A", "b", n)
-    bounding = None if h is None else h < np.inf  # other rows bound nothing
-    if h is not None and bounding is not None:
-        G, h = G[np.flatnonzero(bounding)], h[bounding]
-    _check_convex(P, q)
-    given: dict[str, Any] = {"tol": tol, "maxiter": maxiter}
-    if h is None and d is None:
-        found = linear_complementarity(P, q, bounds=(lower, upper), x0=initvals, method=method, **given)
-    else:
-        data = QuadraticProgramData(P, q, lower, upper, None if G is None else -G, None if h is None else -h, C, d)
-        if not all(M is None or scipy.sparse.issparse(M) for M in (P, G, C)):
-            data = QuadraticProgramData(*(M.toarray() if scipy.sparse.issparse(M) else M for M in vars(data).values()))
-        made = quadratic_program_to_boxed(data, device="cpu")
-        x0 = None if initvals is None else np.r_[_vector(initvals, "initvals", n), np.zeros(len(made.b) - n)]
-        for taken in (InteriorPoint(), Lemke()) if method is None else (method,):
-            if isinstance(taken, Lemke) and method is None and len(made.b) > Lemke.most_unknowns:
-                break
-            found = linear_complementarity(made.A, made.b, bounds=(made.lower, made.upper), x0=x0, method=taken, **given)
-            if found.success or found.result.status is SolveStatus.INFEASIBLE:
-                break
-    if verbose:
-        print(f"{NAME}: {found.message} ({found.nit} iterations, relative residual {found.relative_residual:.1e})")
-    solution = Solution(problem, extras={"result": found}, found=found.success)
-    if found.success:
-        _write(solution, P, q, found, bounding)
-    return solution
+    h = None if h is None else huge_as_infinite(h)
+    bounding = np.zeros(0, dtype=bool) if h is None else h < np.inf
+    if h is not None:
+        G, h = (-G[np.flatnonzero(bounding)], -h[bounding]) if bounding.any() else (None, None)
+    if d is not None and not np.isfinite(d).all():
+        raise ValueError(f"b holds {np.count_nonzero(~np.isfinite(d))} values that are not finite: equations need numbers")
+    if d is not None and not len(d):
+        C, d = None, None
+    return QuadraticProgramData(P, q, lower, upper, G, h, C, d), bounding
 
 
-def _write(solution: Solution, P: Any, q: np.ndarray, found: Any, bounding: np.ndarray | None) -> None:
-    """Write x, its objective and the multipliers."""
-    n, problem = len(q), solution.problem
-    x = found.x[:n]
-    solution.x, solution.obj = x, float(0.5 * x @ (P @ x) + q @ x)
-    inequalities = 0 if bounding is None else int(np.count_nonzero(bounding))
-    if bounding is not None:
-        solution.z = np.zeros(len(bounding))
-        solution.z[bounding] = np.maximum(found.x[n : n + inequalities], 0.0)
-    if problem.A is not None:
-        solution.y = -found.x[n + inequalities :]
-    if problem.lb is not None or problem.ub is not None:
-        solution.z_box = np.where(found.active_mask[:n] != 0, -found.slack[:n], 0.0)
+def _entries(M: Any) -> int:
+    """Return how many entries of a matrix are not 0."""
+    return int(M.nnz if scipy.sparse.issparse(M) else np.count_nonzero(M))
 
 
 def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
@@ -117,8 +223,15 @@ def _objective(problem: Problem) -> tuple[Any, np.ndarray, np.ndarray, np.ndarra
     P = _matrix(problem.P, "P")
     if P.shape != (n, n):
         raise ValueError(f"P has shape {P.shape}: expected {(n, n)}, after q")
-    lower = np.full(n, -np.inf) if problem.lb is None else _vector(problem.lb, "lb", n)
-    upper = np.full(n, np.inf) if problem.ub is None else _vector(problem.ub, "ub", n)
+    if not np.isfinite(q).all():
+        raise ValueError(f"q holds {np.count_nonzero(~np.isfinite(q))} values that are not finite")
+    lower = np.full(n, -np.inf) if problem.lb is None else huge_as_infinite(_vector(problem.lb, "lb", n))
+    upper = np.full(n, np.inf) if problem.ub is None else huge_as_infinite(_vector(problem.ub, "ub", n))
+    for name, side, wrong in (("lb", lower, np.inf), ("ub", upper, -np.inf)):
+        if (side == wrong).any():
+            raise ValueError(f"{name}[{np.flatnonzero(side == wrong)[0]}] is {wrong} (1e20 and more are infinite): no x could meet it")
+    if (lower > upper).any():
+        raise ValueError(f"lb > ub in {np.count_nonzero(lower > upper)} unknowns, {np.flatnonzero(lower > upper)[0]} the first")
     return (P + P.T) * 0.5, q, lower, upper
 
 

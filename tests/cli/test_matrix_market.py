@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 import scipy.sparse
 
-from warp_lcp.cli.matrix_market import MarketError, read_market
+from warp_lcp.cli.matrix_market import HEAD, MarketError, read_market, read_shape
 from warp_lcp.files.claims import ClaimError
 
 RANDOM = np.random.default_rng(733)
@@ -89,6 +89,25 @@ def test_what_is_wrong_is_told(tmp_path, data, message):
 def test_a_shape_is_refused_before_its_matrix_is_read(tmp_path):
     with pytest.raises(ValueError, match="has shape 2 x 3: expected another"):
         read(tmp_path / "a.mtx", REAL + b"2 3 1\nno numbers at all\n", lambda rows, columns: rows == columns)
+
+
+def test_the_shape_is_read_alone(tmp_path):
+    path = tmp_path / "a.mtx"
+    path.write_bytes(REAL + b"% " + b"long" * 40_000 + b"\n7 9 1\n" + b"no numbers")
+    assert read_shape(path, lambda rows, columns: True, "") == (7, 9)
+    cut = REAL + b"%" + b"x" * (HEAD - len(REAL) - len("%\n70")) + b"\n70"  # the first bytes end in the size
+    path.write_bytes(cut + b"0 900 1\n1 1 1\n")
+    assert len(cut) == HEAD
+    assert read_shape(path, lambda rows, columns: True, "") == (700, 900)
+    (tmp_path / "a.mtx.gz").write_bytes(gzip.compress(REAL + b"3 4 1\nno numbers"))
+    assert read_shape(tmp_path / "a.mtx.gz", lambda rows, columns: True, "") == (3, 4)
+    for data, message in (
+        (REAL + b"2 2 9\n1 1 1\n", "2 x 2 with 9 entries: these take 53 bytes, and the file has 6"),
+        (b"", "does not begin"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=message):
+            read_shape(path, lambda rows, columns: True, "")
 
 
 def test_a_device_is_no_file(tmp_path):

@@ -72,6 +72,26 @@ def test_a_dense_problem_with_bounds_in_files(method, tmp_path):
     np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), expected, atol=1e-8)
 
 
+@pytest.mark.parametrize("infinity", [1e20, 3e20, 1e30, np.inf])
+def test_1e20_is_infinite_in_files(infinity, tmp_path):
+    rng = np.random.default_rng(31)
+    B = rng.standard_normal((5, 5))
+    A, b = B @ B.T + np.eye(5), rng.standard_normal(5)
+    lower, upper = np.array([-infinity, -0.1, 0.0, -infinity, 0.0]), np.array([infinity, 0.1, 0.05, 0.0, infinity])
+    for name, array in {"A": A, "b": b, "l": lower, "u": upper}.items():
+        write(tmp_path / f"{name}.mtx", array)
+    result = call(
+        *(tmp_path / "A.mtx", tmp_path / "b.mtx", "--lower", tmp_path / "l.mtx", "--upper", tmp_path / "u.mtx"),
+        *("--method", "lemke", "--out", tmp_path / "x.mtx", "--tolerance", 1e-11),
+    )
+    assert result.exit_code == 0, result.stderr
+    expected = boxed(A, b, np.where(lower <= -1e20, -np.inf, lower), np.where(upper >= 1e20, np.inf, upper))
+    np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), expected, atol=1e-9)
+    free = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--lower", -infinity, "--out", tmp_path / "x.mtx", "--tolerance", 1e-11)
+    assert free.exit_code == 0, free.stderr
+    np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), np.linalg.solve(A, -b), atol=1e-9)
+
+
 def test_the_files_symmetry_is_understood(problem, tmp_path):
     """A symmetric file holds one triangle only."""
     A, _ = problem
@@ -114,6 +134,13 @@ def test_a_long_history_is_shortened(problem, tmp_path):
         (["complex.mtx", "b.mtx"], "complex.mtx: holds complex numbers"),
         (["nan.mtx", "b.mtx"], "nan.mtx: holds 1 values that are not finite"),
         (["A.mtx", "A.mtx"], "A.mtx: has shape 36 x 36: expected 36 x 1"),
+        (["claims.mtx", "b.mtx"], "b.mtx: has shape 36 x 1: expected 2000000000 x 1, a number for each row of A"),
+        (["A.mtx", "b.mtx", "--upper", "long.mtx"], "long.mtx: has shape 2000000000 x 1: expected 36 x 1"),
+        (
+            ["A.mtx", "b.mtx", "--lower", "1e25"],
+            "--lower 1e25: inf, or a magnitude of 1e20 and more, which is infinite: no x could meet it",
+        ),
+        (["A.mtx", "b.mtx", "--upper=-inf"], "--upper -inf: -inf, or a magnitude of 1e20 and more"),
         (["A.mtx", "bnan.mtx"], "bnan.mtx: holds 2 values that are not finite"),
         (["A.mtx", "binf.mtx"], "binf.mtx: holds 1 values that are not finite"),
         (["A.mtx", "b.mtx", "--upper", "bnan.mtx"], "bnan.mtx: holds 2 values that are NaN"),
@@ -136,6 +163,9 @@ def test_wrong_input_exits_with_2(problem, tmp_path, monkeypatch, arguments, exp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.mtx").write_text("1 2 3\n")
     (tmp_path / "short.mtx").write_text("%%MatrixMarket matrix coordinate real general\n2 2 3\n1 1 1.0\n")
+    claims = "%%MatrixMarket matrix coordinate real general\n2000000000 {} 2\n1 1 1.0\n36 1 1.0\n"
+    (tmp_path / "claims.mtx").write_text(claims.format(2000000000))
+    (tmp_path / "long.mtx").write_text(claims.format(1))
     write(tmp_path / "wide.mtx", A[:, :35])
     write(tmp_path / "complex.mtx", A * 1j)
     broken = A.copy()

@@ -26,13 +26,38 @@ HEADER = re.compile(
 )
 COPIES = 5  # of the text: the shortest number takes 2 bytes of it, and 8 as it is read
 NUMBER = 8  # bytes
+HEAD = 1 << 16  # bytes in which a header is looked for before all of a file is read
+Fits = Callable[[int, int], bool]  # whether a matrix of so many rows and columns is allowed
 
 
 class MarketError(ValueError):
     """A file that is not of this format; the message says why, not which file."""
 
 
-def read_market(path: Path, fits: Callable[[int, int], bool], expected: str) -> Any:
+def read_shape(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
+    """Return rows and columns as the header of a matrix has them, without reading more.
+
+    Args:
+        path: the file; .gz and .bz2 are unpacked.
+        fits: whether a shape is allowed.
+        expected: what the message says of a shape that is not.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: as `read_market`.
+    """
+    text = _text(path, HEAD)
+    header = HEADER.match(text)
+    if len(text) == HEAD and (header is None or header.end() == HEAD):  # a long comment, or a size cut short
+        header = HEADER.match(_text(path))
+    rows, columns, more = _size(header, fits, expected)
+    if more and header is not None and path.suffix not in PACKED:
+        width = 2 if header["field"].lower() == b"pattern" else 3
+        _check_stored(_entries(rows, columns, more[0]), width * more[0], path.stat().st_size - header.end())
+    return rows, columns
+
+
+def read_market(path: Path, fits: Fits, expected: str) -> Any:
     """Read a matrix: scipy.sparse (CSR) or numpy as the file says, float64.
 
     Args:
@@ -48,6 +73,17 @@ def read_market(path: Path, fits: Callable[[int, int], bool], expected: str) -> 
     """
     text = _text(path)
     header = HEADER.match(text)
+    rows, columns, more = _size(header, fits, expected)
+    assert header is not None
+    form, field, symmetry = (header[name].lower() for name in ("form", "field", "symmetry"))
+    body = text[header.end() :]
+    if form == b"array":
+        return _dense(body, rows, columns, symmetry)
+    return _sparse(body, rows, columns, more[0], symmetry, pattern=field == b"pattern")
+
+
+def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[int, int, list[int]]:
+    """Return rows, columns and what else the size line has, a number of entries; refuse what does not fit."""
     if header is None:
         raise MarketError("it does not begin with %%MatrixMarket matrix, form, field and symmetry, and its size")
     form, field, symmetry = (header[name].lower() for name in ("form", "field", "symmetry"))
@@ -60,10 +96,7 @@ def read_market(path: Path, fits: Callable[[int, int], bool], expected: str) -> 
         raise MarketError("its size is not that of its form")
     if symmetry != b"general" and rows != columns:
         raise MarketError(f"has shape {rows} x {columns}: symmetric matrices are square")
-    body = text[header.end() :]
-    if form == b"array":
-        return _dense(body, rows, columns, symmetry)
-    return _sparse(body, rows, columns, more[0], symmetry, pattern=field == b"pattern")
+    return rows, columns, more
 
 
 def _dense(body: bytes, rows: int, columns: int, symmetry: bytes) -> np.ndarray:
@@ -83,8 +116,8 @@ def _dense(body: bytes, rows: int, columns: int, symmetry: bytes) -> np.ndarray:
 def _sparse(body: bytes, rows: int, columns: int, entries: int, symmetry: bytes, *, pattern: bool) -> scipy.sparse.csr_array:
     """Return a matrix of entries (row, column, value), counted from 1."""
     width = 2 if pattern else 3
-    what = f"{rows} x {columns} with {entries} entries"
-    table = _numbers(body, width * entries, what, NUMBER * (rows + 2 * width * entries)).reshape(entries, width)
+    what = _entries(rows, columns, entries)
+    table = _numbers(body, width * entries, what, NUMBER * (rows + columns + 2 * width * entries)).reshape(entries, width)
     kind: Any = np.int32 if max(rows, columns) <= np.iinfo(np.int32).max else np.int64
     with np.errstate(invalid="ignore"):  # a place that is no such number differs from what was read
         row, column = (table[:, axis].astype(kind) - 1 for axis in range(2))
@@ -109,7 +142,7 @@ def _numbers(body: bytes, count: int, what: str, needed: int) -> np.ndarray:
         what: names them.
         needed: memory that they take [bytes].
     """
-    check_claim(what, needed, stored=len("1\n") * count - 1, held=len(body))
+    _check_stored(what, count, len(body), needed)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # so NumPy says that something is no number
@@ -121,16 +154,30 @@ def _numbers(body: bytes, count: int, what: str, needed: int) -> np.ndarray:
     return found
 
 
-def _text(path: Path) -> bytes:
-    """Return what is in a file, unpacked if it is packed."""
+def _entries(rows: int, columns: int, entries: int) -> str:
+    return f"{rows} x {columns} with {entries} entries"
+
+
+def _check_stored(what: str, count: int, held: int, needed: int = 0) -> None:
+    """Refuse a count of numbers that so many bytes cannot hold, or that need more memory than is free."""
+    check_claim(what, needed, stored=len("1\n") * count - 1, held=held)
+
+
+def _text(path: Path, most: int | None = None) -> bytes:
+    """Return what is in a file, unpacked if it is packed, or the first bytes of it."""
     unpack = PACKED.get(path.suffix)
+    if unpack is None and most is not None and path.is_file():
+        with path.open("rb") as stream:
+            return stream.read(most)
     if unpack is None:
         return read_whole(path, copies=COPIES)
-    most = free_host_memory()
+    free = free_host_memory()
     try:
         with unpack(path) as stream:
-            text: bytes = stream.read(-1 if most is None else most // COPIES)
-            if most is not None and stream.read(1):
+            if most is not None:
+                return bytes(stream.read(most))
+            text: bytes = stream.read(-1 if free is None else free // COPIES)
+            if free is not None and stream.read(1):
                 raise ClaimError("what is packed in it does not fit the free memory")
     except (EOFError, zlib.error, MemoryError) as error:
         raise MarketError(f"cannot be unpacked: {error}") from error

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,11 @@ import scipy.io
 import scipy.sparse
 from rich.table import Table
 
-from warp_lcp.cli.matrix_market import MarketError, read_market
+from warp_lcp.cli.matrix_market import Fits, MarketError, read_market, read_shape
 from warp_lcp.default import solve
 from warp_lcp.files.atomic import replacing
 from warp_lcp.operators import DenseOperator, SparseOperator
+from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import families
 from warp_lcp.problem.result import SolveResult
@@ -25,6 +27,7 @@ from warp_lcp.settings import SettingError, nearest
 from warp_lcp.solvers.registry import METHODS
 
 MOST_ROWS = 40  # of the table of iterations: a longer history shows its first and last ones
+SQUARE: tuple[Fits, str] = (lambda rows, columns: rows == columns > 0, "A must be square")
 FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)"
 
 
@@ -99,7 +102,7 @@ def solve_files(
     Args:
         matrix: A, sparse (coordinate) or dense (array).
         right_side: b, a vector of either form.
-        lower: a number or the file of a vector.
+        lower: a number or the file of a vector; magnitudes of 1e20 and more are infinite.
         upper: likewise.
         method: a name in `METHODS`; what `wl.solve` chooses if None.
         tolerance: of the residual, relative to the one at clip(0, lower, upper).
@@ -110,11 +113,13 @@ def solve_files(
     Raises:
         ProblemError: a file or an option is wrong.
     """
+    stopping = criteria(tolerance, max_iterations, max_seconds)
+    n = _checked(matrix, *SQUARE)[0]  # sizes first: a file may claim rows that take minutes
+    for path in (right_side, *(Path(side) for side in (lower, upper) if _number(side) is None and Path(side).exists())):
+        _checked(path, *_vector_of(n))
     A = read_matrix(matrix)
-    n = A.shape[0]
     b = read_vector(right_side, n)
     sides = [_bound(value, n, f"--{name}") for name, value in (("lower", lower), ("upper", upper))]
-    stopping = criteria(tolerance, max_iterations, max_seconds)
     try:
         operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
         problem = LCP(operator, b, *sides)
@@ -145,7 +150,7 @@ def read_matrix(path: Path) -> Any:
     Raises:
         ProblemError: the file cannot be read, or holds no finite real square matrix.
     """
-    return _read(path, lambda rows, columns: rows == columns > 0, "A must be square")
+    return _read(path, *SQUARE)
 
 
 def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
@@ -154,8 +159,7 @@ def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
     Raises:
         ProblemError: the file cannot be read, or holds something else.
     """
-    expected = f"expected {n} x 1, a number for each row of A"
-    matrix = _read(path, lambda rows, columns: (rows, columns) in ((n, 1), (1, n)), expected, infinite=infinite)
+    matrix = _read(path, *_vector_of(n), infinite=infinite)
     return (matrix.toarray() if scipy.sparse.issparse(matrix) else matrix).ravel()
 
 
@@ -172,10 +176,22 @@ def write_vector(path: Path, x: np.ndarray) -> None:
         raise ProblemError(f"--out {path}: {error.strerror}") from error
 
 
-def _read(path: Path, fits: Callable[[int, int], bool], expected: str, *, infinite: bool = False) -> Any:
-    """Return what a file of a shape that fits holds: finite real numbers, or also infinite ones."""
+def _vector_of(n: int) -> tuple[Fits, str]:
+    """Return which shapes a vector may have, and what a message says of others."""
+    return lambda rows, columns: (rows, columns) in ((n, 1), (1, n)), f"expected {n} x 1, a number for each row of A"
+
+
+def _checked(path: Path, fits: Fits, expected: str) -> tuple[int, int]:
+    """Return the shape that a file's header claims, which fits."""
+    with _told(path):
+        return read_shape(path, fits, expected)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Say which file is meant where one cannot be read."""
     try:
-        matrix = read_market(path, fits, expected)
+        yield
     except FileNotFoundError as error:
         raise ProblemError(f"{path}: no such file") from error
     except OSError as error:
@@ -184,6 +200,12 @@ def _read(path: Path, fits: Callable[[int, int], bool], expected: str, *, infini
         raise ProblemError(f"{path}: is not {FORMAT}: {error}") from error
     except ValueError as error:
         raise ProblemError(f"{path}: {error}") from error
+
+
+def _read(path: Path, fits: Fits, expected: str, *, infinite: bool = False) -> Any:
+    """Return what a file of a shape that fits holds: finite real numbers, or also infinite ones."""
+    with _told(path):
+        matrix = read_market(path, fits, expected)
     values = matrix.data if scipy.sparse.issparse(matrix) else matrix
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     if wrong.any():
@@ -191,20 +213,30 @@ def _read(path: Path, fits: Callable[[int, int], bool], expected: str, *, infini
     return matrix
 
 
-def _bound(value: str, n: int, option: str) -> float | np.ndarray:
-    """Return a bound: a number, or the vector in a file."""
+def _number(value: str) -> float | None:
+    """Return a number, None if the text is none."""
     try:
         return float(value)
     except ValueError:
-        if not Path(value).exists():
-            raise ProblemError(f"{option} {value}: neither a number nor a file") from None
-        return read_vector(Path(value), n, infinite=True)
+        return None
+
+
+def _bound(value: str, n: int, option: str) -> float | np.ndarray:
+    """Return a bound: a number, or the vector in a file, with infinity for 1e20 and more."""
+    number = _number(value)
+    if number is None and not Path(value).exists():
+        raise ProblemError(f"{option} {value}: neither a number nor a file")
+    side = huge_as_infinite(read_vector(Path(value), n, infinite=True) if number is None else np.asarray(number))
+    wrong = np.inf if option == "--lower" else -np.inf
+    if (side == wrong).any():
+        raise ProblemError(f"{option} {value}: {wrong}, or a magnitude of 1e20 and more, which is infinite: no x could meet it")
+    return side if side.ndim else float(side)
 
 
 def method_named(name: str, family: str, *, shared: bool = False) -> Any:
     """Return a method by its name, for a family of operators, perhaps on several ranks."""
     if name not in METHODS:
-        raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
+        raise ProblemError(f"--method {name}: no such method; {METHODS.nearest(name)}")
     fits = [known for known, kind in METHODS.items() if family in families(kind) and (not shared or getattr(kind, "distributed", False))]
     if name not in fits:
         what = "work on several ranks" if shared else "take grids" if family == "grid" else f"take {family} matrices"

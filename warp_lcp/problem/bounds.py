@@ -16,6 +16,7 @@ from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
 from warp_lcp.rows.vectors import Sums
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
+INFINITY = 1e20  # a bound of this magnitude is infinite in files and to SciPy's and qpsolvers' users, as OSQP and CPLEX take it
 LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
 BITS = (1, 2)  # of a code: the lower bound is finite, the upper one is
 HEADERS, SIDES = Path(__file__).parent / "headers", {"lower": wp.float64, "upper": wp.float64}
@@ -196,3 +197,14 @@ class Bounds:
         source, bits, out = (wp.array(a, device="cpu", copy=False) for a in arrays)
         CODE_ROWS.bind(rows, source=source, code=bits, value=value, infinite=INFINITE[side], bit=BITS[side], out=out).launch()
         return not out.numpy().any()
+
+
+def huge_as_infinite(values: np.ndarray) -> np.ndarray:
+    """Return bounds, or right-hand sides of inequalities, with +-inf in place of magnitudes of INFINITY and more."""
+    huge = np.abs(values) >= INFINITY
+    return np.where(huge, np.copysign(np.inf, values), values) if huge.any() else values
+
+
+def without_far(lower: np.ndarray, upper: np.ndarray, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return lower bounds of at most -far and upper ones of at least far as infinite: no solution of size 1 meets them."""
+    return np.where(lower <= -far, -np.inf, lower), np.where(upper >= far, np.inf, upper)

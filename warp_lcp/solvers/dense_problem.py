@@ -78,7 +78,9 @@ class DenseProblem:
         b, start = R * self.b, R * (self.A @ np.clip(0.0, self.lower, self.upper))
         beta = power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0)
         units = beta * C
-        return DenseProblem(self.rows, scaled(self.A, R, C), b / beta, self.lower / units, self.upper / units, self.symmetric), units
+        with np.errstate(over="ignore"):  # a bound beyond all numbers in these units is infinite
+            sides = self.lower / units, self.upper / units
+        return DenseProblem(self.rows, scaled(self.A, R, C), b / beta, *sides, self.symmetric), units
 
     def _units(self) -> tuple[np.ndarray, np.ndarray]:
         """Return R and C of `scaled`, powers of 2."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
 
+from warp_lcp.problem.bounds import INFINITY, without_far
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step
@@ -127,6 +129,8 @@ class FischerDenseWorkspace(DenseWorkspace):
         super().start(warm=warm, tolerance=tolerance)
         s = self.settings
         data, self.units = self.data.scaled()
+        lower, upper = without_far(data.lower, data.upper, INFINITY)  # squares of what is larger overflow
+        data = replace(data, lower=lower, upper=upper)
         self.map = FischerMap(data, self._descent.share, Kink(s.kink), np.random.default_rng(2015))
         self._identity = np.eye(len(data.b))
         self._search.forget()
@@ -246,6 +250,8 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     if not right.size:
         return right
     factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)
+    if not (np.isfinite(factors).all() or np.isfinite(matrix).all()) or not np.isfinite(right).all():
+        return np.full(right.shape, np.nan)  # LAPACK's least squares would raise or not return
     if info != 0 or not np.isfinite(factors).all():
         return np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
     return scipy.linalg.lapack.dgetrs(factors, pivots, right)[0]

@@ -176,7 +176,8 @@ class PivotingWorkspace(DenseWorkspace):
         free = (kind == FREE) & (np.abs(dx) > ZERO * np.abs(dx).max())
         free[j] = True
         room = np.where(dx > 0, data.upper - x, x - data.lower)
-        steps[free] = np.maximum(room[free], 0.0) / np.abs(dx[free])
+        with np.errstate(over="ignore"):  # a bound that is as good as infinite
+            steps[free] = np.maximum(room[free], 0.0) / np.abs(dx[free])
         leaving = ((kind == LOW) & (dy < -noise)) | ((kind == HIGH) & (dy > noise))
         leaving &= data.lower < data.upper
         slack = np.where(kind == LOW, y, -y)

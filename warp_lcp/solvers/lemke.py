@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.linalg.blas import dger
 
 from warp_lcp.deadline import time_is_up
 from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.bounds import without_far
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
@@ -170,6 +171,8 @@ PIVOT = 1e-10  # entries of the entering column below this part of its largest a
 TIE = 1e-12  # relative difference of ratios that counts as a tie, which the lexicographic rule breaks
 NOISE = 1e-6  # residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution
 PERIOD = 20  # pivots, or an eighth of the rows if that is more, after which the inverse is computed afresh; columns are refined between
+FAR = 1e8  # bounds of this size, in units in which A and b are near 1, are left out at first: beside them ratios that differ tie
+BEYOND = 1e100  # those of this size always are: products overflow
 ACCEPTED = 1e-9  # relative error of the entering column after refinement with which the inverse stays in use
 
 
@@ -183,7 +186,8 @@ class Lemke(Settings):
     prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED. On a bimatrix game,
     M = [[0, E], [F', 0]] with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's method does.
 
-    Boxes add a pair of variables, equations are eliminated or, where their block is singular, split (see LemkeForm). x0 is not used. A
+    Bounds far beyond the sizes of A and b count as infinite at first, and as they are if that leads nowhere. Boxes add a pair of variables,
+    equations are eliminated or, where their block is singular, split (see LemkeForm). x0 is not used. A
     pivot costs O(m^2), m <= 2n. A step is a block of pivots; `linear_iterations` counts pivots.
 
     Args:
@@ -381,7 +385,7 @@ class LemkeWorkspace(DenseWorkspace):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Begin at z = 0 with the covering vector of ones."""
         super().start(warm=warm, tolerance=tolerance)
-        self.rays, self._random = 0, np.random.default_rng(5381)
+        self.rays, self._random, self._keeps_far = 0, np.random.default_rng(5381), False
         self._take()
 
     def read(self) -> DenseProblem:
@@ -396,6 +400,11 @@ class LemkeWorkspace(DenseWorkspace):
     def _take(self) -> None:
         """Scale the problem, and begin at z = 0 with the covering vector of ones."""
         scaled, self.units = self.data.scaled()
+        given, sides = (self.data.lower, self.data.upper), without_far(scaled.lower, scaled.upper, FAR)
+        self._has_far = any((np.isfinite(one) & np.isinf(other)).any() for one, other in zip(given, sides, strict=True))
+        if self._has_far:
+            lower, upper = without_far(scaled.lower, scaled.upper, BEYOND) if self._keeps_far else sides
+            scaled = replace(scaled, lower=lower, upper=upper)
         self.form = LemkeForm.of(scaled)
         m = len(self.form.q)
         self._sizes = (float(abs(self.form.M).max() if m else 0.0) or 1.0, float(np.abs(self.form.q).max(initial=0.0)) or 1.0)
@@ -404,10 +413,10 @@ class LemkeWorkspace(DenseWorkspace):
     def pivot(self, count: int) -> int:
         """Make at most `count` pivots; returns how many were made."""
         done = 0
-        if self.basis is None:
-            self._finish(np.zeros(len(self.form.q)))
-            return 0
         while done < count and self.ended is None and not time_is_up():
+            if self.basis is None:
+                self._finish(np.zeros(len(self.form.q)))
+                break
             outcome = self.basis.pivot()
             done += outcome is not False
             if isinstance(self.basis, BandedBasis) and not self.basis.regular:
@@ -451,5 +460,9 @@ class LemkeWorkspace(DenseWorkspace):
         if self.rays < self.covering_vectors:
             self.rays += 1
             self._cover(self._random.uniform(0.5, 1.5, len(self.form.q)))
+            return
+        if self._has_far and not self._keeps_far:  # a solution may lie out there
+            self.rays, self._keeps_far = 0, True
+            self._take()
             return
         self.ended = SolveStatus.INFEASIBLE if inconsistent(self.data) else SolveStatus.STAGNATED

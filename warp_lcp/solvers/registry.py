@@ -31,13 +31,32 @@ from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
+ALSO = {
+    "ipm": "interior-point",
+    "pgs": "psor",
+    "sor": "psor",
+    "gauss-seidel": "psor",
+    "jacobi": "projected-jacobi",
+    "simplex": "lemke",
+    "piqp": "quadratic-program",
+}
+
 
 class Methods(dict[str, type[Any]]):
-    """Methods by their names; an unknown one's KeyError says which there are."""
+    """Methods by their names; an unknown one's KeyError says which is meant, or which there are."""
 
     def __missing__(self, name: str) -> type[Any]:
         """Refuse a name that no method has."""
-        raise KeyError(f"no method is called {name!r}: {nearest(str(name), self)}")
+        raise KeyError(f"no method is called {name!r}: {self.nearest(name)}")
+
+    def nearest(self, name: object) -> str:
+        """Return `did you mean ...?` for initials ("ipm"), a class's name or another method's, else what `settings.nearest` says."""
+        word = str(name).lower().replace("_", "-").replace(" ", "-")
+        for known, kind in self.items():
+            initials = "".join(part[0] for part in known.split("-"))
+            if ALSO.get(word, known) == known and (word in ALSO or word in (initials, kind.__name__.lower())):
+                return f"did you mean {known!r}?"
+        return nearest(word, self)
 
 
 METHODS = Methods(

@@ -1,0 +1,309 @@
+"""Optimality of a point of a quadratic program: its residuals row by row, Newton steps on its active set, proofs that there is none.
+
+All of it is in the units of `equilibrated`: x = sigma D x', multipliers of rows E z' / (c sigma), P' = c sigma^2 D P D and so on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+
+from warp_lcp.problem.reformulate import QuadraticProgramData
+from warp_lcp.problem.scale import scaled
+
+SMALL = 400  # unknowns and rows up to which matrices are dense, whatever the caller's are
+SWEEPS = 20  # of Ruiz's iteration, each of which halves the logarithms of rows that differ
+CANCELED = 1e-10  # terms of a row below this part of ||a_i|| ||x|| are rounding (Arioli, Demmel and Duff 1989 take 1000 n eps)
+PROXIMAL = 1e-8  # shift of the conditions' matrix, which dependent rows make singular; refinement takes its effect off
+REFINEMENTS = 12
+CHANGES = 30  # of the active set
+EXACT = 1e-13  # relative residual below which there is nothing to improve
+PROVED = 1e-7  # value of a certificate, relative to its terms, beyond rounding and HiGHS's tolerances
+
+
+@dataclass(frozen=True, eq=False)
+class ProgramWithRows(QuadraticProgramData):
+    """A program that has G, h, C and d, without rows where there are none."""
+
+    h: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    d: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class ProgramUnits:
+    """Units of an equilibrated program.
+
+    Attributes:
+        x: what 1 in x' is in x, shape (n,).
+        inequalities: what 1 in a multiplier of G x >= h is, shape (m,).
+        equations: what 1 in a multiplier of C x = d is, shape (k,).
+    """
+
+    x: np.ndarray
+    inequalities: np.ndarray
+    equations: np.ndarray
+
+    def of_caller(self, point: ProgramPoint) -> ProgramPoint:
+        """Return a point of the equilibrated program in the units of the program it was made of."""
+        with np.errstate(over="ignore"):  # a multiplier may be beyond all numbers in those
+            return ProgramPoint(self.x * point.x, self.inequalities * point.z, self.equations * point.y)
+
+
+@dataclass(frozen=True, eq=False)
+class ProgramPoint:
+    """A point and its multipliers: Q x + c - G' z - C' y is >= 0 at lower bounds, <= 0 at upper ones and 0 elsewhere.
+
+    Attributes:
+        x: shape (n,).
+        z: multipliers of G x >= h, shape (m,), >= 0.
+        y: multipliers of C x = d, shape (k,).
+    """
+
+    x: np.ndarray
+    z: np.ndarray
+    y: np.ndarray
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all numbers are."""
+        return all(np.isfinite(part).all() for part in (self.x, self.z, self.y))
+
+
+def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
+    """Return a program with rows, all matrices sparse, or all dense if they are small or dense."""
+    matrices, n = (program.Q, program.G, program.C), len(program.c)
+    h, d = (np.zeros(0) if v is None else v for v in (program.h, program.d))
+    dense = n + len(h) + len(d) <= SMALL or not any(scipy.sparse.issparse(M) for M in matrices)
+
+    def made(M: Any) -> Any:
+        if M is None:
+            M = np.zeros((0, n))
+        if dense:
+            return M.toarray() if scipy.sparse.issparse(M) else M
+        return scipy.sparse.csr_array(M)
+
+    Q, G, C = map(made, matrices)
+    return ProgramWithRows(Q, program.c, program.lower, program.upper, G, h, C, d)
+
+
+def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnits]:
+    """Return a program in units in which its rows and columns are alike, and those units, powers of 2.
+
+    D and E make the largest entry of each row of diag(D, E) [[Q, B'], [B, 0]] diag(D, E) 1, B the rows of G and C (Ruiz 2001, as OSQP
+    does it), with Q in a unit of its own. sigma is a unit of x after the sizes of bounds and right-hand sides, the cost's unit follows.
+
+    Args:
+        program: with rows (`with_rows`).
+    """
+    n, m, Q = len(program.c), len(program.h), program.Q
+    B = _stacked(program.G, program.C)
+    E = 1 / _nonzero(_largest(B, 1))
+    curvature = abs(Q) / _nonzero(_largest(Q, 0).max(initial=0.0))
+    D = np.ones(n)
+    for _ in range(SWEEPS):
+        rows = scaled(B, E, D)
+        D = D / np.sqrt(_nonzero(np.maximum(_largest(scaled(curvature, D, D), 0), _largest(rows, 0))))
+        E = E / np.sqrt(_nonzero(_largest(rows, 1)))
+    D, E = _power_of_two(D), _power_of_two(E)
+    right = np.r_[E * np.r_[program.h, program.d], program.lower / D, program.upper / D]
+    sizes = np.abs(right[np.isfinite(right) & (right != 0)])
+    bend = float(_largest(scaled(Q, D, D), 0).max(initial=0.0))
+    costs = np.abs(D * program.c)[program.c != 0]
+    slope = float(np.median(costs)) if len(costs) else 0.0
+    sigma = float(np.median(sizes)) if len(sizes) else slope / bend if bend and slope else 1.0
+    sigma = _power_of_two(sigma)
+    cost = _power_of_two(1 / (max(sigma * bend, slope) or 1.0))  # times sigma: of sigma D (Q x + c)
+    made = ProgramWithRows(
+        scaled(Q, cost * sigma * D, D), cost * D * program.c, program.lower / (sigma * D), program.upper / (sigma * D),
+        scaled(program.G, E[:m], D), E[:m] * program.h / sigma, scaled(program.C, E[m:], D), E[m:] * program.d / sigma,
+    )  # fmt: skip
+    with np.errstate(over="ignore"):
+        return made, ProgramUnits(sigma * D, E[:m] / cost, E[m:] / cost)
+
+
+def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
+    """Return a point within its bounds with each pair complementary: x on a bound, or z = 0, whichever moves less."""
+    at, slope = np.clip(point.x, program.lower, program.upper), _gradient(program, point)
+    x = np.where(at - program.lower <= slope, program.lower, np.where(program.upper - at <= -slope, program.upper, at))
+    x = np.where(np.isfinite(x), x, at)
+    slack = program.G @ at - program.h
+    return ProgramPoint(x, np.where(slack <= point.z, np.maximum(point.z, 0.0), 0.0), point.y)
+
+
+def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[float, float, float]:
+    """Return the primal and the dual residual, each the largest of its rows relative to the terms of that row, and the gap to its own.
+
+    For row i of a x - b that is |a_i x - b_i| / (sum_j |a_ij x_j| + |b_i|), the componentwise backward error, which does not depend on the
+    units of rows; where all terms are rounding, ||a_i|| ||x|| is added (Arioli, Demmel and Duff 1989). An inequality with a
+    multiplier counts as an equation. The duality gap is x'Qx + c'x - h'z - d'y less what the bounds pay, relative to the sum of its parts.
+
+    Args:
+        program: with rows.
+        point: with x within the bounds.
+    """
+    p, x, z, y = program, point.x, point.z, point.y
+    slack, miss = p.G @ x - p.h, p.C @ x - p.d
+    rows = _stacked(p.G, p.C)
+    right, missed = np.abs(np.r_[p.h, p.d]), np.r_[np.where(z > 0, np.abs(slack), np.maximum(-slack, 0.0)), np.abs(miss)]
+    primal = _relative(missed, abs(rows) @ np.abs(x) + right, _largest(abs(rows), 1) * np.abs(x).max(initial=0.0) + right)
+    g, multipliers = _gradient(p, point), np.abs(np.r_[z, y])
+    wrong = np.where(x <= p.lower, np.maximum(-g, 0.0), np.where(x >= p.upper, np.maximum(g, 0.0), np.abs(g)))
+    wrong = np.where(p.lower == p.upper, 0.0, wrong)
+    terms = abs(p.Q) @ np.abs(x) + np.abs(p.c) + abs(rows).T @ multipliers
+    sizes = _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0) + np.abs(p.c) + _largest(abs(rows), 0) * multipliers.max(initial=0.0)
+    dual = _relative(wrong, terms, sizes)
+    held = np.where((x <= p.lower) | (x >= p.upper), g * x, 0.0)
+    parts = np.r_[x * (p.Q @ x), p.c * x, -p.h * z, -p.d * y, -held]
+    sides = np.r_[x * (p.G.T @ z), x * (p.C.T @ y)]  # of the same size, where h and d are 0
+    size = float(np.abs(parts).sum() + np.abs(sides).sum())
+    return primal, dual, abs(float(parts.sum())) / size if size else 0.0
+
+
+def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
+    """Return the best point of some primal-dual active-set steps: Newton's for the equations of the active rows, the others let go.
+
+    Args:
+        program: with rows.
+        point: near a solution.
+    """
+    p, best = program, settled(program, point)
+    error, now, seen = max(relative_residuals(p, best)), best, set()
+    low, high = now.x <= p.lower, (now.x >= p.upper) & (now.x > p.lower)
+    tight = now.z > 0
+    for _ in range(CHANGES):
+        key = (low.tobytes(), high.tobytes(), tight.tobytes())
+        if error <= EXACT or key in seen:
+            break
+        seen.add(key)
+        found = _newton(p, now, low, high, tight)
+        if found is None:
+            break
+        inside = ProgramPoint(np.clip(found.x, p.lower, p.upper), np.maximum(found.z, 0.0), found.y)
+        for tried in (inside, replace(inside, x=np.where(np.abs(inside.x) > CANCELED, inside.x, np.clip(0.0, p.lower, p.upper)))):
+            worth = max(relative_residuals(p, tried))
+            if worth < error:
+                best, error = tried, worth
+        slope, slack = _gradient(p, found), p.G @ found.x - p.h
+        fixed = p.lower == p.upper
+        low, high = fixed | np.where(low, slope > 0, found.x < p.lower), ~fixed & np.where(high, slope < 0, found.x > p.upper)
+        tight, now = np.where(tight, found.z > 0, slack < 0), found
+    return best
+
+
+def has_no_solution(program: ProgramWithRows) -> str:
+    """Return why a program has no solution, proved by a certificate that was computed anew; "" where there is no proof.
+
+    Infeasible: z >= 0, y and bound multipliers with G'z + C'y + v - w = 0 and h'z + d'y + l'v - u'w > 0 (Farkas). Unbounded: a direction e
+    with Q e = 0, C e = 0, G e >= 0, within the cone of the bounds, and c'e < 0.
+
+    Args:
+        program: with rows.
+    """
+    from scipy.optimize import linprog  # a fifth of a second to import, and seldom needed
+
+    p, n = program, len(program.c)
+    low, high = np.flatnonzero(np.isfinite(p.lower)), np.flatnonzero(np.isfinite(p.upper))
+    unit = scipy.sparse.eye_array(n, format="csr")
+    rows = scipy.sparse.vstack([scipy.sparse.csr_array(p.G), scipy.sparse.csr_array(p.C), unit[low], -unit[high]]).tocsr()
+    worth = np.r_[p.h, p.d, p.lower[low], -p.upper[high]]
+    if len(worth):
+        size = _nonzero(np.abs(worth))  # each row in its own size: a far bound is no proof
+        rows_of_one, worth_of_one = scaled(rows, 1 / size, np.ones(n)), worth / size
+        limits = np.repeat([[0.0, 1.0]], len(worth), axis=0)
+        limits[len(p.h) : len(p.h) + len(p.d), 0] = -1.0
+        found = linprog(-worth_of_one, A_eq=rows_of_one.T, b_eq=np.zeros(n), bounds=limits, method="highs")
+        if found.status == 0:
+            v = _without_rounding(np.clip(found.x, limits[:, 0], limits[:, 1]))
+            gain, terms = float(worth_of_one @ v), float(np.abs(worth_of_one) @ np.abs(v))
+            rest, left = np.abs(rows_of_one.T @ v), abs(rows_of_one).T @ np.abs(v)
+            if gain > PROVED * terms and (rest <= 1e-2 * PROVED * left + 1e-300).all():
+                return "infeasible"
+    if not p.c.any():
+        return ""
+    sides = np.stack([np.where(np.isfinite(p.lower), 0.0, -1.0), np.where(np.isfinite(p.upper), 0.0, 1.0)], axis=1)
+    still = _stacked(p.Q, p.C)
+    more = {"A_ub": -p.G, "b_ub": np.zeros(len(p.h))} if len(p.h) else {}
+    found = linprog(p.c, A_eq=still, b_eq=np.zeros(still.shape[0]), bounds=sides, method="highs", **more)
+    if found.status != 0:
+        return ""
+    e = _without_rounding(np.clip(found.x, sides[:, 0], sides[:, 1]))
+    moved, up = np.abs(still @ e), p.G @ e
+    small = 1e-2 * PROVED
+    flat = (moved <= small * (abs(still) @ np.abs(e)) + 1e-300).all() and (up >= -small * (abs(p.G) @ np.abs(e))).all()
+    return "unbounded" if flat and -float(p.c @ e) > PROVED * float(np.abs(p.c) @ np.abs(e)) else ""
+
+
+def _without_rounding(values: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(values) > 1e-2 * PROVED * np.abs(values).max(initial=0.0), values, 0.0)
+
+
+def _newton(p: ProgramWithRows, now: ProgramPoint, low: Any, high: Any, tight: Any) -> ProgramPoint | None:
+    """Return the point where the active rows hold and the slope of the free unknowns is 0; None where it is not finite.
+
+    [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step refined: of rows that depend on each other the least change.
+    """
+    free, active = np.flatnonzero(~low & ~high), np.flatnonzero(tight)
+    x = np.where(low, p.lower, np.where(high, p.upper, now.x))
+    B, right = _stacked(p.G[active], p.C), np.r_[p.h[active], p.d]
+    multipliers = np.r_[now.z[active], now.y]
+    if len(free) + len(right):
+        solve = _factored(p.Q[free][:, free], B[:, free])
+        for _ in range(REFINEMENTS if solve else 0):
+            slope = (p.Q @ x + p.c - B.T @ multipliers)[free]
+            step = -solve(np.r_[slope, B @ x - right])  # type: ignore[misc]
+            x[free] += step[: len(free)]
+            multipliers = multipliers + step[len(free) :]
+        if solve is None or not (np.isfinite(x).all() and np.isfinite(multipliers).all()):
+            return None
+    z = np.zeros(len(p.h))
+    z[active] = multipliers[: len(active)]
+    return ProgramPoint(x, z, multipliers[len(active) :])
+
+
+def _factored(Q: Any, B: Any) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return what solves [[Q + s, -B'], [B, s]] v = r, s = PROXIMAL; None where the factors are singular."""
+    n, k = Q.shape[0], B.shape[0]
+    if scipy.sparse.issparse(Q):
+        M = scipy.sparse.block_array([[Q, -B.T], [B, scipy.sparse.csr_array((k, k))]]) + PROXIMAL * scipy.sparse.eye_array(n + k)
+        try:
+            solve: Callable[[np.ndarray], np.ndarray] = scipy.sparse.linalg.splu(M.tocsc()).solve
+        except RuntimeError:
+            return None
+        return solve
+    factors, pivots, info = scipy.linalg.lapack.dgetrf(np.block([[Q, -B.T], [B, np.zeros((k, k))]]) + PROXIMAL * np.eye(n + k))
+    return None if info else lambda r: scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
+
+
+def _gradient(p: ProgramWithRows, point: ProgramPoint) -> np.ndarray:
+    """Return Q x + c - G' z - C' y."""
+    return p.Q @ point.x + p.c - p.G.T @ point.z - p.C.T @ point.y
+
+
+def _relative(values: np.ndarray, terms: np.ndarray, sizes: np.ndarray) -> float:
+    """Return the largest of values relative to the terms they are left of."""
+    whole = np.where(terms > CANCELED * sizes, terms, terms + sizes)
+    return float((values / np.where(whole > 0, whole, 1.0)).max(initial=0.0))
+
+
+def _stacked(*parts: Any) -> Any:
+    return scipy.sparse.vstack(parts).tocsr() if scipy.sparse.issparse(parts[0]) else np.vstack(parts)
+
+
+def _largest(M: Any, axis: int) -> np.ndarray:
+    if not min(M.shape):
+        return np.zeros(M.shape[1 - axis])
+    return abs(M).max(axis=axis).toarray().ravel() if scipy.sparse.issparse(M) else abs(M).max(axis=axis)
+
+
+def _nonzero(values: np.ndarray) -> np.ndarray:
+    return np.where(values > 0, values, 1.0)
+
+
+def _power_of_two(value: Any) -> Any:
+    return 2.0 ** np.round(np.log2(value))
