@@ -36,17 +36,16 @@ def draw_case(kind: str, seed: int, index: int) -> Case:
 
 
 def attempt(case: Case) -> Answer:
-    """Solve a case; exceptions become answers. A ValueError raised by this package is a refusal."""
+    """Solve a case; exceptions become answers. A ValueError is a refusal, but for LinAlgError, which derives from it."""
     try:
         return case.solve()
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         trace = error.__traceback__
         while trace is not None and trace.tb_next is not None:
             trace = trace.tb_next
         file = trace.tb_frame.f_code.co_filename if trace is not None else ""
-        inside = any(part in file for part in ("warp_lcp", "qpsolvers")) and "hostile" not in file
-        refused = isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError) and inside
-        where = f" (at {file.rsplit('/', 1)[-1]}:{trace.tb_lineno})" if trace is not None and not refused else ""
+        where = f" (raised in {file.rsplit('/', 1)[-1]}:{trace.tb_lineno})" if trace is not None and "warp_lcp" not in file else ""
+        refused = isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError)
         return Answer("REFUSED" if refused else "EXCEPTION", None, f"{type(error).__name__}: {str(error)[:150]}{where}")
 
 

@@ -139,9 +139,7 @@ def stencil_matrix(
     return sp.coo_array((values.astype(float), (i.astype(int), j.astype(int))), shape=(cells.size, cells.size)).tocsr()
 
 
-def boundary_term(
-    cells: Array, coefficients: dict[tuple[int, ...], Any], values: Array, periodic: tuple[bool, ...], outside: int
-) -> Array:
+def boundary_term(cells: Array, coefficients: dict[tuple[int, ...], Any], values: Array, periodic: tuple[bool, ...], outside: int) -> Array:
     """Return the sums of a_o(i) value_(i + o) over AIR neighbors; `values` is padded by one cell."""
     total = np.zeros(cells.shape)
     for cell in zip(*np.nonzero(cells == FLUID), strict=True):

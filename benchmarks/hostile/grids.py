@@ -102,7 +102,7 @@ def periodic(rng: Rng) -> Case:
         x, b = draw.plant(rng, A, low, high)
         box = Box(A=A, b=b, lower=low, upper=high, rtol=float(rng.choice([1e-6, 1e-8])), solution=x, unique=True, solvable=True, grid=True)
         name = f"dominant stencil {'x'.join(map(str, shape))} over {spread:.1f} decades, {bound} bounds"
-        return box_case(rng, name, box, operator=lambda: _stencil(cells, a, sides, draw.AIR), shape=shape, unknowns=np.arange(cells.size), named=GRID_METHODS, share=0.2)
+        return _stencil_case(rng, name, box, cells, a, sides, draw.AIR)
     three = rng.random() < 0.2
     shape = tuple(draw.size(rng, 3, 9 if three else 48) for _ in range(3 if three else 2))
     cells, sides = np.ones(shape, int), (True, True, three)
@@ -118,7 +118,17 @@ def periodic(rng: Rng) -> Case:
         b, x = b - b.mean() - 10 ** rng.uniform(-3, 0), None
     box = Box(A=A, b=b, lower=low, upper=high, rtol=1e-6, solution=x, solvable=solvable, definite=True, grid=True)
     name = f"periodic stencil {'x'.join(map(str, shape))}, {bound} bounds, {'planted' if solvable else 'incompatible'}"
-    return box_case(rng, name, box, operator=lambda: _stencil(cells, a, sides, draw.SOLID), shape=shape, unknowns=np.arange(cells.size), named=GRID_METHODS, share=0.15)
+    return _stencil_case(rng, name, box, cells, a, sides, draw.SOLID)
+
+
+def _stencil_case(rng: Rng, name: str, box: Box, cells: np.ndarray, a: Any, sides: Any, outside: int) -> Case:
+    """Return a case whose cells are all FLUID."""
+
+    def operator() -> Any:
+        return _stencil(cells, a, sides, outside)
+
+    every = np.arange(cells.size)
+    return box_case(rng, name, box, operator=operator, shape=cells.shape, unknowns=every, named=GRID_METHODS, share=0.2)
 
 
 def _stencil(cells: Any, a: Any, sides: Any, outside: int) -> Any:

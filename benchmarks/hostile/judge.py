@@ -12,9 +12,6 @@ from scipy.optimize import linprog
 from warp_lcp.benchmarks.hostile.case import CONVERGED, EXCEPTION, INFEASIBLE, REFUSED, Answer, Box, Case, Program, Refusal, Values
 
 EPS = np.finfo(np.float64).eps
-FAULTS = ("FALSE CONVERGED", "FALSE INFEASIBLE", "CRASH", "TIMEOUT", "EXCEPTION")
-REMARKS = ("row hidden", "suspicious", "not solved", "refused", "infeasible unproved")
-GOOD = ("converged", "infeasible right", "honest", "other method")
 HIDDEN = 1e-3  # a row violated by more than this share of its own terms is hidden by others
 Verdicts = list[tuple[str, str]]
 
@@ -43,11 +40,12 @@ def _refusal(truth: Refusal, answer: Answer) -> Verdicts:
 def _values(truth: Values, answer: Answer) -> Verdicts:
     if answer.status != CONVERGED:
         return [("not solved", f"{answer.status}: {answer.note}")]
+    magnitude = max((float(np.abs(e).max(initial=0.0)) for e in truth.expected.values()), default=0.0)
     for name, expected in truth.expected.items():
         if name not in answer.values:
             return [("FALSE CONVERGED", f"{name} is missing")]
         error = float(np.abs(answer.values[name] - expected).max(initial=0.0))
-        largest = float(np.abs(expected).max(initial=0.0)) + 1e-300
+        largest = max(float(np.abs(expected).max(initial=0.0)), 1e-3 * magnitude, 1e-9)  # some may be 0
         if not error <= truth.tolerance * largest:
             return [("FALSE CONVERGED", f"{name} is off by {error / largest:.1e} of its largest entry")]
     return [("converged", "")]
@@ -204,7 +202,7 @@ def reference(program: Program) -> np.ndarray | None:
     for name in ("clarabel", "piqp"):
         try:
             solution = qpsolvers.solve_problem(program.plain, solver=name)
-        except Exception:  # noqa: BLE001
+        except Exception:
             continue
         if solution.found and solution.x is not None:
             first = solution.x if first is None else first

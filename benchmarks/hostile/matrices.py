@@ -95,8 +95,11 @@ def _reynolds(rng: Rng) -> Case:
 
 def narrow(rng: Rng) -> Case:
     """Draw a chain, beam or tridiagonal matrix with bounds in windows."""
-    n = draw.size(rng, 50, 4000) if rng.random() < 0.92 else draw.size(rng, 10_000, 50_000)
-    t, bandwidth = np.arange(1, n + 1) / (n + 1), int(rng.choice([1, 2, 3], p=[0.65, 0.3, 0.05]))
+    n, bandwidth = draw.size(rng, 50, 4000), int(rng.choice([1, 2, 3], p=[0.65, 0.3, 0.05]))
+    n = min(n, {1: n, 2: 2000, 3: 100}[bandwidth])  # conditions grow with n^2, n^4 and n^6
+    if rng.random() < 0.08 and bandwidth < 3:
+        n = draw.size(rng, 10_000, 50_000)
+    t, foundation = np.arange(1, n + 1) / (n + 1), 10 ** rng.uniform(-8, -4)
     if bandwidth == 1:
         w = 10 ** (rng.uniform(0, 1) * np.sin(rng.uniform(1, 20) * np.r_[t, 1]))
         A = sp.diags_array([-w[1:-1], w[:-1] + w[1:], -w[1:-1]], offsets=[-1, 0, 1], shape=(n, n))
@@ -105,16 +108,18 @@ def narrow(rng: Rng) -> Case:
     else:
         D = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)).tocsr()
         A = D @ D + rng.choice([0.0, 1.0]) * D if bandwidth == 2 else D @ D @ D
+        A = A + foundation * sp.eye_array(n) if n > 2000 else A
     symmetric = bandwidth > 1 or not np.any(wind)
     load = rng.uniform(5, 60) * np.sin(rng.uniform(1, 30) * t + rng.uniform(0, 6)) - rng.uniform(-10, 15)
-    b = load / (n + 1) ** (2 * bandwidth)
+    b = load / (n + 1) ** (2 * bandwidth) if n <= 2000 or bandwidth == 1 else load * foundation
     low = np.full(n, -np.inf) if rng.random() < 0.1 else np.zeros(n)
     high = np.full(n, np.inf)
     for _ in range(int(rng.integers(0, 4))):
         high[np.abs(t - rng.random()) < rng.uniform(0.01, 0.3)] = 10 ** rng.uniform(-2.5, 0)
     box = Box(A=A.tocsr(), b=b, lower=low, upper=high, rtol=float(rng.choice([1e-6, 1e-8])), solvable=True, definite=symmetric)
     named = ("minimum-map-newton", "interior-point", "primal-dual-active-set", "mprgp", "lemke")
-    return box_case(rng, f"bandwidth {bandwidth}{'' if symmetric else ' with wind'}, {np.isfinite(high).sum()} upper", box, named=named, share=0.15)
+    name = f"bandwidth {bandwidth}{'' if symmetric else ' with wind'}, {np.isfinite(high).sum()} upper"
+    return box_case(rng, name, box, named=named, share=0.15)
 
 
 def sign(rng: Rng) -> Case:
@@ -155,13 +160,15 @@ def friction(rng: Rng) -> Case:
         W, mu = J @ J.T, rng.uniform(0, 1.2)
         normal = np.repeat(3 * np.arange(k), 3)
         normal[::3] = -1
-        b = rng.standard_normal(3 * k) - 0.5 * (normal < 0)
+        b = J @ rng.standard_normal(J.shape[1])  # velocities of bodies, so that there is a solution
         name, system_A, system_b = f"random boxed friction, mu {mu:.1f}", W, b
         low, high = wl.AffineBounds.friction(normal, mu)
     else:
         scene = str(rng.choice(sorted(SCENES)))
-        count = int(rng.integers(1, {"wall": 5, "leaning-wall": 4, "gear-pyramid": 3, "heavy-on-light": 3}.get(scene, 9)))
-        system = SCENES[scene](count, seed=int(rng.integers(1, 10_000))).assemble(float(10 ** rng.uniform(-3, -1.5))).system
+        count = int(rng.integers(2, {"wall": 5, "leaning-wall": 4, "gear-pyramid": 4, "heavy-on-light": 4}.get(scene, 9)))
+        count = 2 * (count // 2) + 3 if "snake" in scene else count  # an odd number of links
+        ratio = {"ratio": float(10 ** rng.uniform(0, 6))} if scene == "heavy-on-light" else {}
+        system = SCENES[scene](count, seed=int(rng.integers(1, 10_000)), **ratio).assemble(10 ** rng.uniform(-3, -1.5)).system
         if len(system.q) == 0:
             return friction(rng)
         model = BoxedModel() if rng.random() < 0.75 or len(system.q) > 300 else StewartTrinkleModel(4)
@@ -170,7 +177,7 @@ def friction(rng: Rng) -> Case:
     n = len(system_b)
     if not isinstance(low, wl.AffineBounds) and not isinstance(high, wl.AffineBounds):
         plain = [np.broadcast_to(np.asarray(side, dtype=float), n).copy() for side in (low, high)]
-        box = Box(A=system_A, b=system_b, lower=plain[0], upper=plain[1], rtol=rtol)
+        box = Box(A=system_A, b=system_b, lower=plain[0], upper=plain[1], rtol=rtol, solvable=True)  # (Anitescu, Potra)
         return box_case(rng, name, box, named=("lemke", "fischer-newton", "interior-point", "minimum-map-newton"), share=0.4)
 
     def sides(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -293,6 +300,8 @@ def odd(rng: Rng) -> Case:
     kind, low, high = draw.bounds(rng, n)
     if way == "stack":  # a stack of masses m_i: J M^-1 J' of neighbors
         mass = 10 ** (rng.uniform(2, 8) * rng.random(n + 1) ** rng.choice([1, 8]))
+        if rng.random() < 0.5:  # one heavy body on top of light ones
+            mass = np.r_[np.ones(n), 10 ** rng.uniform(2, 8)]
         J = np.eye(n, n + 1) - np.eye(n, n + 1, k=1)
         A, low, high, kind, what = (J / mass) @ J.T, np.zeros(n), np.full(n, np.inf), "lower", "stack of masses"
         A = sp.csr_array(A) if rng.random() < 0.4 else A

@@ -94,8 +94,9 @@ def program(rng: Rng, scale: float) -> Case:
     as_sparse, rng_bounds = bool(rng.random() < 0.4), bool(rng.random() < 0.4)
     scaled = problem(big, by_row[:rows], by_equation[:equations], True)
     plain = problem(1.0, np.ones(rows), np.ones(equations), False)
-    name = f"{expected} program, n={n}, rank {rank}, {rows} rows, {equations} equations, {'box' if lb is not None else 'no box'}, costs {big:.0e}"
-    name += f"{', sparse' if as_sparse else ''}, infinity {loose:g} in {open_rows.sum()} rows{' and bounds' if rng_bounds and lb is None else ''}"
+    name = f"{expected} program, n={n}, rank {rank}, {rows} rows, {equations} equations, {'box' if lb is not None else 'no box'}"
+    name += f", costs {big:.0e}{', sparse' if as_sparse else ''}, infinity {loose:g} in {open_rows.sum()} rows"
+    name += " and bounds" if rng_bounds and lb is None else ""
     return Case(name, lambda: solve_program(scaled), Program(scaled=scaled, plain=plain, expected=expected, unique=rank == n))
 
 
@@ -120,9 +121,10 @@ def low_rank(rng: Rng) -> Case:
     d = int(rng.integers(1, max(2, n // 3)))
     F = rng.standard_normal((n, d)) * np.sign(rng.standard_normal((n, 1)))
     Q, box = F @ F.T, {"rtol": draw.tolerance(rng), "solvable": True, "monotone": True}
-    none = np.full(n, np.inf)
+    none, one = np.full(n, np.inf), np.ones(n)
     if kind == "box":
-        truth = Box(A=Q, b=rng.choice([-np.ones(n), rng.standard_normal(n)]), lower=-np.ones(n) * rng.integers(0, 2), upper=np.ones(n), definite=True, **box)
+        b = rng.choice([-one, rng.standard_normal(n)])
+        truth = Box(A=Q, b=b, lower=-one * rng.integers(0, 2), upper=one, definite=True, **box)
     elif kind == "ridge":
         ridge = 10 ** rng.uniform(-8, -1)
         truth = Box(A=Q + ridge * np.eye(n), b=rng.standard_normal(n), lower=-np.ones(n), upper=np.ones(n), definite=True, **box)
@@ -143,11 +145,7 @@ def low_rank(rng: Rng) -> Case:
         rows = np.vstack([np.ones(n), mean])
         A = np.block([[Q / n + np.diag(10 ** rng.uniform(-4, -1, n)), -rows.T], [rows, np.zeros((2, 2))]])
         truth = Box(
-            A=A,
-            b=np.r_[np.zeros(n), -1.0, -np.median(mean)],
-            lower=np.r_[np.zeros(n), -np.inf, 0.0],
-            upper=np.full(n + 2, np.inf),
-            **box,
+            A=A, b=np.r_[np.zeros(n), -1.0, -np.median(mean)], lower=np.r_[np.zeros(n), -np.inf, 0.0], upper=np.full(n + 2, np.inf), **box
         )
     elif kind == "game":  # an equilibrium always exists; A is not monotone
         m = max(2, n // 3)
