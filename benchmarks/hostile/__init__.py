@@ -1,0 +1,55 @@
+"""Hostile inputs of plain users, drawn by seed and judged by independent oracles.
+
+`python -m warp_lcp.benchmarks.hostile --seed 1 --count 78` solves 78 cases of each kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from warp_lcp.benchmarks.hostile import grids, matrices, programs
+from warp_lcp.benchmarks.hostile.case import Answer, Case
+from warp_lcp.benchmarks.hostile.judge import Verdicts, judge
+
+KINDS: dict[str, Callable[[np.random.Generator], Case]] = {
+    "rows": matrices.rows,
+    "infinity": programs.infinity,
+    "program": programs.programs,
+    "solid": grids.solid,
+    "gradients": grids.gradients,
+    "singular": matrices.singular,
+    "narrow": matrices.narrow,
+    "sign": matrices.sign,
+    "low-rank": programs.low_rank,
+    "friction": matrices.friction,
+    "malformed": matrices.malformed,
+    "periodic": grids.periodic,
+    "odd": matrices.odd,
+}
+
+
+def draw_case(kind: str, seed: int, index: int) -> Case:
+    """Return a case of a kind; equal arguments give equal cases."""
+    return KINDS[kind](np.random.default_rng([seed, list(KINDS).index(kind), index]))
+
+
+def attempt(case: Case) -> Answer:
+    """Solve a case; exceptions become answers. A ValueError is a refusal, but for LinAlgError, which derives from it."""
+    try:
+        return case.solve()
+    except Exception as error:
+        trace = error.__traceback__
+        while trace is not None and trace.tb_next is not None:
+            trace = trace.tb_next
+        file = trace.tb_frame.f_code.co_filename if trace is not None else ""
+        where = f" (raised in {file.rsplit('/', 1)[-1]}:{trace.tb_lineno})" if trace is not None and "warp_lcp" not in file else ""
+        refused = isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError)
+        return Answer("REFUSED" if refused else "EXCEPTION", None, f"{type(error).__name__}: {str(error)[:150]}{where}")
+
+
+def examine(case: Case) -> tuple[Answer, Verdicts]:
+    """Solve a case and judge its answer."""
+    answer = attempt(case)
+    return answer, judge(case, answer)

@@ -1,0 +1,222 @@
+"""Cases of the hostile benchmark: an input, how it is solved, and what is known of its answer."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+import scipy.sparse
+
+import warp_lcp as wl
+
+Bounds = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+CONVERGED, INFEASIBLE, REFUSED, EXCEPTION = "CONVERGED", "INFEASIBLE", "REFUSED", "EXCEPTION"
+# Methods that take any matrix, or refuse it in a ValueError, which is no fault.
+NAMED = tuple(sorted(set(wl.METHODS) - {"projected-multigrid", "direct-enumeration"}))
+GRID_METHODS = ("projected-multigrid", "minimum-map-newton", "mprgp", "psor", "interior-point")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a solve returned, on the host.
+
+    Args:
+        status: name of a `wl.SolveStatus`, or REFUSED (a ValueError) or EXCEPTION (any other).
+        x: the solution, shape (n,).
+        note: message of an exception, or further facts.
+        values: other arrays by name, as gradients.
+    """
+
+    status: str
+    x: np.ndarray | None = None
+    note: str = ""
+    values: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """The problem y = A x + b, l <= x <= u as plain arrays, and what is known of its answer.
+
+    Args:
+        A: matrix (n, n), dense or scipy.sparse, float64.
+        b: shape (n,).
+        lower: l, shape (n,).
+        upper: u, shape (n,).
+        rtol: relative tolerance of the solve.
+        solution: a solution known by construction.
+        unique: whether it is the only one.
+        solvable: whether a solution exists, by construction; None: an oracle is asked.
+        definite: A is symmetric positive semi-definite, by construction.
+        monotone: x'Ax >= 0 for all x, by construction; implied by `definite`.
+        grid: the problem was posed on a grid, where d_i = A_ii.
+        storage: relative rounding of coefficients that the operator documents (float32 storage).
+        affine: bounds at x, where they are affine in x.
+        largest: a bound on |x| beyond which an answer is suspicious.
+    """
+
+    A: Any
+    b: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    rtol: float = 1e-6
+    solution: np.ndarray | None = None
+    unique: bool = False
+    solvable: bool | None = None
+    definite: bool = False
+    monotone: bool = False
+    grid: bool = False
+    storage: float = 0.0
+    affine: Bounds | None = None
+    largest: float = np.inf
+
+    def bounds(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return l and u at x."""
+        return (self.lower, self.upper) if self.affine is None else self.affine(x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Program:
+    """A quadratic program as given to qpsolvers, and a well-scaled form of it with the same x.
+
+    Args:
+        scaled: qpsolvers.Problem as given to the solver.
+        plain: qpsolvers.Problem in units near 1, with inf where there is no bound.
+        expected: "solvable", "infeasible" or "unbounded", by construction.
+        unique: whether x is the only solution.
+    """
+
+    scaled: Any
+    plain: Any
+    expected: str
+    unique: bool
+
+
+@dataclass(frozen=True)
+class Values:
+    """Arrays that the answer must have, to a tolerance relative to the largest entry of each."""
+
+    expected: dict[str, np.ndarray]
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Malformed input: a ValueError, or a solve that ends in a status other than CONVERGED."""
+
+    why: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One solve.
+
+    Args:
+        name: what was drawn, in a line.
+        solve: makes the solve; what it raises is recorded.
+        truth: what is known of the answer.
+        method: the method named; None: the default.
+    """
+
+    name: str
+    solve: Callable[[], Answer]
+    truth: Box | Program | Values | Refusal
+    method: str | None = None
+
+
+def box_case(
+    rng: np.random.Generator,
+    name: str,
+    box: Box,
+    *,
+    operator: Callable[[], Any] | None = None,
+    shape: tuple[int, ...] | None = None,
+    unknowns: np.ndarray | None = None,
+    named: tuple[str, ...] = NAMED,
+    share: float = 0.4,
+    bounds: tuple[Any, Any] | None = None,
+    entries: bool = True,
+    x0: np.ndarray | None = None,
+) -> Case:
+    """Return a case that solves a box by the default, a named method or another entry point.
+
+    Args:
+        rng: random numbers.
+        name: what was drawn.
+        box: the problem.
+        operator: makes A as it is given to the library; None: `box.A` itself.
+        shape: of the fields of a grid; then `unknowns` are the flat indices of FLUID cells.
+        unknowns: see `shape`.
+        named: methods to draw from.
+        share: probability that a method is named.
+        bounds: bounds as they are given to the library; None: those of the box.
+        entries: whether other entry points may be drawn.
+        x0: start, shape (n,).
+    """
+    method = str(rng.choice(named)) if rng.random() < share else None
+    entry = "solve"
+    if entries and operator is None and x0 is None and box.affine is None:
+        entry = str(rng.choice(["solve", "linear_complementarity", "command line"], p=[0.86, 0.125, 0.015]))
+
+    def field_of(values: Any) -> Any:
+        if shape is None or unknowns is None or np.ndim(values) == 0:
+            return values
+        full = np.zeros(int(np.prod(shape)))
+        full[unknowns] = values
+        return full.reshape(shape)
+
+    def solve() -> Answer:
+        A = box.A if operator is None else operator()
+        low, high = (box.lower, box.upper) if bounds is None else bounds
+        if entry == "linear_complementarity":
+            found = wl.linear_complementarity(A, box.b, bounds=(low, high), tol=box.rtol, method=method)
+            return Answer(found.result.status.name, np.asarray(found.x).ravel(), found.message)
+        if entry == "command line":
+            return command_line(A, box.b, low, high, box.rtol, method)
+        problem = wl.LCP(A, field_of(box.b), field_of(low), field_of(high))
+        stopping = wl.StoppingCriteria(rtol=box.rtol, max_iterations=1000 if method else 100)
+        solver = wl.METHODS[method]() if method else None
+        result = wl.solve(problem, solver, stopping=stopping, x0=None if x0 is None else field_of(x0))
+        x = result.x.numpy().astype(np.float64).ravel()
+        note = f"{result.iterations} steps, relative residual {result.relative_residual:.1e}"
+        return Answer(result.status.name, x if unknowns is None else x[unknowns], note)
+
+    via = "" if entry == "solve" else f", by {entry}"
+    return Case(f"{name}, n={len(box.b)}, rtol {box.rtol:g}, {method or 'default'}{via}", solve, box, method)
+
+
+def command_line(A: Any, b: np.ndarray, lower: Any, upper: Any, rtol: float, method: str | None) -> Answer:
+    """Solve by `warp-lcp solve` from Matrix Market files."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for label, array in (("A", A), ("b", b), ("l", lower), ("u", upper)):
+            column = np.broadcast_to(array, np.shape(b)).reshape(-1, 1) if label != "A" else array
+            text = scipy.sparse.coo_array(column) if scipy.sparse.issparse(column) else np.asarray(column)
+            scipy.io.mmwrite(folder / f"{label}.mtx", text, precision=17)
+        command = [sys.executable, "-m", "warp_lcp.cli.commands", "solve", "A.mtx", "b.mtx", "--lower", "l.mtx", "--upper", "u.mtx"]
+        command += ["--tolerance", f"{rtol:g}", "--out", "x.mtx", "--device", "cpu"] + (["--method", method] if method else [])
+        code = f"import sys; sys.argv = {['warp-lcp', *command[3:]]!r}; from warp_lcp.cli.commands import main; main()"
+        run = subprocess.run([sys.executable, "-c", code], cwd=folder, env=_environment(), capture_output=True, text=True, check=False)
+        told = f"{run.stdout}\n{run.stderr}".strip()
+        if run.returncode == 0 and (folder / "x.mtx").exists():
+            return Answer(CONVERGED, np.asarray(scipy.io.mmread(folder / "x.mtx")).ravel(), told[-200:])
+        if run.returncode == 2:
+            return Answer(REFUSED, None, told[-200:])
+        if run.returncode != 1 or "Traceback" in told:
+            return Answer(EXCEPTION, None, f"exit code {run.returncode}: {told[-200:]}")
+        status = next((s.name for s in wl.SolveStatus if s.name in told and s.name != CONVERGED), "FAILED")
+        return Answer(status, None, told[-200:])
+
+
+def _environment() -> dict[str, str]:
+    """Return the environment of a child process that imports this package, whatever its folder."""
+    import os
+
+    root = str(Path(wl.__file__).parents[1])
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}

@@ -1,0 +1,165 @@
+"""Hostile inputs by seed: the judge sees wrong answers, and cases of each kind are solved or refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.benchmarks.hostile import KINDS, attempt, draw, draw_case, examine, judge
+from warp_lcp.benchmarks.hostile.__main__ import FAULTS, report, supervise
+from warp_lcp.benchmarks.hostile.case import Answer, Box, Case, Program, Refusal, Values
+from warp_lcp.benchmarks.hostile.judge import exists, residual, scales
+
+qpsolvers = pytest.importorskip("qpsolvers")
+
+SEED = 4721
+A = np.array([[2.0, 1.0], [1.0, 2.0]])
+
+
+def box(b, **known):
+    given = {"A": A, "lower": np.zeros(2), "upper": np.full(2, np.inf), "definite": True, **known}
+    return Box(b=np.array(b), **given)
+
+
+def categories(truth, answer, method=None):
+    return [category for category, _ in judge(Case("", lambda: answer, truth, method), answer)]
+
+
+@pytest.mark.parametrize("large", [1.0, 1e8, 1e16])
+def test_a_wrong_x_is_a_false_convergence(large):
+    """b = (-1, large) has x = (1/2, 0), however large the inactive row is."""
+    truth = box([-1.0, large], solution=np.array([0.5, 0.0]), solvable=True, unique=True)
+    assert categories(truth, Answer("CONVERGED", np.array([0.5, 0.0]))) == ["converged"]
+    for wrong in ([0.0, 0.0], [0.49, 0.0], [0.5, 0.01], [-0.5, 0.0], [np.nan, 0.0]):
+        assert categories(truth, Answer("CONVERGED", np.array(wrong))) == ["FALSE CONVERGED"], wrong
+
+
+def test_signs_at_upper_bounds_and_in_equations():
+    truth = box([-9.0, 0.0], lower=np.array([0.0, -np.inf]), upper=np.array([1.0, np.inf]))
+    assert categories(truth, Answer("CONVERGED", np.array([1.0, -0.5]))) == ["converged"]  # y = (-7.5, 0)
+    assert categories(replace(truth, b=np.array([9.0, 0.0])), Answer("CONVERGED", np.array([1.0, -0.5]))) == ["FALSE CONVERGED"]
+
+
+def test_a_row_that_others_hide_is_told():
+    """x_1 = 0 is wrong in its own row, but 1e-12 of the norm that the tolerance is relative to."""
+    truth = Box(A=np.eye(2), b=np.array([-1.0, -1e12]), lower=np.zeros(2), upper=np.full(2, np.inf), definite=True)
+    assert categories(truth, Answer("CONVERGED", np.array([0.0, 1e12]))) == ["converged", "row hidden"]
+    assert categories(truth, Answer("CONVERGED", np.array([1.0, 1e12]))) == ["converged"]
+
+
+def test_a_false_infeasible_is_seen():
+    """By what is planted, by a linear program for monotone A, and by enumeration."""
+    claim = Answer("INFEASIBLE", np.zeros(2))
+    assert categories(box([-1.0, 1.0], solvable=True), claim) == ["FALSE INFEASIBLE"]
+    assert categories(box([-1.0, 1.0]), claim) == ["FALSE INFEASIBLE"]
+    assert categories(box([-1.0, 1.0], definite=False), claim) == ["FALSE INFEASIBLE"]
+    assert categories(box([-1.0, 0.0], A=-A, definite=False), claim) == ["infeasible right"]  # -2 x_1 - x_2 - 1 >= 0
+    assert categories(box([-1.0, 0.0], A=np.zeros((2, 2))), claim) == ["infeasible right"]
+    assert exists(box([-1.0, 0.0], A=-A, definite=False, upper=np.ones(2)))
+
+
+def test_what_ends_honestly():
+    known = box([-1.0, 1.0], solvable=True)
+    assert categories(known, Answer("STAGNATED", np.zeros(2))) == ["not solved"]
+    assert categories(known, Answer("STAGNATED", np.zeros(2)), "psor") == ["other method"]
+    assert categories(replace(known, solvable=False), Answer("STAGNATED", np.zeros(2))) == ["honest"]
+    assert categories(known, Answer("REFUSED", None)) == ["refused"]
+    assert categories(Refusal("no matrix"), Answer("REFUSED", None)) == ["honest"]
+    assert categories(Refusal("no matrix"), Answer("CONVERGED", np.zeros(2))) == ["FALSE CONVERGED"]
+
+
+def test_scales_do_not_depend_on_units():
+    """d = 1 / (r c) turns into s_i d_i where rows are scaled by s, and the residual with it."""
+    rng = np.random.default_rng(SEED)
+    M, b, s = rng.standard_normal((5, 5)), rng.standard_normal(5), 10.0 ** rng.integers(-6, 6, 5)
+    plain = Box(A=M, b=b, lower=np.zeros(5), upper=np.full(5, np.inf))
+    other = replace(plain, A=draw.scaled(M, s, np.ones(5)), b=s * b)
+    x = np.abs(rng.standard_normal(5))
+    assert np.allclose(scales(other), s * scales(plain), rtol=1e-6)
+    assert np.allclose(residual(other, x, scales(other)), s * residual(plain, x, scales(plain)), rtol=1e-6)
+
+
+def test_programs_are_judged_in_plain_units():
+    one = np.ones((1, 1))
+    plain = qpsolvers.Problem(one, -np.ones(1), G=one, h=np.array([0.5]))  # least at x = 0.5
+    truth = Program(scaled=plain, plain=plain, expected="solvable", unique=True)
+    assert categories(truth, Answer("CONVERGED", np.array([0.5]))) == ["converged"]
+    for wrong in (0.4, 0.6, 0.0, 1.0):
+        assert categories(truth, Answer("CONVERGED", np.array([wrong]))) == ["FALSE CONVERGED"]
+    assert categories(truth, Answer("INFEASIBLE", None)) == ["FALSE INFEASIBLE"]
+    assert categories(replace(truth, expected="unbounded"), Answer("CONVERGED", np.array([0.5]))) == ["FALSE CONVERGED"]
+
+
+def test_values_and_exceptions():
+    truth = Values({"b": np.array([1.0, -2.0])}, 1e-6)
+    assert categories(truth, Answer("CONVERGED", None, "", {"b": np.array([1.0, -2.0])})) == ["converged"]
+    assert categories(truth, Answer("CONVERGED", None, "", {"b": np.array([1.0, 2.0])})) == ["FALSE CONVERGED"]
+
+    def fail():
+        raise np.linalg.LinAlgError("from inside")
+
+    assert attempt(Case("", fail, truth)).status == "EXCEPTION"
+    refused = attempt(Case("", lambda: wl.LCP(A, np.array([np.nan, 1.0])), truth))
+    assert (refused.status, "b" in refused.note) == ("REFUSED", True)
+
+
+def test_the_stencil_oracle_follows_the_definition():
+    """A closed side adds its coefficient to the diagonal; AIR adds nothing there."""
+    coefficients = {(0, 0): np.full((1, 2), 20.0), (0, 1): np.array([[-1.0, -5.0]]), (0, -1): np.array([[-3.0, -1.0]])}
+    cells = np.ones((1, 2), int)
+    closed = draw.stencil_matrix(cells, coefficients, None, (False,) * 3, draw.SOLID).toarray()
+    assert np.array_equal(closed, [[17.0, -1.0], [-1.0, 15.0]])
+    open_ = draw.stencil_matrix(cells, coefficients, None, (False,) * 3, draw.AIR).toarray()
+    assert np.array_equal(open_, [[20.0, -1.0], [-1.0, 20.0]])
+    values = np.zeros((3, 4))
+    values[1, 0], values[1, 3] = 1.0, 10.0
+    assert np.array_equal(draw.boundary_term(cells, coefficients, values, (False,) * 3, draw.AIR), [[-3.0, -50.0]])
+    around = draw.stencil_matrix(np.ones((1, 3), int), {(0, 0): 5.0, (0, 1): -2.0}, 1.0, (True, False, False), draw.SOLID).toarray()
+    assert np.array_equal(around, [[6.0, -2.0, 0.0], [0.0, 6.0, -2.0], [-2.0, 0.0, 6.0]])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_case_is_that_of_its_seed(kind):
+    names = {draw_case(kind, SEED, i).name for i in range(6)}
+    assert names == {draw_case(kind, SEED, i).name for i in range(6)}
+    assert len(names) > 3
+
+
+def test_planted_solutions_solve():
+    """What is planted meets the criterion, or verdicts on it would mean nothing."""
+    rng, planted = np.random.default_rng(SEED), 0
+    for kind in KINDS:
+        for _ in range(8):
+            case = KINDS[kind](rng)
+            if isinstance(case.truth, Box) and case.truth.solution is not None:
+                assert categories(case.truth, Answer("CONVERGED", case.truth.solution))[0] == "converged", case.name
+                planted += 1
+    assert planted > 30
+
+
+PASSING: list[tuple[str, int]] = []
+
+
+@pytest.mark.parametrize(("kind", "index"), PASSING)
+def test_cases(kind, index):
+    _, verdicts = examine(draw_case(kind, SEED, index))
+    assert [v for v in verdicts if v[0] in (*FAULTS, "not solved", "refused")] == []
+
+
+def test_a_worker_streams_what_becomes_of_its_cases():
+    outcomes = supervise("sign", SEED, 2)
+    assert [o.index for o in outcomes] == [0, 1]
+    assert all(o.verdicts for o in outcomes)
+    page = report(outcomes, SEED)
+    assert "| sign | 2 |" in page and "| all | 2 |" in page
+
+
+def test_the_published_faults_are_drawn():
+    """The operators of the cases are those of the library, on its CPU device."""
+    found = wl.Stencil(np.ones((1, 2), int), {(0, 0): 3.0, (0, 1): -1.0, (0, -1): -1.0}, outside=wl.AIR, device="cpu", dtype=wp.float64)
+    matrix = draw.stencil_matrix(np.ones((1, 2), int), {(0, 0): 3.0, (0, 1): -1.0, (0, -1): -1.0}, None, (False,) * 3, draw.AIR)
+    assert np.array_equal(found.apply(wp.array([[1.0, 2.0]], dtype=wp.float64, device="cpu")).numpy().ravel(), matrix @ [1.0, 2.0])
+    assert sp.issparse(matrix)
