@@ -1,8 +1,9 @@
-"""Convex quadratic programs drawn at random, whose verdict and minimizer are known, in units as bad as users bring them.
+"""Random convex quadratic programs with known verdicts and minimizers, badly scaled.
 
-Each is made around a point x and multipliers, from which q follows by the first-order conditions; some are then made infeasible by a
-contradiction or unbounded by a direction of descent without end. Costs, rows and unknowns are scaled afterwards, so that the program
-in plain units is known as well: solvers that fail on the scaled one are asked for that.
+Each is made around a point x and multipliers, from which q follows by the first-order conditions;
+some are then made infeasible by a contradiction or unbounded by a direction of descent without end.
+Costs, rows and unknowns are scaled afterwards, so that the program in plain units is known as well:
+solvers that fail on the scaled one are asked for that.
 """
 
 from dataclasses import dataclass

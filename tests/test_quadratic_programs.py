@@ -1,4 +1,4 @@
-"""Quadratic programs in bad units, with infinity as a number, without rows or solutions: verdicts and minimizers as others find them."""
+"""Quadratic programs: bad scaling, 1e20 as infinity, no rows, no solution."""
 
 import warnings
 
@@ -14,7 +14,7 @@ OTHERS = [name for name in ("clarabel", "piqp") if name in qpsolvers.available_s
 
 
 def check(seed, **options):
-    """The verdict, and of what is solvable the objective, the minimizer if there is one, and the conditions in the caller's units."""
+    """Compare verdict, objective and minimizer with the construction, and test optimality."""
     drawn = draw(seed, **options)
     found = qp.solve_problem(qpsolvers.Problem(**drawn.scaled))
     message = (seed, drawn.verdict, found.extras["result"].message)
@@ -35,7 +35,7 @@ def check(seed, **options):
 
 
 def optimal(given, found, message, accuracy=2e-8):
-    """Residuals row by row, relative to the terms of each row, with NumPy alone: nothing small hides behind something large."""
+    """Test the first-order conditions row by row, relative to the terms of each row."""
     dense = {name: v.toarray() if hasattr(v, "toarray") else v for name, v in given.items() if v is not None}
     n, x = len(given["q"]), found.x
     gradient, terms = dense["P"] @ x + dense["q"], np.abs(dense["P"]) @ np.abs(x) + np.abs(dense["q"])
@@ -92,7 +92,8 @@ def test_as_clarabel_and_piqp_say(seed):
         costs, least = (0.5 * v @ p["P"] @ v + p["q"] @ v for v in (x, other.x))
         near = np.abs(x - other.x).max() / max(1.0, np.abs(x).max()) if drawn.unique else 0.0
         agreed.append(max(near, abs(costs - least) / (1 + np.abs(p["q"] * x).sum())))
-    # `check` has compared with the minimizer of the construction to 1e-6; theirs is off by 1e-4 where multipliers vanish
+    # `check` has compared with the constructed minimizer to 1e-6; theirs is off by 1e-4 where
+    # multipliers vanish
     assert not OTHERS or min(agreed, default=1.0) <= 2e-4, seed
 
 

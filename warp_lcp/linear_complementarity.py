@@ -53,9 +53,11 @@ def linear_complementarity(
     Args:
         A: matrix (n, n), a numpy array or scipy.sparse one in any format, a scipy.sparse.linalg.LinearOperator, or an operator of warp_lcp.
         b: n numbers in any shape, or a field of the operator's shape.
-        bounds: a tuple (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None where there is none; or SciPy's list of
-            pairs (lo, hi), one for each unknown, of numbers or None; None: (0, inf). For two unknowns a list of two tuples is pairs, a
-            tuple of two lists or arrays is (lo, hi), and what could be both is refused. Magnitudes of 1e20 and more are infinite.
+        bounds: a tuple (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None
+            where there is none; or SciPy's list of pairs (lo, hi), one for each unknown, of numbers
+            or None; None: (0, inf). For two unknowns a list of two tuples is pairs, a tuple of two
+            lists or arrays is (lo, hi), and what could be both is refused. Magnitudes of 1e20 and
+            more are infinite.
         x0: a guess, of b's shape.
         tol: relative tolerance, in [0, 1): of the natural residual's norm, relative to that at the projection of 0 onto the bounds.
         atol: absolute tolerance of that norm, >= 0, in the units of b.

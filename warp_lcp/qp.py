@@ -59,28 +59,32 @@ def solve_problem(
 ) -> Solution:
     """Minimize x'Px / 2 + q'x subject to G x <= h, A x = b, lb <= x <= ub, P symmetric positive semi-definite.
 
-    A program with nothing but a box is the boxed LCP of P and q ([Book] eq. 1.58); others are equilibrated and solved by the boxed LCP of
-    their first-order conditions, in x and the multipliers (`quadratic_program_to_boxed`). Magnitudes of 1e20 and more in h, lb and ub are
+    A program with nothing but a box is the boxed LCP of P and q ([Book] eq. 1.58); others are
+    equilibrated and solved by the boxed LCP of their first-order conditions, in x and the
+    multipliers (`quadratic_program_to_boxed`). Magnitudes of 1e20 and more in h, lb and ub are
     infinite.
 
     Args:
         problem: of qpsolvers; P's symmetric part is what counts.
         initvals: a guess of x, shape (n,).
         verbose: print how the solve ended.
-        method: of `linear_complementarity`. None: what that takes for a box; with other constraints, or where that fails, InteriorPoint,
-            then Lemke.
-        tol: relative tolerance, in [0, 1), of the natural residual; what is found has primal and dual residuals below 10 tol in every
-            row, relative to the terms of that row, and such a duality gap, relative to its terms.
+        method: of `linear_complementarity`. None: what that takes for a box; with other
+            constraints, or where that fails, InteriorPoint, then Lemke.
+        tol: relative tolerance, in [0, 1), of the natural residual; what is found has primal and
+            dual residuals below 10 tol in every row, relative to the terms of that row, and such a
+            duality gap, relative to its terms.
         maxiter: the most iterations of a method.
 
     Returns:
-        x with the multipliers y, z and z_box in qpsolvers' signs, and `found` where residuals and gap, recomputed in float64 in all rows,
-        meet the tolerance; else `found` is False and they are None. `extras["result"]` is what `linear_complementarity` returned last,
-        with success, status and message of the program; "primal_residual", "dual_residual" and "duality_gap" are those relative figures.
+        x with the multipliers y, z and z_box in qpsolvers' signs, and `found` where residuals and
+        gap, recomputed in float64 in all rows, meet the tolerance; else `found` is False and they
+        are None. `extras["result"]` is what `linear_complementarity` returned last, with success,
+        status and message of the program; "primal_residual", "dual_residual" and "duality_gap" are
+        those relative figures.
 
     Raises:
-        ValueError: the program is not convex, an argument is of another kind or shape, or a bound is NaN, crossed or on the wrong side of
-            all numbers.
+        ValueError: the program is not convex, an argument is of another kind or shape, or a bound
+            is NaN, crossed or on the wrong side of all numbers.
     """
     from qpsolvers import Solution
 
@@ -195,7 +199,7 @@ def _write(solution: Solution, program: QuadraticProgramData, point: ProgramPoin
 
 
 def _read(problem: Problem) -> tuple[QuadraticProgramData, np.ndarray]:
-    """Return the program, without rows that bound nothing, and which rows of G it has; its G and h have the opposite sign."""
+    """Return the program without its infinite rows, with the sign of G and h changed, and the mask of its rows."""
     P, q, lower, upper = _objective(problem)
     n = len(q)
     G, h = _rows(problem.G, problem.h, "G", "h", n)

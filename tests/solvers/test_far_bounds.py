@@ -1,4 +1,4 @@
-"""Bounds from 1e15 to 1e308, which users write for infinity: the answer without them, or a status that says there is none yet."""
+"""Finite bounds from 1e15 to 1e308: the solution without them, or an honest status."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ ANSWERS = ("lemke", "fischer-newton", "minimum-map-newton", "direct-enumeration"
 
 
 def drawn(seed, symmetric):
-    """A with a positive definite symmetric part, b, true bounds and the same with far ones in place of infinity."""
+    """Return A, positive definite, b, the bounds, and the bounds with far ones for infinity."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 5))
     root, turn = rng.standard_normal((n, n)), rng.standard_normal((n, n))

@@ -83,7 +83,7 @@ def read_market(path: Path, fits: Fits, expected: str) -> Any:
 
 
 def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[int, int, list[int]]:
-    """Return rows, columns and what else the size line has, a number of entries; refuse what does not fit."""
+    """Check a header; return rows, columns and, of a sparse matrix, its number of entries."""
     if header is None:
         raise MarketError("it does not begin with %%MatrixMarket matrix, form, field and symmetry, and its size")
     form, field, symmetry = (header[name].lower() for name in ("form", "field", "symmetry"))
@@ -159,7 +159,7 @@ def _entries(rows: int, columns: int, entries: int) -> str:
 
 
 def _check_stored(what: str, count: int, held: int, needed: int = 0) -> None:
-    """Refuse a count of numbers that so many bytes cannot hold, or that need more memory than is free."""
+    """Refuse a count of numbers beyond what a file holds or free memory allows."""
     check_claim(what, needed, stored=len("1\n") * count - 1, held=held)
 
 

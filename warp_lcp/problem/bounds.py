@@ -200,11 +200,11 @@ class Bounds:
 
 
 def huge_as_infinite(values: np.ndarray) -> np.ndarray:
-    """Return bounds, or right-hand sides of inequalities, with +-inf in place of magnitudes of INFINITY and more."""
+    """Replace magnitudes of INFINITY and more by infinities, in bounds and right-hand sides."""
     huge = np.abs(values) >= INFINITY
     return np.where(huge, np.copysign(np.inf, values), values) if huge.any() else values
 
 
 def without_far(lower: np.ndarray, upper: np.ndarray, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower bounds of at most -far and upper ones of at least far as infinite: no solution of size 1 meets them."""
+    """Replace lower bounds of at most -far and upper ones of at least far by infinities."""
     return np.where(lower <= -far, -np.inf, lower), np.where(upper >= far, np.inf, upper)

@@ -1,6 +1,7 @@
-"""Optimality of a point of a quadratic program: its residuals row by row, Newton steps on its active set, proofs that there is none.
+"""Quadratic programs: equilibration, residuals row by row, polishing, certificates.
 
-All of it is in the units of `equilibrated`: x = sigma D x', multipliers of rows E z' / (c sigma), P' = c sigma^2 D P D and so on.
+Points are in the units of `equilibrated`: x = sigma D x', multipliers of rows E z' / (c sigma),
+P' = c sigma^2 D P D and so on.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from warp_lcp.problem.scale import scaled
 
 SMALL = 400  # unknowns and rows up to which matrices are dense, whatever the caller's are
 SWEEPS = 20  # of Ruiz's iteration, each of which halves the logarithms of rows that differ
-CANCELED = 1e-10  # terms of a row below this part of ||a_i|| ||x|| are rounding (Arioli, Demmel and Duff 1989 take 1000 n eps)
+CANCELED = 1e-10  # terms of a row below this part of ||a_i|| ||x|| count as rounding
 PROXIMAL = 1e-8  # shift of the conditions' matrix, which dependent rows make singular; refinement takes its effect off
 REFINEMENTS = 12
 CHANGES = 30  # of the active set
@@ -76,7 +77,7 @@ class ProgramPoint:
 
 
 def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
-    """Return a program with rows, all matrices sparse, or all dense if they are small or dense."""
+    """Return a program with rows, its matrices all sparse, or all dense if small or dense."""
     matrices, n = (program.Q, program.G, program.C), len(program.c)
     h, d = (np.zeros(0) if v is None else v for v in (program.h, program.d))
     dense = n + len(h) + len(d) <= SMALL or not any(scipy.sparse.issparse(M) for M in matrices)
@@ -93,10 +94,11 @@ def with_rows(program: QuadraticProgramData) -> ProgramWithRows:
 
 
 def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnits]:
-    """Return a program in units in which its rows and columns are alike, and those units, powers of 2.
+    """Return an equilibrated program and its units, which are powers of 2.
 
-    D and E make the largest entry of each row of diag(D, E) [[Q, B'], [B, 0]] diag(D, E) 1, B the rows of G and C (Ruiz 2001, as OSQP
-    does it), with Q in a unit of its own. sigma is a unit of x after the sizes of bounds and right-hand sides, the cost's unit follows.
+    D and E make the largest entry of each row of diag(D, E) [[Q, B'], [B, 0]] diag(D, E) 1, B the
+    rows of G and C (Ruiz 2001, as OSQP does it), with Q in a unit of its own. sigma is a unit of x
+    after the sizes of bounds and right-hand sides, the cost's unit follows.
 
     Args:
         program: with rows (`with_rows`).
@@ -128,7 +130,7 @@ def equilibrated(program: ProgramWithRows) -> tuple[ProgramWithRows, ProgramUnit
 
 
 def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
-    """Return a point within its bounds with each pair complementary: x on a bound, or z = 0, whichever moves less."""
+    """Return the point with complementary pairs: x on a bound or z = 0, the nearer of the two."""
     at, slope = np.clip(point.x, program.lower, program.upper), _gradient(program, point)
     x = np.where(at - program.lower <= slope, program.lower, np.where(program.upper - at <= -slope, program.upper, at))
     x = np.where(np.isfinite(x), x, at)
@@ -137,11 +139,13 @@ def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
 
 
 def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[float, float, float]:
-    """Return the primal and the dual residual, each the largest of its rows relative to the terms of that row, and the gap to its own.
+    """Return the primal residual, the dual residual and the duality gap, relative to their terms.
 
-    For row i of a x - b that is |a_i x - b_i| / (sum_j |a_ij x_j| + |b_i|), the componentwise backward error, which does not depend on the
-    units of rows; where all terms are rounding, ||a_i|| ||x|| is added (Arioli, Demmel and Duff 1989). An inequality with a
-    multiplier counts as an equation. The duality gap is x'Qx + c'x - h'z - d'y less what the bounds pay, relative to the sum of its parts.
+    For row i of a x - b that is |a_i x - b_i| / (sum_j |a_ij x_j| + |b_i|), the componentwise
+    backward error, which does not depend on the units of rows; where all terms are rounding,
+    ||a_i|| ||x|| is added. An inequality with a multiplier counts as
+    an equation. The duality gap is x'Qx + c'x - h'z - d'y less what the bounds pay, relative to the
+    sum of its parts.
 
     Args:
         program: with rows.
@@ -166,7 +170,7 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
 
 
 def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
-    """Return the best point of some primal-dual active-set steps: Newton's for the equations of the active rows, the others let go.
+    """Return the best point of some primal-dual active-set steps.
 
     Args:
         program: with rows.
@@ -197,9 +201,10 @@ def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
 
 
 def has_no_solution(program: ProgramWithRows) -> str:
-    """Return why a program has no solution, proved by a certificate that was computed anew; "" where there is no proof.
+    """Return "infeasible" or "unbounded" where a certificate proves it, else "".
 
-    Infeasible: z >= 0, y and bound multipliers with G'z + C'y + v - w = 0 and h'z + d'y + l'v - u'w > 0 (Farkas). Unbounded: a direction e
+    Infeasible: z >= 0, y and bound multipliers with G'z + C'y + v - w = 0 and h'z + d'y + l'v - u'w
+        > 0 (Farkas). Unbounded: a direction e
     with Q e = 0, C e = 0, G e >= 0, within the cone of the bounds, and c'e < 0.
 
     Args:
@@ -244,9 +249,10 @@ def _without_rounding(values: np.ndarray) -> np.ndarray:
 
 
 def _newton(p: ProgramWithRows, now: ProgramPoint, low: Any, high: Any, tight: Any) -> ProgramPoint | None:
-    """Return the point where the active rows hold and the slope of the free unknowns is 0; None where it is not finite.
+    """Return the solution of the equations of an active set; None where it is not finite.
 
-    [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step refined: of rows that depend on each other the least change.
+    [[Q_FF + s, -B_F'], [B_F, s]] is factored, s > 0 small, and the step refined: of rows that
+    depend on each other the least change.
     """
     free, active = np.flatnonzero(~low & ~high), np.flatnonzero(tight)
     x = np.where(low, p.lower, np.where(high, p.upper, now.x))

@@ -186,9 +186,10 @@ class Lemke(Settings):
     prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED. On a bimatrix game,
     M = [[0, E], [F', 0]] with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's method does.
 
-    Bounds far beyond the sizes of A and b count as infinite at first, and as they are if that leads nowhere. Boxes add a pair of variables,
-    equations are eliminated or, where their block is singular, split (see LemkeForm). x0 is not used. A
-    pivot costs O(m^2), m <= 2n. A step is a block of pivots; `linear_iterations` counts pivots.
+    Bounds far beyond the sizes of A and b count as infinite at first, and as they are if that leads
+    nowhere. Boxes add a pair of variables, equations are eliminated or, where their block is
+    singular, split (see LemkeForm). x0 is not used. A pivot costs O(m^2), m <= 2n. A step is a
+    block of pivots; `linear_iterations` counts pivots.
 
     Args:
         pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.

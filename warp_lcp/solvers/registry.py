@@ -50,7 +50,7 @@ class Methods(dict[str, type[Any]]):
         raise KeyError(f"no method is called {name!r}: {self.nearest(name)}")
 
     def nearest(self, name: object) -> str:
-        """Return `did you mean ...?` for initials ("ipm"), a class's name or another method's, else what `settings.nearest` says."""
+        """Return `did you mean ...?` for initials, class names and synonyms, else `settings.nearest`."""
         word = str(name).lower().replace("_", "-").replace(" ", "-")
         for known, kind in self.items():
             initials = "".join(part[0] for part in known.split("-"))
