@@ -19,7 +19,14 @@ from warp_lcp.problem.scale import scaled
 from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import rows_of
-from warp_lcp.solvers.dense_problem import DenseProblem, power_of_two, proved_infeasible, unit_rows_and_columns, within_reach, without_contact
+from warp_lcp.solvers.dense_problem import (
+    DenseProblem,
+    power_of_two,
+    proved_infeasible,
+    unit_rows_and_columns,
+    within_reach,
+    without_contact,
+)
 
 UNITS = RowPass(
     "equilibrated.units", Path(__file__).parent / "headers" / "units.h", wp.float64, reads={"x": wp.float64, "units": wp.float64},
@@ -149,7 +156,9 @@ class EquilibratedWorkspace(IterateMemory):
         R, C = (power_of_two(1 / np.sqrt(A.scale())),) * 2 if A.symmetric else unit_rows_and_columns(matrix)
         if max(R.max() / R.min(), C.max() / C.min()) <= ALIKE:
             R = C = np.ones(len(R))
-        self._alone = np.flatnonzero((np.asarray(abs(matrix).sum(axis=0)).ravel() == 0) & (np.asarray(abs(matrix).sum(axis=1)).ravel() == 0))
+        self._alone = np.flatnonzero(
+            (np.asarray(abs(matrix).sum(axis=0)).ravel() == 0) & (np.asarray(abs(matrix).sum(axis=1)).ravel() == 0)
+        )
         self._rows.assign(R)
         self._units.assign(C)
         return scaled(matrix, R, C)
