@@ -165,3 +165,25 @@ def test_files_that_could_harm_are_refused(tmp_path, name, message):
     assert path.stat().st_size < 30_000
     with pytest.raises(ValueError, match=message):
         read_fclib(path)
+
+
+def test_each_contact_has_friction(tmp_path):
+    """Rows without any once became joints."""
+    write_local(tmp_path / "few.hdf5", np.eye(6), np.ones(6), np.array([0.3]))
+    with pytest.raises(ValueError, match="mu has 1 values for 6 rows of 3 a contact"):
+        read_fclib(tmp_path / "few.hdf5")
+
+
+def test_entries_that_overflow(tmp_path):
+    write_local(tmp_path / "large.hdf5", np.full((3, 3), 1.5e308), np.ones(3), np.array([0.3]))
+    assert np.isfinite(read_fclib(tmp_path / "large.hdf5").system.B.data).all()
+
+
+def test_vectors_never_written_are_zero(tmp_path):
+    path = tmp_path / "unwritten.hdf5"
+    write_local(path, np.eye(3), np.ones(3), np.array([0.3]))
+    with h5py.File(path, "r+") as file:
+        vectors = file["fclib_local/vectors"]
+        del vectors["q"]
+        vectors.create_dataset("q", (3,), dtype="f8")
+    np.testing.assert_array_equal(read_fclib(path).system.q, 0.0)

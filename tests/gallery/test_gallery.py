@@ -150,3 +150,8 @@ def test_arguments_out_of_range_are_named():
     ]:
         with pytest.raises(ValueError, match=name):
             wrong()
+
+
+def test_a_splash_says_what_makes_its_problem():
+    with pytest.raises(AttributeError, match=r"splash.named\('everywhere'\).lcp"):
+        _ = splash(4).lcp

@@ -181,3 +181,9 @@ def test_wrong_settings_are_refused():
     with pytest.raises(ValueError, match="singular"):
         singular.multipliers(device="cpu")
     assert isinstance(arm, ArticulatedFigure)
+
+
+@pytest.mark.parametrize("lengths", [[0, 0], [], [1.0, np.inf]])
+def test_a_chain_without_length_is_refused(lengths):
+    with pytest.raises(ValueError, match="lengths = "):
+        planar_chain(lengths)

@@ -104,3 +104,9 @@ def test_update_equals_a_new_operator(device):
 def test_bad_input_is_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         wl.GridPoisson(**{"cells": np.ones((3, 3), dtype=int), "device": "cpu", **arguments})
+
+
+@pytest.mark.parametrize("device", ["cuda:77", "gpu"])
+def test_a_device_that_is_not_there(device):
+    with pytest.raises(ValueError, match=f"device = '{device}': there is no such device, expected one of cpu"):
+        wl.GridPoisson(np.ones((2, 2), int), device=device)

@@ -179,3 +179,13 @@ def test_what_stops_being_finite_is_said():
     result = wl.solve(wl.LCP(wl.LinearOperator(product, (3,), symmetric=True), -np.ones(3)), wl.AcceleratedProjectedGradient())
     assert not result
     assert result.status is wl.SolveStatus.NON_FINITE
+
+
+def test_a_buffer_that_is_handed_out_twice():
+    rng = np.random.default_rng(5)
+    F, out = rng.standard_normal((20, 20)), np.empty(20)
+    M = F @ F.T + 20 * np.eye(20)
+    A = wl.LinearOperator(lambda x: np.matmul(M, x, out=out), shape=(20,), symmetric=True)
+    result = wl.solve(wl.LCP(A, -np.ones(20)))
+    x = result.x.numpy()
+    assert result and np.linalg.norm(np.minimum(x, M @ x - 1)) < 1e-4

@@ -212,3 +212,21 @@ def test_blocks_are_found_and_a_pickle_keeps_the_near_null_space():
     assert (A.block, A.near_null_space.shape) == (3, (24, 1))
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(A)).near_null_space, A.near_null_space)
     assert wl.SparseOperator(blocks, device="cpu").block == 1
+
+
+@pytest.mark.parametrize("form", ["csr", "csc", "coo", "bsr"])
+@pytest.mark.parametrize("index", [2_000_000, -1, 50])
+def test_indices_out_of_range_are_refused(form, index):
+    """They once ended the process."""
+    A = (scipy.sparse.random_array((50, 50), density=0.2, rng=np.random.default_rng(1)) + 20 * scipy.sparse.eye_array(50)).asformat(form)
+    indices = A.col if form == "coo" else A.indices
+    indices[5] = index
+    with pytest.raises(ValueError, match="matrix is no sparse matrix"):
+        wl.SparseOperator(A, device="cpu")
+
+
+def test_row_starts_that_fall_are_refused():
+    A = scipy.sparse.csr_array(np.eye(4))
+    A.indptr[2] = 4
+    with pytest.raises(ValueError, match="matrix is no sparse matrix"):
+        wl.SparseOperator(A, device="cpu")

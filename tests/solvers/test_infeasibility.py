@@ -26,7 +26,10 @@ def planted_solution(seed):
         k = int(rng.integers(0, n))
         A[:k, k:] = A[k:, :k] = 0
     below, above = rng.random((2, n)) < 0.5
-    lower, upper = np.where(below, -rng.random(n) * rng.integers(0, 2), -np.inf), np.where(above, rng.random(n) * rng.integers(1, 3), np.inf)
+    lower, upper = (
+        np.where(below, -rng.random(n) * rng.integers(0, 2), -np.inf),
+        np.where(above, rng.random(n) * rng.integers(1, 3), np.inf),
+    )
     x = np.clip(rng.standard_normal(n) * 10 ** rng.uniform(0, 6 if rng.random() < 0.3 else 0), lower, upper)
     low = below & (rng.random(n) < 0.5)
     high = above & ~low & (rng.random(n) < 0.5)

@@ -39,7 +39,9 @@ class Splash:
     def __getattr__(self, name: str) -> Any:
         """Say what makes the problem, to those who know it from other members of the gallery."""
         if name in ("lcp", "A"):
-            raise AttributeError(f"a Splash has no {name}, its bounds are open: take splash.named('everywhere').{name}, or 'walls', 'linear'")
+            raise AttributeError(
+                f"a Splash has no {name}, its bounds are open: take splash.named('everywhere').{name}, or 'walls', 'linear'"
+            )
         raise AttributeError(f"a Splash has no {name}")
 
     def lower(self, bounds: str) -> float | np.ndarray:
