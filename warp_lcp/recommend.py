@@ -186,7 +186,9 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     reasons = (f"{rule.reason}.", f"The problem: {t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}.")
     limit = steps_allowed(rule.method) if rule.steps is None else max(100, 10 * rule.steps)
     stopping = _criteria(rtol, limit)
-    alternatives = tuple(name for name in rule.alternatives if t.takes(name) and not (name == "lemke" and t.unknowns > PIVOTED))
+    concave = t.kind in ("dense", "sparse") and t.symmetric and t.diagonal == "negative"  # a sign error mostly: pivots may prove it
+    names = ("lemke",) if concave else rule.alternatives
+    alternatives = tuple(name for name in names if name != rule.method and t.takes(name) and not (name == "lemke" and t.unknowns > PIVOTED))
     return Recommendation(rule.method, method_for(rule.method, t), stopping, reasons, expected, alternatives, t)
 
 
