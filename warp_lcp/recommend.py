@@ -120,7 +120,7 @@ RULES: tuple[Rule, ...] = (
          lambda t: t.pivotable and t.kind == "sparse", 8, ("fischer-newton", "minimum-map-newton", "lemke")),
     Rule("fischer-newton", "Zeros on the diagonal of a dense matrix are no obstacle to Fischer and Burmeister's function",
          lambda t: t.pivotable, 12, ("interior-point", "lemke", "minimum-map-newton")),
-    Rule("quadratic-program", "A symmetric matrix of low rank, or with a small ridge, makes a convex quadratic program, which PIQP solves",
+    Rule("quadratic-program", "A dense symmetric matrix of low rank, or with a ridge, makes a convex quadratic program, which PIQP solves",
          lambda t: t.low_rank, 1, ("interior-point", "lemke", "minimum-map-newton", "mprgp")),
     Rule("interior-point", "Free blocks of a symmetric matrix of low rank are singular, and interior points shift theirs",
          lambda t: t.low_rank, 14, ("lemke", "fischer-newton", "minimum-map-newton", "mprgp")),
