@@ -246,6 +246,8 @@ def stack(rng: np.random.Generator, seed: int) -> wl.LCP:
     """Return contacts without friction: J M^-1 J' with dependent rows."""
     made = frozen(rng, seed)
     normals = np.flatnonzero(np.isinf(np.asarray(made.upper)) & (np.asarray(made.lower) == 0))
+    if not len(normals):  # joints only
+        return stack(rng, seed)
     A = scipy.sparse.csr_array(made.A)[normals][:, normals]
     return wl.LCP(A if rng.random() < 0.5 else A.toarray(), np.asarray(made.b)[normals])
 

@@ -113,7 +113,7 @@ def test_precisions_may_be_members_of_their_enumeration():
         (lambda: wl.CycleSettings(semi=1.1), "semi = 1.1: must be in [0, 1]"),
         (lambda: wl.MPRGP(cycle={"gamma": 1}), "cycle = {'gamma': 1}: must be a CycleSettings"),
         (lambda: wl.MinimumMapNewton(direct=1), "direct = 1: must be True or False"),
-        (lambda: wl.ProjectedSOR(omega=2), "omega = 2: must be in (0, 2)"),
+        (lambda: wl.ProjectedSOR(omega=2), "omega = 2: must be in (0, 2) or None"),
         (lambda: wl.ProjectedJacobi(omega=0), "omega = 0: must be a finite number > 0 or None"),
         (lambda: wl.FischerNewton(share=0.0), "share = 0.0: must be in (0, 1] or None"),
         (lambda: wl.InteriorPoint(crossover=1.0), "crossover = 1.0: must be in [0, 1)"),

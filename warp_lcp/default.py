@@ -87,15 +87,16 @@ def _solve_by_choice(
 ) -> SolveResult:
     """Solve by the recommended method, then by its alternatives; return the best x."""
     begun, results = time.perf_counter(), list[SolveResult]()
-    grid, accuracy = _as_grid(problem), _accuracy(stopping)
-    advice = recommend(problem if grid is None else grid, accuracy=accuracy)
-    criteria = stopping or advice.stopping
+    accuracy = _accuracy(stopping)
+    advice = recommend(problem, accuracy=accuracy)
+    grid = None if advice.name == "psor" else _as_grid(problem)  # a few sweeps need no hierarchy
     if grid is not None:
-        attempt = partial(_solve_as_grid, problem, grid, advice.method)
-        if _try(results, advice.name, attempt, _left(criteria, begun, results, reserve=stopping is not None), x0, callback, begun):
+        by_grid = recommend(grid, accuracy=accuracy)
+        attempt = partial(_solve_as_grid, problem, grid, by_grid.method)
+        criteria = _left(stopping or by_grid.stopping, begun, results, reserve=stopping is not None)
+        if _try(results, by_grid.name, attempt, criteria, x0, callback, begun):
             return _best(results)
-        advice = recommend(problem, accuracy=accuracy)
-        criteria = stopping or advice.stopping
+    criteria = stopping or advice.stopping
     spent = [] if stopping is None else results  # without limits that were given each attempt has its own
     reserve = stopping is not None and bool(advice.alternatives) and advice.traits.kind in ("dense", "sparse")
     attempt = partial(_solve_in_order, problem, advice.method)

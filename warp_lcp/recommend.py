@@ -120,7 +120,7 @@ RULES: tuple[Rule, ...] = (
          lambda t: t.pivotable and t.kind == "sparse", 8, ("fischer-newton", "minimum-map-newton", "lemke")),
     Rule("fischer-newton", "Zeros on the diagonal of a dense matrix are no obstacle to Fischer and Burmeister's function",
          lambda t: t.pivotable, 12, ("interior-point", "lemke", "minimum-map-newton")),
-    Rule("quadratic-program", "A symmetric matrix of low rank, or with a small ridge, makes a convex quadratic program, which PIQP solves",
+    Rule("quadratic-program", "A dense symmetric matrix of low rank, or with a ridge, makes a convex quadratic program, which PIQP solves",
          lambda t: t.low_rank, 1, ("interior-point", "lemke", "minimum-map-newton", "mprgp")),
     Rule("interior-point", "Free blocks of a symmetric matrix of low rank are singular, and interior points shift theirs",
          lambda t: t.low_rank, 14, ("lemke", "fischer-newton", "minimum-map-newton", "mprgp")),
@@ -186,7 +186,9 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     reasons = (f"{rule.reason}.", f"The problem: {t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}.")
     limit = steps_allowed(rule.method) if rule.steps is None else max(100, 10 * rule.steps)
     stopping = _criteria(rtol, limit)
-    alternatives = tuple(name for name in rule.alternatives if t.takes(name) and not (name == "lemke" and t.unknowns > PIVOTED))
+    concave = t.kind in ("dense", "sparse") and t.symmetric and t.diagonal == "negative"  # a sign error mostly: pivots may prove it
+    names = ("lemke",) if concave else rule.alternatives
+    alternatives = tuple(name for name in names if name != rule.method and t.takes(name) and not (name == "lemke" and t.unknowns > PIVOTED))
     return Recommendation(rule.method, method_for(rule.method, t), stopping, reasons, expected, alternatives, t)
 
 

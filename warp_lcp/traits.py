@@ -102,16 +102,15 @@ class Traits:
 
     @cached_property
     def low_rank(self) -> bool:
-        """Return whether A is symmetric and few of its eigenvalues carry the trace.
+        """Return whether A is dense, symmetric, and few of its eigenvalues carry the trace.
 
         By whether most pivots of a Cholesky factorization are small beside the diagonal entries;
-        beyond MOST_FACTORED unknowns, of dense matrices those of every second row and column, of
-        sparse ones False.
+        beyond MOST_FACTORED unknowns those of every second row and column.
         """
         n = self.unknowns
-        if not self.symmetric or self.diagonal != "positive" or self.kind not in ("dense", "sparse"):
+        if self.kind != "dense" or not self.symmetric or self.diagonal != "positive":
             return False
-        if n > MOST_FACTORED and (self.kind == "sparse" or n > SHARE_FACTORED * MOST_SAMPLED):
+        if n > SHARE_FACTORED * MOST_SAMPLED:
             return False
         A, d = self._matrix, self._entries_on_diagonal
         if n > MOST_FACTORED:
