@@ -128,7 +128,7 @@ def _far(box: Box, x: np.ndarray, d: np.ndarray) -> str:
     A = box.A.toarray() if sp.issparse(box.A) else box.A
     root = np.sqrt(d)
     condition = float(np.linalg.cond(A / root[:, None] / root))
-    error = float(np.linalg.norm(root * (x - box.solution)) / max(np.linalg.norm(root * box.solution), 1e-300))
+    error = float(np.linalg.norm(root * (x - box.solution))) / max(float(np.linalg.norm(root * box.solution)), 1e-300)
     allowed = 100 * condition * max(box.rtol, EPS, box.storage)
     return f"{error:.1e} from the solution, condition {condition:.1e}" if allowed < 0.5 and error > allowed else ""
 
@@ -168,7 +168,7 @@ def _linear_program(box: Box) -> bool | None:
     rows = np.maximum(abs(A).max(axis=1).toarray().ravel(), np.abs(box.b))
     A, b = sp.diags_array(1 / np.where(rows > 0, rows, 1.0)) @ A, box.b / np.where(rows > 0, rows, 1.0)
     above, below = ~np.isfinite(box.upper), ~np.isfinite(box.lower)
-    limits = list(zip(np.where(below, None, box.lower), np.where(above, None, box.upper), strict=True))
+    limits = np.column_stack((box.lower, box.upper))
     rows_of = sp.vstack([-A[above], A[below]]) if above.any() or below.any() else None
     sides = np.r_[b[above], -b[below]]
     found = linprog(np.zeros(n), A_ub=rows_of, b_ub=sides if rows_of is not None else None, bounds=limits, options={"time_limit": 20.0})

@@ -77,8 +77,9 @@ def singular(rng: Rng) -> Case:
     solvable: bool | None = True
     if kind not in ("low rank", "graph") and rng.random() < 0.4:  # 1'y = 1'b: for equations 1'b = 0, for x >= 0 1'b >= 0
         b = b - b.mean() - 10 ** rng.uniform(-3, 1) * np.abs(b).mean() - 1e-3
-        solvable, x = False if bound in ("none", "lower") else None, None
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=draw.tolerance(rng), solution=x, solvable=solvable, definite=definite)
+        solvable = False if bound in ("none", "lower") else None
+    solution = x if solvable else None
+    box = Box(A=A, b=b, lower=low, upper=high, rtol=draw.tolerance(rng), solution=solution, solvable=solvable, definite=definite)
     return box_case(rng, f"{kind}, {bound} bounds, {'planted' if solvable else 'incompatible'}", box, share=0.3)
 
 
@@ -346,7 +347,7 @@ def _operator(A: Any, buffer: bool) -> Any:
 
 def _frozen(A: Any) -> Any:
     """Return A with read-only arrays, dense ones in Fortran's order."""
-    B = A.copy() if sp.issparse(A) else np.asfortranarray(A)
+    B: Any = A.copy() if sp.issparse(A) else np.asfortranarray(A)
     (B.data if sp.issparse(A) else B).setflags(write=False)
     return B
 
