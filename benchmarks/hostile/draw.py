@@ -135,8 +135,9 @@ def stencil_matrix(
                 entries.append((i, int(index[there]), value))
             elif kind == SOLID:
                 entries.append((i, i, value))
-    i, j, values = (np.array(column) for column in zip(*entries, strict=True))
-    return sp.coo_array((values.astype(float), (i.astype(int), j.astype(int))), shape=(cells.size, cells.size)).tocsr()
+    heads, tails, values = (np.array(column) for column in zip(*entries, strict=True))
+    where = heads.astype(int), tails.astype(int)
+    return sp.coo_array((values.astype(float), where), shape=(cells.size, cells.size)).tocsr()
 
 
 def boundary_term(cells: Array, coefficients: dict[tuple[int, ...], Any], values: Array, periodic: tuple[bool, ...], outside: int) -> Array:

@@ -31,7 +31,7 @@ def _coefficients(rng: Rng, cells: np.ndarray, *, symmetric: bool, spread: float
     Symmetric: a_o(i) = a_-o(i + o) between cells, while a coefficient that belongs to a closed or outer side is its own.
     """
     names = draw.offsets(cells.ndim, axes=bool(rng.random() < 0.4))
-    a = {o: -(10 ** rng.uniform(-spread, 0, cells.shape)) for o in names}
+    a: dict[Any, Any] = {o: -(10 ** rng.uniform(-spread, 0, cells.shape)) for o in names}
     if symmetric:
         for o in names:
             if o > tuple(-k for k in o):
@@ -54,7 +54,7 @@ def solid(rng: Rng) -> Case:
     symmetric &= not any(p and cells.shape[cells.ndim - 1 - axis] < 3 for axis, p in enumerate(periodic))
     outside = int(rng.choice([draw.SOLID, draw.AIR]))
     a = _coefficients(rng, cells, symmetric=symmetric, spread=rng.choice([0.5, 2.0]), margin=rng.choice([0.01, 0.3]), periodic=periodic)
-    shift = rng.choice([None, 1.0]) and rng.uniform(0, 2, cells.shape)
+    shift = rng.uniform(0, 2, cells.shape) if rng.random() < 0.5 else None
     name = f"stencil {'x'.join(map(str, cells.shape))}, {'' if symmetric else 'un'}symmetric, outside {outside}, periodic {periodic}"
     matrix = draw.stencil_matrix(cells, a, shift, periodic, outside)
 
@@ -115,8 +115,9 @@ def periodic(rng: Rng) -> Case:
     x, b = draw.plant(rng, A, low, high)
     solvable = bool(rng.random() < 0.5)
     if not solvable:
-        b, x = b - b.mean() - 10 ** rng.uniform(-3, 0), None
-    box = Box(A=A, b=b, lower=low, upper=high, rtol=1e-6, solution=x, solvable=solvable, definite=True, grid=True)
+        b = b - b.mean() - 10 ** rng.uniform(-3, 0)
+    solution = x if solvable else None
+    box = Box(A=A, b=b, lower=low, upper=high, rtol=1e-6, solution=solution, solvable=solvable, definite=True, grid=True)
     name = f"periodic stencil {'x'.join(map(str, shape))}, {bound} bounds, {'planted' if solvable else 'incompatible'}"
     return _stencil_case(rng, name, box, cells, a, sides, draw.SOLID)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from itertools import product
 from typing import Any
 
@@ -104,8 +105,8 @@ def _converged(box: Box, x: np.ndarray, note: str) -> Verdicts:
     # What rounding may leave: of y_i, or of d_i (x_i - l_i) where the bound holds x_i.
     at_bound = d * (np.abs(x) + np.where(np.isfinite(low), np.abs(low), 0) + np.where(np.isfinite(high), np.abs(high), 0))
     rounding = 8 * EPS * np.where(np.abs(r) == np.abs(box.A @ x + box.b), size, at_bound) + box.storage * size
-    # For A_ii the scale is unique; Ruiz's limit depends on the order of its updates.
-    slack = 1.05 if box.grid or box.definite else 3.0
+    # A_ii is unique; Ruiz's limit depends on the order of its updates, by factors up to about 4.
+    slack = 1.05 if box.grid or box.definite else 10.0
     norm, allowed = float(np.linalg.norm(r)), slack * box.rtol * first + float(np.linalg.norm(rounding))
     if not norm <= allowed:
         return [("FALSE CONVERGED", f"residual {norm:.1e}, allowed {allowed:.1e} (rtol times {first:.1e}); {note}")]
@@ -127,7 +128,7 @@ def _far(box: Box, x: np.ndarray, d: np.ndarray) -> str:
     A = box.A.toarray() if sp.issparse(box.A) else box.A
     root = np.sqrt(d)
     condition = float(np.linalg.cond(A / root[:, None] / root))
-    error = float(np.linalg.norm(root * (x - box.solution)) / max(np.linalg.norm(root * box.solution), 1e-300))
+    error = float(np.linalg.norm(root * (x - box.solution))) / max(float(np.linalg.norm(root * box.solution)), 1e-300)
     allowed = 100 * condition * max(box.rtol, EPS, box.storage)
     return f"{error:.1e} from the solution, condition {condition:.1e}" if allowed < 0.5 and error > allowed else ""
 
@@ -167,7 +168,7 @@ def _linear_program(box: Box) -> bool | None:
     rows = np.maximum(abs(A).max(axis=1).toarray().ravel(), np.abs(box.b))
     A, b = sp.diags_array(1 / np.where(rows > 0, rows, 1.0)) @ A, box.b / np.where(rows > 0, rows, 1.0)
     above, below = ~np.isfinite(box.upper), ~np.isfinite(box.lower)
-    limits = list(zip(np.where(below, None, box.lower), np.where(above, None, box.upper), strict=True))
+    limits = np.column_stack((box.lower, box.upper))
     rows_of = sp.vstack([-A[above], A[below]]) if above.any() or below.any() else None
     sides = np.r_[b[above], -b[below]]
     found = linprog(np.zeros(n), A_ub=rows_of, b_ub=sides if rows_of is not None else None, bounds=limits, options={"time_limit": 20.0})
@@ -200,10 +201,12 @@ def reference(program: Program) -> np.ndarray | None:
 
     values, first = [], None
     for name in ("clarabel", "piqp"):
-        try:
-            solution = qpsolvers.solve_problem(program.plain, solver=name)
-        except Exception:
-            continue
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                solution = qpsolvers.solve_problem(program.plain, solver=name)
+            except Exception:  # a peer's own
+                continue
         if solution.found and solution.x is not None:
             first = solution.x if first is None else first
             values.append(_cost(program.plain, solution.x)[0])

@@ -120,7 +120,8 @@ def low_rank(rng: Rng) -> Case:
     n = draw.size(rng, 10, 300)
     d = int(rng.integers(1, max(2, n // 3)))
     F = rng.standard_normal((n, d)) * np.sign(rng.standard_normal((n, 1)))
-    Q, box = F @ F.T, {"rtol": draw.tolerance(rng), "solvable": True, "monotone": True}
+    Q = F @ F.T
+    box: dict[str, Any] = {"rtol": draw.tolerance(rng), "solvable": True, "monotone": True}
     none, one = np.full(n, np.inf), np.ones(n)
     if kind == "box":
         b = rng.choice([-one, rng.standard_normal(n)])
