@@ -29,7 +29,14 @@ LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
 ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
 LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
 RESERVED, FEW = 4, 40  # one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps on
-ENDED = (SolveStatus.CONVERGED, SolveStatus.INFEASIBLE, SolveStatus.STOPPED, SolveStatus.TIME_LIMIT, SolveStatus.FLOOR)
+ENDED = (
+    SolveStatus.CONVERGED,
+    SolveStatus.INFEASIBLE,
+    SolveStatus.STOPPED,
+    SolveStatus.TIME_LIMIT,
+    SolveStatus.FLOOR,
+    SolveStatus.NEGATIVE_CURVATURE,
+)
 
 Attempt = Callable[[StoppingCriteria | MeanCriteria, Array | None, Callable[[Record], None] | None], SolveResult]
 

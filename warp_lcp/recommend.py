@@ -105,6 +105,13 @@ RULES: tuple[Rule, ...] = (
          lambda t: t.affine, 18, ("nncg", "blocked-gauss-seidel", "psor", "staggering")),
     Rule("projected-jacobi", "Bounds that are affine in x and no rows leave one method",
          lambda t: t.affine, None, ()),
+    Rule("lemke", "Pivots ask for no sign of a diagonal entry where a bound is infinite, and this one is negative: is A's sign right?",
+         lambda t: t.curved and t.unknowns <= PIVOTED, 5, ("minimum-map-newton",)),
+    Rule("minimum-map-newton", "A diagonal entry is negative where a bound is infinite, which the status will say: is A's sign right?",
+         lambda t: t.curved, None, ()),
+    Rule("psor", "A sweep sets an unknown whose diagonal entry is negative to one of its bounds",
+         lambda t: t.diagonal == "negative" and t.kind in ("dense", "sparse"), None,
+         ("lemke", "fischer-newton", "minimum-map-newton", "interior-point")),
     Rule("minimum-map-newton", "An operator that shows no rows cannot be swept, and Newton's method needs the fewest products",
          lambda t: t.kind == "operator", 8, ("mprgp", "primal-dual-active-set", "interior-point", "fischer-newton")),
     Rule("psor", "A grid or a sparse matrix that a few sweeps solve, as a trial says, needs no hierarchy and no systems",
@@ -181,7 +188,7 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     expected = None
     if rule.steps is not None:
         expected = f"{rule.steps} steps or fewer"
-    elif rule.method == "psor":
+    elif rule.method == "psor" and math.isfinite(t.sweeps):
         expected = f"about {math.ceil(t.sweeps)} sweeps, by the rate of the first {TRIAL}"
     reasons = (f"{rule.reason}.", f"The problem: {t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}.")
     limit = steps_allowed(rule.method) if rule.steps is None else max(100, 10 * rule.steps)

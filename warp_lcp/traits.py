@@ -15,6 +15,7 @@ import warp as wp
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, has, layout_of, takes
 from warp_lcp.problem.solve import solve
@@ -87,6 +88,11 @@ class Traits:
         """Return the sign of the smallest diagonal entry: "positive", "zero" or "negative"."""
         least = self._entries_on_diagonal.min()
         return "positive" if least > 0 else "zero" if least == 0 else "negative"
+
+    @cached_property
+    def curved(self) -> bool:
+        """Return whether a matrix has a negative diagonal entry where a bound is infinite."""
+        return self.kind in ("dense", "sparse") and self.diagonal == "negative" and has_negative_curvature(self._problem)
 
     @cached_property
     def definiteness(self) -> str:

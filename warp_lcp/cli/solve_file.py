@@ -23,7 +23,7 @@ from warp_lcp.problem.protocol import families
 from warp_lcp.problem.result import SolveResult
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.run.problem_folder import ProblemError
-from warp_lcp.settings import SettingError, nearest
+from warp_lcp.settings import SettingError
 from warp_lcp.solvers.registry import METHODS
 
 MOST_ROWS = 40  # of the table of iterations: a longer history shows its first and last ones

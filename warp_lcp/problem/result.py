@@ -33,7 +33,7 @@ class SolveStatus(Enum):
     )
     INFEASIBLE = (
         "the problem has no solution: b is incompatible with a singular component, or the method has proved it; "
-        "check the signs: y = A x + b"
+        "if you expected one, check the signs: y = A x + b wants A, not -A"
     )
     NEGATIVE_CURVATURE = (
         "A has a negative diagonal entry, or x'Ax < 0, where a bound is infinite: it is neither positive semi-definite nor a P-matrix; "

@@ -183,8 +183,8 @@ class Lemke(Settings):
     z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It processes every problem with a
     copositive-plus matrix, positive semi-definite ones among them, symmetric or not, and every P-matrix; for others it may end in a ray.
     A ray is believed only when further covering vectors, random in [.5, 1.5], end in one too; the status is then INFEASIBLE if multipliers
-    prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED. On a bimatrix game,
-    M = [[0, E], [F', 0]] with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's method does.
+    prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED. On a bimatrix
+    game, M = [[0, E], [F', 0]] with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's method does.
 
     Bounds far beyond the sizes of A and b count as infinite at first, and as they are if that leads
     nowhere. Boxes add a pair of variables, equations are eliminated or, where their block is

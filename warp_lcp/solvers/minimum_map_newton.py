@@ -17,11 +17,12 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.phases import (
+from warp_lcp.solvers.phases import PATH_IDLE, (
     AlgebraicSteps,
     CoarseProblem,
     CoarseStencilProblem,
@@ -34,6 +35,7 @@ from warp_lcp.solvers.phases import (
 from warp_lcp.solvers.principal_system import (
     CLASSIFY,
     ON_FREE,
+    BandedSystem,
     DenseSystem,
     GridSystem,
     LineSystem,
@@ -321,7 +323,8 @@ class NewtonWorkspace(IterateMemory):
             if AlgebraicSteps.suits(self.problem):
                 self.resort = AlgebraicSteps(self.problem, self.problem.A, x, self.target)  # type: ignore[arg-type]
             else:
-                self.resort = InteriorSteps(self.problem, self.residual, self.target)
+                patience = StoppingCriteria.patience if isinstance(self.system, BandedSystem) else PATH_IDLE  # where steps are cheap
+                self.resort = InteriorSteps(self.problem, self.residual, self.target, patience=patience)
         step = self.resort.step(x)
         self._round(x)
         return step

@@ -325,16 +325,17 @@ class InteriorSteps:
         problem: with a dense or sparse operator.
         residual: the problem's own.
         tolerance: the norm of it that is asked for.
+        patience: steps without progress before the proximal-point iteration.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float, *, patience: int = PATH_IDLE) -> None:
         from warp_lcp.solvers.interior_point import InteriorPoint  # which knows the active-set methods
 
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
         self._inner = Inner(InteriorPoint(precision="double"), problem)
         self._inner.work.residual.start(self._inner.work.x, keep=False)
         self._inner.begin(self._inner.work.x, tolerance, warm=False)
-        self._smallest, self._idle, self._norms = math.inf, 0, list[float]()
+        self._smallest, self._idle, self._patience, self._norms = math.inf, 0, patience, list[float]()
         self._begun: wp.array[Any] | None = None
         self._next: ProximalPoint | None = None
 
@@ -352,7 +353,7 @@ class InteriorSteps:
         self._smallest = min(norm, self._smallest)
         self._norms = [*self._norms, norm][-1 - PATH_IDLE :]
         creeps = len(self._norms) > PATH_IDLE and norm > CREEPS * self._norms[0]
-        over = step.failure is not None or (self._idle >= PATH_IDLE and creeps)
+        over = step.failure is not None or (self._idle >= self._patience and creeps)
         wp.copy(x, self._begun if over else self._inner.work.x)
         if over:
             self._residual.evaluate(x)
