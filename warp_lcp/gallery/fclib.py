@@ -21,7 +21,6 @@ from warp_lcp.files.archive import DEFLATED
 from warp_lcp.files.claims import ClaimError, check_claim
 from warp_lcp.gallery.contact_models import ContactSystem
 
-
 UNWRITTEN = 2**24  # bytes of a dataset that was never written, up to which it is read as zeros
 
 
