@@ -126,7 +126,7 @@ def reynolds(n, eccentricity):
 
 
 @pytest.mark.parametrize("method", [None, wl.InteriorPoint()], ids=["default", "interior point"])
-@pytest.mark.parametrize(("n", "eccentricity"), [(360, 0.999), (90, 0.99), (200, 0.9)])
+@pytest.mark.parametrize(("n", "eccentricity"), [(360, 0.999), (90, 0.99)])
 def test_a_full_film(n, eccentricity, method):
     A, b = reynolds(n, eccentricity)
     result = wl.solve(wl.LCP(A, b), method)
@@ -139,7 +139,7 @@ def test_a_full_film(n, eccentricity, method):
 @pytest.mark.parametrize("lower", [0.0, -np.inf])
 @pytest.mark.parametrize("method", [None, wl.InteriorPoint()], ids=["default", "interior point"])
 def test_a_ring(method, lower, dense):
-    n = 240 if dense else 720
+    n = 120 if dense else 720
     A, b = ring(n), np.sin(2 * np.pi * np.arange(n) / n)
     A = A.toarray() if dense else A
     assert wl.solve(wl.LCP(A, b, lower), method)

@@ -338,7 +338,8 @@ def within_reach(problem: LCP) -> bool:
     sparse = sparse_matrix(problem)
     if sparse is None and problem.layout.size > SIDE:
         return False
-    return (np.count_nonzero(assemble(problem, np.arange(problem.layout.size))) if sparse is None else sparse.nnz) <= PROVABLE
+    entries = np.count_nonzero(assemble(problem, np.arange(problem.layout.size))) if sparse is None else sparse.nnz
+    return int(entries) <= PROVABLE
 
 
 def check_size(problem: LCP, method: str, most: int) -> int:

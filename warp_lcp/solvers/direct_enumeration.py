@@ -13,11 +13,12 @@ from warp_lcp.problem.pickling import FieldsOnHost
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step
 from warp_lcp.rows.fields import Array, real_array
-from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size
+from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent
 from warp_lcp.solvers.direct_enumeration_kernels import enumeration_kernels
 
 MOST = 4  # unknowns: 3^4 = 81 sets
 ACCEPTED = {wp.float64: 1e-10, wp.float32: 3e-5}  # measure of a solution: natural residual over the terms of y, of cond(A) < 1e5
+CLEAR = 1e-3  # measure of all sets above which there surely is no solution: rounding in systems of cond(A) = 1e12 makes less
 SAME = 1e-9  # relative difference below which two solutions are one
 
 
@@ -27,7 +28,8 @@ class DirectEnumeration:
 
     Each unknown is at l, at u or free with y = 0, which makes 2^n complementarity cones for the LCP and 3^n for a box; the set that solves
     the problem most exactly wins. A may be anything: unsymmetric, indefinite, singular. A free block that is singular contributes its basic
-    solution. Where no set solves the problem there is no solution: INFEASIBLE. x0 is not used; `linear_iterations` counts sets.
+    solution. Where no set solves the problem, by far or as multipliers
+    prove, there is no solution: INFEASIBLE. x0 is not used; `linear_iterations` counts sets.
 
     For many problems at once see `enumerate_batch`.
     """
@@ -52,7 +54,9 @@ class DirectEnumeration:
             work.write_iterate(candidates[best])
             work.ended = SolveStatus.STAGNATED
         else:
-            work.ended = SolveStatus.INFEASIBLE
+            work.ended = SolveStatus.INFEASIBLE if measures[best] > CLEAR or inconsistent(work.data) else SolveStatus.STAGNATED
+            if work.ended is SolveStatus.STAGNATED:
+                work.write_iterate(candidates[best])
         return work.result("sets", int(np.count_nonzero(measures <= 1)))
 
     def solutions(self, problem: LCP) -> np.ndarray:

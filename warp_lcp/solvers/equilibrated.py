@@ -156,9 +156,9 @@ class EquilibratedWorkspace(IterateMemory):
         R, C = (power_of_two(1 / np.sqrt(A.scale())),) * 2 if A.symmetric else unit_rows_and_columns(matrix)
         if max(R.max() / R.min(), C.max() / C.min()) <= ALIKE:
             R = C = np.ones(len(R))
-        self._alone = np.flatnonzero(
-            (np.asarray(abs(matrix).sum(axis=0)).ravel() == 0) & (np.asarray(abs(matrix).sum(axis=1)).ravel() == 0)
-        )
+        sizes = abs(matrix)
+        sums = (np.asarray(sizes.sum(axis=k)).ravel() for k in (0, 1))
+        self._alone = np.flatnonzero(np.add(*sums) == 0)
         self._rows.assign(R)
         self._units.assign(C)
         return scaled(matrix, R, C)
