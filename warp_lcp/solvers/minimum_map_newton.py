@@ -22,7 +22,8 @@ from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.phases import PATH_IDLE, (
+from warp_lcp.solvers.phases import (
+    PATH_IDLE,
     AlgebraicSteps,
     CoarseProblem,
     CoarseStencilProblem,
