@@ -220,7 +220,7 @@ def malformed(rng: Rng) -> Case:
     elif way == "indptr":
         M.indptr[int(rng.integers(1, n + 1))] = int(rng.choice([-1, M.nnz + 1000, 2**31 - 1]))
     elif way == "lengths":
-        M.data = M.data[: M.nnz // 2]
+        M.data = M.data[: M.nnz // 2].copy()
     elif way == "values":
         M.data[k] = rng.choice([np.nan, np.inf, -np.inf])
     else:
