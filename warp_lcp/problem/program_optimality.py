@@ -160,7 +160,9 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
     wrong = np.where(x <= p.lower, np.maximum(-g, 0.0), np.where(x >= p.upper, np.maximum(g, 0.0), np.abs(g)))
     wrong = np.where(p.lower == p.upper, 0.0, wrong)
     terms = abs(p.Q) @ np.abs(x) + np.abs(p.c) + abs(rows).T @ multipliers
-    sizes = _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0) + np.abs(p.c) + _largest(abs(rows), 0) * multipliers.max(initial=0.0)
+    # without ||multipliers||: a bound and an equation that cancel may have any, and would hide the other rows
+    least = np.abs(p.c[p.c != 0]).min(initial=np.inf)
+    sizes = _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0) + terms + (least if np.isfinite(least) else 1.0)
     dual = _relative(wrong, terms, sizes)
     held = np.where((x <= p.lower) | (x >= p.upper), g * x, 0.0)
     parts = np.r_[x * (p.Q @ x), p.c * x, -p.h * z, -p.d * y, -held]
