@@ -6,6 +6,7 @@ P' = c sigma^2 D P D and so on.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -138,6 +139,7 @@ def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     return ProgramPoint(x, np.where(slack <= point.z, np.maximum(point.z, 0.0), 0.0), point.y)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of multipliers beyond all numbers: inf is returned
 def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[float, float, float]:
     """Return the primal residual, the dual residual and the duality gap, relative to their terms.
 
@@ -168,9 +170,12 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
     parts = np.r_[x * (p.Q @ x), p.c * x, -p.h * z, -p.d * y, -held]
     sides = np.r_[x * (p.G.T @ z), x * (p.C.T @ y)]  # of the same size, where h and d are 0
     size = float(np.abs(parts).sum() + np.abs(sides).sum())
-    return primal, dual, abs(float(parts.sum())) / size if size else 0.0
+    gap = abs(float(parts.sum())) / size if size else 0.0
+    primal, dual, gap = (math.inf if math.isnan(value) else value for value in (primal, dual, gap))
+    return primal, dual, gap
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     """Return the best point of some primal-dual active-set steps.
 
