@@ -138,6 +138,8 @@ class _Solve:
             self.end(SolveStatus.INFEASIBLE, WORDS[why])
         elif len(self._conditions.b) <= Lemke.most_unknowns:
             self._by(Lemke())
+            if self.point is None and self.result.status == STATUSES[SolveStatus.INFEASIBLE]:  # a ray is no certificate
+                self.end(SolveStatus.STAGNATED, "no method solves the conditions, and no certificate shows that none could")
 
     def end(self, status: SolveStatus, message: str) -> None:
         """Say how the program ended."""

@@ -6,6 +6,7 @@ P' = c sigma^2 D P D and so on.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -138,6 +139,7 @@ def settled(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     return ProgramPoint(x, np.where(slack <= point.z, np.maximum(point.z, 0.0), 0.0), point.y)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of multipliers beyond all numbers: inf is returned
 def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[float, float, float]:
     """Return the primal residual, the dual residual and the duality gap, relative to their terms.
 
@@ -160,15 +162,20 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
     wrong = np.where(x <= p.lower, np.maximum(-g, 0.0), np.where(x >= p.upper, np.maximum(g, 0.0), np.abs(g)))
     wrong = np.where(p.lower == p.upper, 0.0, wrong)
     terms = abs(p.Q) @ np.abs(x) + np.abs(p.c) + abs(rows).T @ multipliers
-    sizes = _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0) + np.abs(p.c) + _largest(abs(rows), 0) * multipliers.max(initial=0.0)
+    # without ||multipliers||: a bound and an equation that cancel may have any, and would hide the other rows
+    least = np.abs(p.c[p.c != 0]).min(initial=np.inf)
+    sizes = _largest(abs(p.Q), 1) * np.abs(x).max(initial=0.0) + terms + (least if np.isfinite(least) else 1.0)
     dual = _relative(wrong, terms, sizes)
     held = np.where((x <= p.lower) | (x >= p.upper), g * x, 0.0)
     parts = np.r_[x * (p.Q @ x), p.c * x, -p.h * z, -p.d * y, -held]
     sides = np.r_[x * (p.G.T @ z), x * (p.C.T @ y)]  # of the same size, where h and d are 0
     size = float(np.abs(parts).sum() + np.abs(sides).sum())
-    return primal, dual, abs(float(parts.sum())) / size if size else 0.0
+    gap = abs(float(parts.sum())) / size if size else 0.0
+    primal, dual, gap = (math.inf if math.isnan(value) else value for value in (primal, dual, gap))
+    return primal, dual, gap
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     """Return the best point of some primal-dual active-set steps.
 
