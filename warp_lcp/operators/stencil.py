@@ -56,14 +56,15 @@ class Stencil(GridOperator):
             an array of the shape of `cells`, or a Warp function of the cell's indices, (k, j, i) or (j, i), that returns a float; functions
             and arrays do not mix. Or an array of numbers of shape (3, 3) or (3, 3, 3), the center in the middle.
         shift: None, a number or an array of the shape of `cells`, >= 0.
-        periodic: whether x, y, z wrap around.
+        periodic: whether x, y, z wrap around; the cells of an axis of one cell are then their own neighbors.
         outside: what lies beyond the array where an axis is not periodic: SOLID, as for `wl.GridPoisson`, or AIR.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 coefficients are rounded, so that the problem solved is another
             one by about 1e-7 of the diagonal.
 
     Attributes:
-        symmetric: whether a_o(i) = a_-o(i + o) between all unknowns, to the last bit.
+        symmetric: whether a_o(i) = a_-o(i + o) between all unknowns, to the last bit; coefficients toward SOLID, AIR and what lies outside
+            do not matter. Once other cells in place have made A unsymmetric, it stays False.
         monotone: whether all a_o but the center's are <= 0, as in an M-matrix.
 
     Raises:

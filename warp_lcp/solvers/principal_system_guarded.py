@@ -76,7 +76,7 @@ class MatrixSystem:
         self._most = FACTORED_IN_SPACE if A.stencil.padding.counts[0] > 1 else FACTORED_IN_PLANE
         self._operator, self._shifted = SparseOperator(grid_matrix(A), device=A.device, dtype=wp.float64), shifted
         self._system: KrylovSystem = SparseSystem(self._operator, wp.float64, shifted=shifted)
-        self._preconditioner: Any = self._system.preconditioner  # type: ignore[attr-defined]
+        self._preconditioner: Any = self._system.preconditioner
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
         """Take another free set and shift, stored fields of the grid."""
