@@ -141,13 +141,18 @@ def stencil_matrix(
 
 
 def boundary_term(cells: Array, coefficients: dict[tuple[int, ...], Any], values: Array, periodic: tuple[bool, ...], outside: int) -> Array:
-    """Return the sums of a_o(i) value_(i + o) over AIR neighbors; `values` is padded by one cell."""
+    """Return the sums of a_o(i) value_(i + o) over AIR neighbors; `values` is padded by one cell.
+
+    Along a periodic axis the padding stands for the other side, outside another axis too.
+    """
     total = np.zeros(cells.shape)
     for cell in zip(*np.nonzero(cells == FLUID), strict=True):
         for offset, a in coefficients.items():
             there = neighbor(cell, offset, cells.shape, periodic)
             if (outside if there is None else cells[there]) == AIR:
-                at = tuple(c + o + 1 for c, o in zip(cell, offset, strict=True)) if there is None else tuple(c + 1 for c in there)
+                reached = [int(c) + o for c, o in zip(cell, offset, strict=True)]
+                wraps = [periodic[cells.ndim - 1 - axis] for axis in range(cells.ndim)]
+                at = tuple((k % n if wrap else k) + 1 for k, n, wrap in zip(reached, cells.shape, wraps, strict=True))
                 total[cell] += float(a[cell] if np.ndim(a) else a) * values[at]
     return total
 

@@ -274,7 +274,7 @@ class Stencil(GridOperator):
 
         Args:
             values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2, nx + 2), with what lies outside; what
-                FLUID and SOLID cells have does not matter.
+                FLUID and SOLID cells have does not matter, nor what the padding along a periodic axis has.
         """
         host = real_array(values, "values")
         padded = np.zeros(self.layout.stored_shape)
