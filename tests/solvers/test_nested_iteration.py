@@ -85,7 +85,7 @@ def test_steps_on_m_matrices_do_not_grow_with_n(kind):
             p = narrow_problem(kind, seed, n)
             result = wl.solve(wl.LCP(p.A, p.b, p.lower, p.upper))
             assert result, f"{p.name}: {result.status.name}"
-            assert result.iterations <= 7, p.name
+            assert result.iterations <= 11, p.name  # four plain steps, nested iteration, and what is left
             assert relative_residual(p, result.x.numpy()) <= 1e-6 * (1 + 1e-6)
 
 
@@ -98,7 +98,7 @@ def test_an_upper_bound_in_a_window_at_any_size():
         for upper in (np.where(abs(x - 0.6) < 0.15, 0.05, np.inf), np.inf):
             result = wl.solve(wl.LCP(A, b, 0.0, upper))
             assert result
-            assert result.iterations <= 4
+            assert result.iterations <= 8
             assert natural_residual(A, b, 0.0, upper, result.x.numpy()) <= 1e-6 * np.linalg.norm(np.minimum(b, 0)) * (1 + 1e-6)
 
 

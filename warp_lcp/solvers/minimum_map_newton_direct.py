@@ -26,7 +26,7 @@ MOST = 200  # unknowns up to which LAPACK on the host costs less than launches o
 FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
 NARROW_STEPS = 20  # whole steps after nested iteration: M-matrices take 2 to 5, and beams, whose sets may wander, seldom more
 IDLE = 30  # steps without a smaller residual, the loop's patience, after which safeguarded steps take over
-WARM = 8  # steps from a guess before nested iteration: an active set that has moved a few unknowns takes fewer
+PLAIN = 4  # steps before nested iteration, which costs about 20: many active sets are found in fewer
 
 
 class SmallMatrix:
@@ -155,8 +155,8 @@ class DirectNewtonWorkspace(IterateMemory):
     """Whole Newton steps solved by LAPACK on the host, then the safeguarded ones where these lead nowhere.
 
     On an M-matrix whole steps end at the solution, but an end of a contact set may move by one unknown a step. A narrow problem
-    therefore begins by nested iteration, which finds the ends to within a few unknowns; from a guess, after `WARM` steps. A set that
-    comes again, a singular block, or `IDLE` steps without gain: MinimumMapNewton's own steps go on from the best iterate.
+    therefore takes nested iteration after `PLAIN` steps, which finds the ends to within a few unknowns. A set that comes again, a
+    singular block, or `IDLE` steps without gain: MinimumMapNewton's own steps go on from the best iterate.
 
     Attributes:
         rest: their memory, once they do.
@@ -193,7 +193,7 @@ class DirectNewtonWorkspace(IterateMemory):
             self._lower, self._upper = bounds.host(0), bounds.host(1)
             self._d = residual.diagonal.numpy().astype(np.float64)
         self._seen: set[bytes] = set()
-        self._wait = WARM if warm else 0  # steps before nested iteration
+        self._wait = PLAIN  # steps before nested iteration
         self._begun = self._nested = False
         self._left: float = math.inf
         self._least, self._idle = math.inf, 0
