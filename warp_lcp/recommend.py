@@ -122,7 +122,7 @@ RULES: tuple[Rule, ...] = (
     Rule("minimum-map-newton", "A stencil that is not symmetric, or that only lines smooth, has a hierarchy for Newton's systems",
          lambda t: t.kind == "grid", 9, ("primal-dual-active-set", "interior-point", "mprgp")),
     Rule("lemke", "Zeros on the diagonal, as friction cones, linear programs and games have them, are for pivots where unknowns are few",
-         lambda t: t.pivotable and t.unknowns <= 400, 5, ("fischer-newton", "interior-point", "minimum-map-newton")),
+         lambda t: t.pivotable and t.unknowns <= 400, 5, ("interior-point", "fischer-newton", "minimum-map-newton")),
     Rule("interior-point", "Zeros on the diagonal of a sparse matrix are no obstacle to interior points, whose systems are shifted",
          lambda t: t.pivotable and t.kind == "sparse", 8, ("fischer-newton", "minimum-map-newton", "lemke")),
     Rule("fischer-newton", "Zeros on the diagonal of a dense matrix are no obstacle to Fischer and Burmeister's function",
