@@ -8,7 +8,7 @@ import warp_lcp as wl
 from narrow_problems import KINDS, M_MATRICES, narrow_problem
 from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of, bandwidth
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.solvers.nested_iteration import COARSEST, Level, nested_iteration
+from warp_lcp.solvers.nested_iteration import COARSEST, BlockTridiagonalProblem, nested_iteration
 
 TIGHT = wl.StoppingCriteria(rtol=1e-7)
 
@@ -71,7 +71,7 @@ def test_levels_are_schur_complements(kind, seed):
 @pytest.mark.parametrize("n", [31, 64, 97])
 def test_a_last_block_that_is_not_full_is_filled_up(n):
     p = narrow_problem("dominant band", 7311, n)
-    level = Level.of(banded(p), p.b, p.lower, p.upper)
+    level = BlockTridiagonalProblem.of(banded(p), p.b, p.lower, p.upper)
     whole, filled = level.matrix(), level.b.size
     x = np.random.default_rng(7312).standard_normal(filled)
     np.testing.assert_allclose(whole.product(x)[:n], p.A @ x[:n], atol=1e-13)

@@ -25,7 +25,7 @@ STEPS = 30  # of Newton's method on a coarse level; M-matrices take 2 or 3
 
 
 @dataclass(frozen=True)
-class Level:
+class BlockTridiagonalProblem:
     """A boxed problem with a block tridiagonal matrix of m blocks of k unknowns.
 
     Args:
@@ -45,7 +45,7 @@ class Level:
     upper: np.ndarray
 
     @classmethod
-    def of(cls, A: BandedMatrix, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> Level:
+    def of(cls, A: BandedMatrix, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> BlockTridiagonalProblem:
         """Cut a problem into blocks; the last one is filled up with equations x_i = 0."""
         k, n = max(A.width, 1), len(b)
         m = -(-n // k)
@@ -61,7 +61,7 @@ class Level:
         fields = (np.r_[f, np.full(m * k - n, end)].reshape(m, k) for f, end in ((b, 0.0), (lower, -np.inf), (upper, np.inf)))
         return cls(*parts, *fields)
 
-    def coarse(self) -> tuple[Level, np.ndarray]:
+    def coarse(self) -> tuple[BlockTridiagonalProblem, np.ndarray]:
         """Return the problem of the even blocks, and A_FF^-1, shape (m // 2, k, k).
 
         Raises:
@@ -80,7 +80,7 @@ class Level:
         right[: len(after)] = -_times(after, self.right[odd])
         b[1:] -= _applied(before, self.b[odd][:count])
         b[: len(after)] -= _applied(after, self.b[odd])
-        return Level(left, own, right, b, self.lower[even], self.upper[even]), inverse
+        return BlockTridiagonalProblem(left, own, right, b, self.lower[even], self.upper[even]), inverse
 
     def interpolated(self, coarse: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Return x, shape (m, k), of its even blocks: y = 0 on the odd ones."""
@@ -142,8 +142,8 @@ def nested_iteration(A: BandedMatrix, b: np.ndarray, lower: np.ndarray, upper: n
         lower: l, shape (n,).
         upper: u, shape (n,).
     """
-    level = Level.of(A, b, lower, upper)
-    finer: list[tuple[Level, np.ndarray]] = []
+    level = BlockTridiagonalProblem.of(A, b, lower, upper)
+    finer: list[tuple[BlockTridiagonalProblem, np.ndarray]] = []
     try:
         while len(level.b) > COARSEST:
             coarse, inverse = level.coarse()
