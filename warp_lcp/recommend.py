@@ -107,7 +107,7 @@ RULES: tuple[Rule, ...] = (
          lambda t: t.affine, None, ()),
     Rule("lemke", "A negative diagonal entry beside an infinite bound, mostly a sign error in A, is no obstacle to pivots",
          lambda t: t.curved and t.unknowns <= PIVOTED, 5, ("minimum-map-newton",)),
-    Rule("minimum-map-newton", "A negative diagonal entry beside an infinite bound, of many unknowns, ends in a status that asks for the sign",
+    Rule("minimum-map-newton", "Where unknowns are many, such an entry ends in a status that asks for the sign of A",
          lambda t: t.curved, None, ()),
     Rule("psor", "A sweep sets an unknown whose diagonal entry is negative to one of its bounds",
          lambda t: t.diagonal == "negative" and t.kind in ("dense", "sparse"), None,
