@@ -12,7 +12,7 @@ from warp_lcp.gallery.contact_models import BoxedModel
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.recommend import LEAN, RULES, memory_of
-from warp_lcp.traits import Traits, traits_of
+from warp_lcp.traits import traits_of
 
 SEEDS = range(700, 703)  # neither those of the rules nor those of the published check
 COUNTED = [family for family in FAMILIES if not family.startswith("scene")]  # contacts at rest are tried below
@@ -244,12 +244,10 @@ def test_the_default_solves_convex_boxes_of_low_rank(kind, seed, piqp, monkeypat
 
 
 @pytest.fixture
-def misled(monkeypatch):
-    """A convex box of rank 3 that is taken for one of full rank: Newton's method stagnates on it."""
-    monkeypatch.setattr(Traits, "low_rank", False)
-    rng = np.random.default_rng([60, 3, 0])
-    F = rng.standard_normal((60, 3)) * np.sign(rng.standard_normal((60, 1)))
-    return wl.LCP(F @ F.T, -np.ones(60), 0.0, 1.0)
+def misled():
+    """A box whose matrix has negative diagonal entries: sweeps stagnate on it, pivots solve it."""
+    rng = np.random.default_rng([12, 2])
+    return wl.LCP(rng.standard_normal((12, 12)), rng.standard_normal(12), 0.0, 1.0)
 
 
 def test_a_method_that_fails_is_followed_by_its_alternatives(misled):
@@ -266,7 +264,7 @@ def test_a_method_that_fails_is_followed_by_its_alternatives(misled):
         assert numbers == sorted(numbers)
     assert [r.step for r in told if r.step.startswith("start")] == ["start", f"start of {result.method}"]
     x = misled.A.matrix.numpy(), misled.b.numpy(), 0.0, 1.0, result.x.numpy()
-    assert natural_residual(*x) <= 1e-6 * natural_residual(*x[:4], np.zeros(60))
+    assert natural_residual(*x) <= 1e-6 * natural_residual(*x[:4], np.zeros(12))
 
 
 def test_alternatives_keep_the_limits(misled):
@@ -282,7 +280,7 @@ def test_alternatives_keep_the_limits(misled):
             raise StopIteration
 
     assert wl.solve(misled, callback=stop).status is wl.SolveStatus.STOPPED
-    timed = wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=1000, patience=1000, max_seconds=0.02))
+    timed = wl.solve(misled, stopping=wl.StoppingCriteria(max_iterations=100_000, patience=100_000, max_seconds=0.02))
     assert timed.status is wl.SolveStatus.TIME_LIMIT
     assert len([r for r in timed.history if r.step.startswith("start")]) == 1
 

@@ -19,7 +19,7 @@ from warp_lcp.problem.protocol import version_of
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.solve import EPS, ConvexSetProblem, Solver, Workspace
 from warp_lcp.problem.solve import solve as solve_by
-from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.recommend import Recommendation, method_for, recommend, steps_allowed
 from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
@@ -82,6 +82,7 @@ def solve(
         raise ValueError("workspace: name the solver that made it")
     if solver is None and isinstance(problem, ConvexSetProblem):
         raise ValueError(f"solver: a {type(problem).__name__} is solved by methods of its own, name one")
+    check_criteria(stopping)
     if solver is None and isinstance(problem, LCP):
         return _solve_by_choice(problem, stopping, x0, callback)
     if workspace is None and isinstance(problem, LCP) and solver is not None:

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.sparse
 import scipy.sparse.linalg
 
 import warp_lcp as wl
 from warp_lcp.problem.curvature import has_negative_curvature
 
-CURVED = wl.SolveStatus.NEGATIVE_CURVATURE
+CURVED, INFEASIBLE = wl.SolveStatus.NEGATIVE_CURVATURE, wl.SolveStatus.INFEASIBLE
 
 
 def laplacian(n):
@@ -37,23 +38,41 @@ def products(A):
     return wl.LinearOperator(lambda x: A @ x, shape=(A.shape[0],), symmetric=symmetric, transpose=None if symmetric else lambda x: A.T @ x)
 
 
-@pytest.mark.parametrize("method", [None, wl.MinimumMapNewton(), wl.PrimalDualActiveSet(), wl.InteriorPoint()])
+def is_feasible(A, b):
+    """Return whether some x >= 0 has A x + b >= 0, by HiGHS."""
+    return scipy.optimize.linprog(np.zeros(len(b)), A_ub=-A, b_ub=b, bounds=(0.0, None)).status == 0
+
+
+@pytest.mark.parametrize("method", [wl.MinimumMapNewton(), wl.PrimalDualActiveSet(), wl.InteriorPoint()])
 def test_flipped_matrices_take_no_steps(method):
     for seed in range(6201, 6216):
         A = drawn(seed)
         b = np.random.default_rng([seed, 1]).standard_normal(A.shape[0]) - 1.0
-        result = wl.solve(wl.LCP(-A, b), *([method] if method else []))
-        assert result.status is CURVED or (method is None and result), (seed, result.status)
-        if result.status is CURVED:
-            assert result.iterations == 0
-        assert wl.solve(wl.LCP(A, b), *([method] if method else [])).status is not CURVED
+        result = wl.solve(wl.LCP(-A, b), method)
+        assert result.status is CURVED, (seed, result.status)
+        assert result.iterations == 0
+        assert wl.solve(wl.LCP(A, b), method).status is not CURVED
 
 
-def test_the_message_asks_for_the_sign():
-    found = wl.linear_complementarity(-laplacian(20), np.full(400, -1.0))
+def test_flipped_matrices_are_solved_or_refuted_by_default():
+    """Pivots solve -A or prove it infeasible; what neither does has negative curvature."""
+    for seed in range(6201, 6216):
+        A = drawn(seed)
+        b = np.random.default_rng([seed, 1]).standard_normal(A.shape[0]) - 1.0
+        result = wl.solve(wl.LCP(-A, b))
+        assert result or result.status in (CURVED, INFEASIBLE), (seed, result.status)
+        if result.status is INFEASIBLE:
+            assert not is_feasible(-A, b)
+        assert wl.solve(wl.LCP(A, b))
+
+
+@pytest.mark.parametrize(("n", "status"), [(20, 2), (32, 10)])
+def test_the_message_asks_for_the_sign(n, status):
+    """Up to 1,000 unknowns pivots prove that there is no solution."""
+    found = wl.linear_complementarity(-laplacian(n), np.full(n * n, -1.0))
     assert not found.success
     assert "A, not -A" in found.message
-    assert found.status == 10
+    assert found.status == status
 
 
 def test_products_alone_tell_too():

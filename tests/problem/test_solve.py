@@ -61,7 +61,10 @@ def test_history_counts_and_limits_are_exact():
     A, b = poisson()
     seen = []
     result = wl.solve(
-        wl.LCP(A, b), wl.ProjectedSOR(direction="symmetric"), stopping=wl.StoppingCriteria(max_iterations=4), callback=seen.append
+        wl.LCP(A, b),
+        wl.ProjectedSOR(omega=1.4, direction="symmetric"),
+        stopping=wl.StoppingCriteria(max_iterations=4),
+        callback=seen.append,
     )
     assert result.status is wl.SolveStatus.MAX_ITERATIONS
     assert not result
@@ -258,8 +261,8 @@ class TestStatuses:
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(2))
         assert wl.solve(problem, wl.MinimumMapNewton()).status is wl.SolveStatus.NEGATIVE_CURVATURE
         assert wl.solve(problem, wl.Lemke()).status is wl.SolveStatus.INFEASIBLE
-        A = np.array([[7.0, -7.0, 3.0], [-7.0, 9.0, 8.0], [3.0, 8.0, 5.0]])  # indefinite, with a positive diagonal
-        indefinite = wl.LCP(wl.DenseOperator(A, device="cpu"), np.array([-3.0, -2.0, -2.0]))
+        A = np.array([[3.0, 3.0, 9.0], [3.0, 2.0, -4.0], [9.0, -4.0, 9.0]])  # indefinite, with a positive diagonal
+        indefinite = wl.LCP(wl.DenseOperator(A, device="cpu"), np.array([-4.0, 1.0, -2.0]))
         assert wl.solve(indefinite, wl.DirectEnumeration())
         result = wl.solve(indefinite, wl.MinimumMapNewton())
         assert result.status in (wl.SolveStatus.NON_DESCENT, wl.SolveStatus.STAGNATED)

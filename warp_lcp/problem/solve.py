@@ -19,7 +19,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import NamesComponents, has, version_of
 from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.rows.fields import Array
 from warp_lcp.rows.vectors import convert
 
@@ -220,8 +220,7 @@ def solve(
     if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
         kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"
         raise ValueError(f"solver is {kind}: expected a method with its settings, say MinimumMapNewton()")
-    if not (stopping is None or isinstance(stopping, (StoppingCriteria, MeanCriteria))):
-        raise ValueError(f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)")
+    check_criteria(stopping)
     taken: type = getattr(solver, "problems", LCP)
     if not isinstance(problem, taken):
         raise ValueError(f"{type(solver).__name__} takes problems of the class {taken.__name__}: this is a {type(problem).__name__}")

@@ -91,3 +91,9 @@ class MeanCriteria:
     def known(self) -> StoppingCriteria:
         """Return the criteria for the unknowns as counted."""
         return StoppingCriteria(rtol=self.rtol, atol=self.atol * self.count() ** 0.5, max_iterations=self.max_iterations)
+
+
+def check_criteria(stopping: object) -> None:
+    """Raise ValueError for stopping criteria of another kind, say a bare tolerance."""
+    if not (stopping is None or isinstance(stopping, (StoppingCriteria, MeanCriteria))):
+        raise ValueError(f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)")
