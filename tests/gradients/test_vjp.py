@@ -293,7 +293,7 @@ def test_sums_of_a_grid_and_columns():
 @pytest.mark.parametrize("precision", ["single", "mixed"])
 def test_iterates_in_float32_and_coefficients_in_float32(precision):
     cells, data = random_grid((8, 9), 91)
-    problem = wl.LCP(wl.GridPoisson(cells, device="cpu", shift=0.2), data["b"], data["lower"])
+    problem = wl.LCP(wl.GridPoisson(cells, device="cpu", shift=0.25), data["b"], data["lower"])
     result = wl.solve(problem, wl.MinimumMapNewton(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-5))
     g = np.random.default_rng(92).standard_normal(cells.shape)
     exact = wl.solve(problem, stopping=TIGHT)

@@ -14,7 +14,7 @@ from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, real_array
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, real_array, relative_rounding
 
 HEADERS, FIELDS = Path(__file__).parent / "headers", dict.fromkeys(("b", "lower", "upper"), "S")
 PRODUCT = RowPass(
@@ -70,6 +70,7 @@ class DenseOperator(Pickled):
         largest = np.abs(host).max(axis=1)
         check_kept(largest, dtype, "matrix, the largest entries of its rows")
         self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
+        self._rounding = relative_rounding(host, dtype)
         self.symmetric = is_rounding(host - host.T, largest[:, None], largest)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -84,6 +85,11 @@ class DenseOperator(Pickled):
     def update(self, values: Any) -> None:
         """Take other entries, shape (n, n), finite; `symmetric` and `row_sizes` stay as they are."""
         self.matrix.assign(values)
+        self._rounding = relative_rounding(real_array(values, "values"), self.dtype)
+
+    def storage_rounding(self) -> float:
+        """Return the largest relative rounding of an entry."""
+        return self._rounding
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return A x, x of shape (n,) and type wp.float32 or wp.float64."""

@@ -16,7 +16,7 @@ from warp_lcp.operators.padded_stencil import Ghosts, PaddedStencil, find_spans_
 from warp_lcp.problem.pickling import Pickled
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, checked_device, real_array
+from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, checked_device, real_array, relative_rounding
 from warp_lcp.rows.vectors import Across
 
 HEADERS = Path(__file__).parent / "headers"
@@ -47,6 +47,8 @@ class GridOperator(Pickled):
     _ghosts: Ghosts | None = None  # of a box of cells among others
     _across: Across | None = None
     _finder: Any = None  # of floating components
+    _rounding = 0.0  # the largest relative one of coefficients that were given as arrays
+    _rounding_of_diagonal = -1, 0.0  # a version, and that of the diagonal then
     outside = SOLID  # what lies beyond the array
 
     def __init__(self, cells: Any, coefficients: dict[str, Any], periodic: tuple[bool, ...], device: Any, dtype: Any) -> None:
@@ -164,6 +166,29 @@ class GridOperator(Pickled):
         inner = d.reshape(self.layout.stored_shape)[1:-1, 1:-1, 1:-1]
         return wp.array(inner.reshape(self.shape), dtype=self.dtype, device=self.device)
 
+    def storage_rounding(self) -> float:
+        """Return the largest relative rounding of a coefficient that was given, and of the diagonal, which adds them up.
+
+        That of the diagonal is computed when it is first asked for; on ranks, and of principal systems, it is left out.
+        """
+        whole = self._mask is None and self.layout.across is None
+        if whole and self.dtype is wp.float32 and self.stencil.d.dtype is wp.float32 and self._rounding_of_diagonal[0] != self.version:
+            exact = self._in_float64()
+            d, stored = (1.0, 1.0) if exact is None else (A.diagonal().numpy().astype(np.float64) for A in (exact, self))
+            there = np.asarray(d) != 0
+            error = np.abs(np.where(there, stored, 0.0) - d) / np.where(there, np.abs(d), 1.0)
+            self._rounding_of_diagonal = self.version, float(error.max())
+        return max(self._rounding, self._rounding_of_diagonal[1] if whole else 0.0)
+
+    def _in_float64(self) -> Self | None:
+        """Return the operator of the same cells, its stored coefficients in float64; None where there is nothing to add up."""
+        kind = wp.float64
+        given = {
+            name: wp.array(v.numpy(), dtype=kind, device=self.device) if isinstance(v, wp.array) else v for name, v in self._arguments().items()
+        }
+        cells = self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape)
+        return type(self)(cells, periodic=self._wraps, device=self.device, dtype=kind, **given)
+
     def masked(self, free: Any, shift: Any = None) -> Self:
         """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""
         mask = (self.layout.load(free, wp.uint8, "free").numpy() != 0) & (self.cells.numpy().ravel() == FLUID)
@@ -246,7 +271,12 @@ class GridOperator(Pickled):
         if host.shape != self.shape:
             raise ValueError(f"shift has shape {host.shape}: expected {self.shape}")
         check_coefficients(host, self.dtype, "shift")
+        self._note_rounding(host)
         return wp.array(np.pad(host.reshape(self.layout.padding.counts), 1), dtype=self.dtype, device=self.device)
+
+    def _note_rounding(self, values: np.ndarray) -> None:
+        """Take note of what storing coefficients changes."""
+        self._rounding = max(self._rounding, relative_rounding(values, self.dtype))
 
     def _find_rows(self) -> None:
         """Find what of each row is in use."""

@@ -67,8 +67,8 @@ class GridPoisson(GridOperator):
         periodic: whether x, y, z wrap around.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 unequal coefficients and their sums are rounded, so that the
-            problem solved is another one by about 1e-7 of the diagonal: for tolerances near that, and for closed domains with such
-            coefficients, take wp.float64. Equal coefficients without a shift are not rounded.
+            problem solved is another one by about 1e-7 of the diagonal: for closed domains with such coefficients take wp.float64, and
+            for tolerances below the rounding, where the status is FLOOR. Equal coefficients without a shift are not rounded.
 
     Raises:
         ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names it.
@@ -180,6 +180,7 @@ class GridPoisson(GridOperator):
         if host.shape != tuple(expected):
             raise ValueError(f"{name} has shape {host.shape}: expected {tuple(expected)} for cells of shape {self.shape}")
         check_coefficients(host, self.dtype, name)
+        self._note_rounding(host)
         if self.periodic[axis] and not np.array_equal(host.take(0, -1 - axis), host.take(-1, -1 - axis)):
             raise ValueError(f"{name}: the first and the last faces of a periodic axis are the same ones, but their coefficients differ")
         counts = [*self.layout.padding.counts]

@@ -17,7 +17,7 @@ from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, kept, real_array, zeros, zeros_like
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, kept, real_array, relative_rounding, zeros, zeros_like
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
 
@@ -198,6 +198,10 @@ class SparseOperator(Pickled):
             self._scale = scale_of_matrix(self.matrix())
         return self._scale
 
+    def storage_rounding(self) -> float:
+        """Return the largest relative rounding of an entry."""
+        return self._rounding
+
     def renumbered(self) -> tuple[Renumbering, SparseOperator] | None:
         """Return A as it is now in a numbering in which neighbors lie together in memory; None where its own is as good, and on CUDA."""
         found = self._numbering
@@ -206,7 +210,7 @@ class SparseOperator(Pickled):
         if self._turned is None or self._turned_from != self.version:
             B = None if self.near_null_space is None else self.near_null_space[found.order]
             self._turned = SparseOperator(found.matrix(self.matrix()), device=self.device, dtype=self.dtype, near_null_space=B)
-            self._turned_from = self.version
+            self._turned._rounding, self._turned_from = self._rounding, self.version
         return found, self._turned
 
     @cached_property
@@ -284,7 +288,7 @@ class SparseOperator(Pickled):
         self._diagonal.assign(diagonal.astype(wp.dtype_to_numpy(self.dtype)))
         if self._transpose_values is not None:
             self._gather(self._transpose[2])
-        self._scale = None
+        self._scale, self._rounding = None, relative_rounding(host.data, self.dtype)
         self.version += 1
 
     def _gather(self, order: wp.array[Any]) -> None:

@@ -60,7 +60,7 @@ class Stencil(GridOperator):
         outside: what lies beyond the array where an axis is not periodic: SOLID, as for `wl.GridPoisson`, or AIR.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 coefficients are rounded, so that the problem solved is another
-            one by about 1e-7 of the diagonal.
+            one by about 1e-7 of the diagonal, and tolerances below the rounding end with FLOOR.
 
     Attributes:
         symmetric: whether a_o(i) = a_-o(i + o) between all unknowns, to the last bit; coefficients toward SOLID, AIR and what lies outside
@@ -97,6 +97,8 @@ class Stencil(GridOperator):
                 raise ValueError(f"coefficients[{_named(o, cells.ndim)}] has shape {f.shape}: expected a number or {cells.shape}")
             check_storable(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
             check_kept(f, self.dtype, f"coefficients[{_named(o, cells.ndim)}]")
+            if f.ndim:  # numbers are not stored, but added up
+                self._note_rounding(f)
         if functions and any(f.ndim for f in values.values()):
             raise ValueError("coefficients: arrays and Warp functions do not mix, evaluate the functions or make the arrays functions")
         fluid = cells.reshape(self.layout.padding.counts) == FLUID
@@ -389,6 +391,10 @@ class StoredStencil(GridOperator):
 
     def _fill_stencil(self) -> None:
         self._wrap_cells()
+
+    def _in_float64(self) -> None:
+        """Nothing: the stencil is what it was given."""
+        return
 
 
 def _opposite(offset: Offset) -> Offset:

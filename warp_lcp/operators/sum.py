@@ -10,7 +10,18 @@ import warp as wp
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled
-from warp_lcp.problem.protocol import AppliesPlus, HasCells, HasColumns, HasStencil, NamesComponents, Operator, has, layout_of, version_of
+from warp_lcp.problem.protocol import (
+    AppliesPlus,
+    HasCells,
+    HasColumns,
+    HasStencil,
+    NamesComponents,
+    Operator,
+    StoresRounded,
+    has,
+    layout_of,
+    version_of,
+)
 from warp_lcp.rows.vectors import ADD, rows_of
 
 FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
@@ -119,6 +130,10 @@ class SumOperator(Pickled):
             if found is None
             else found.without(_felt(found.label, found.count, low, weighted=found.left is not None or found.right is not None))
         )
+
+    def storage_rounding(self) -> float:
+        """Return the larger one of the terms' relative roundings."""
+        return max((A.storage_rounding() for A in (self.first, self.second) if has(A, StoresRounded)), default=0.0)
 
     def masked(self, free: Any, shift: Any = None) -> SumOperator:
         """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift); of terms that have that."""

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from warp_lcp.rows.fields import PaddedLayout
 
 AIR, FLUID, SOLID = 0, 1, 2  # types of a grid's cells
+FLOAT32_ROUNDING = 2.0**-24  # the largest relative one of a number that float32 holds
 Capability = TypeVar("Capability", bound="Operator")
 
 
@@ -182,6 +183,13 @@ class NamesComponents(Operator, Protocol):
         """
 
 
+class StoresRounded(Operator, Protocol):
+    """Entries that may be rounded where they are stored: a tolerance below that is the stored A's alone, and the status FLOOR."""
+
+    def storage_rounding(self) -> float:
+        """Return the largest relative rounding of what A is made of, as it was given in float64, and of the diagonal; 0: none."""
+
+
 class HasCoefficients(Operator, Protocol):
     """What A is made of, and how a scalar depends on it: for `wl.vjp`."""
 
@@ -210,6 +218,7 @@ CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {  # what to c
     AppliesPlus: ("sums with products", ("sparse", "grid")),
     HasScale: ("a scale", ("dense", "sparse")),
     NamesComponents: ("components", ("grid",)),
+    StoresRounded: ("the rounding of storage", ("dense", "sparse", "grid")),
     HasCoefficients: ("coefficients", ("dense", "sparse", "grid")),
 }
 
@@ -230,6 +239,11 @@ def has(A: object, capability: type[Capability]) -> TypeGuard[Capability]:
 def version_of(A: Operator) -> int | None:
     """Return the version of an operator, None of one that does not say when it changes."""
     return A.version if has(A, Versioned) else None
+
+
+def asks_beyond_storage(A: Any, share: float) -> bool:
+    """Return whether a relative tolerance is below the rounding that storage in float32 makes of A's entries."""
+    return share < FLOAT32_ROUNDING and has(A, StoresRounded) and share < A.storage_rounding()
 
 
 def layout_of(A: Operator) -> Layout:

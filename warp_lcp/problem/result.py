@@ -23,7 +23,10 @@ class SolveStatus(Enum):
     TIME_LIMIT = "`max_seconds` came first: raise it, start from this x, or take a faster method, that of wl.solve(problem) or wl.recommend"
     STOPPED = "the callback raised StopIteration: go on from this x"
     STAGNATED = "no smaller residual in the last `patience` steps: take another method or precision='double'"
-    FLOOR = "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'"
+    FLOOR = (
+        "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'; "
+        "where A is stored in float32 and its entries are rounded, an rtol below 1e-7 needs dtype=wp.float64"
+    )
     LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start elsewhere or take another method"
     NON_DESCENT = "no step reduces the merit function: take another method, for example ProjectedSOR"
     DIVERGED = "the residual grew beyond `divergence` times the first one: the method's assumptions on A do not hold"

@@ -16,7 +16,7 @@ import warp as wp
 from warp_lcp.deadline import Deadline, TimeIsUp
 from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import NamesComponents, has, version_of
+from warp_lcp.problem.protocol import NamesComponents, asks_beyond_storage, has, version_of
 from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
@@ -289,7 +289,7 @@ class _Loop:
                 return self._iterate(None if wanted and not self.stopped else self._status(0, None))
         except TimeIsUp:  # within a step, of which nothing is left
             self._restore()
-            ended = SolveStatus.CONVERGED if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
+            ended = self._solved() if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
             return self._finish(ended, self.history[-1].iteration)
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
@@ -337,9 +337,16 @@ class _Loop:
             return self._floor_or(failure)
         idle = iteration - max(self.best_iteration, self.progress)
         status = self.stopping.status(norm, self.tolerance, first, iteration, idle, interim=interim)
+        if status is SolveStatus.CONVERGED:
+            return self._solved()
         if status is SolveStatus.STAGNATED or (status is SolveStatus.NON_FINITE and iteration > 0):
             return self._floor_or(status)
         return SolveStatus.TIME_LIMIT if status is None and self.deadline.left() <= 0 else status
+
+    def _solved(self) -> SolveStatus:
+        """Return CONVERGED, or FLOOR where the tolerance is below what storing A in float32 has changed."""
+        A, share = getattr(self.problem, "A", None), self.tolerance / max(self.reference, self.tolerance, SMALLEST)
+        return SolveStatus.FLOOR if asks_beyond_storage(A, share) else SolveStatus.CONVERGED
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
         """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it.
@@ -376,9 +383,8 @@ class _Loop:
             self._restore()
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0
-        version = version_of(self.problem.A) if isinstance(self.problem, LCP) else None
-        found = {"problem": self.problem, "version": version}
-        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history, **found)
+        of = {"problem": self.problem, "version": version_of(self.problem.A) if isinstance(self.problem, LCP) else None}
+        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history, **of)
 
     def _found(self) -> wp.array[Any]:
         """Return x as the result has it: in place."""

@@ -106,6 +106,16 @@ def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
         raise ValueError(f"{name}: {lost} are not 0, but {dtype.__name__} takes them for it: pass dtype=wp.float64")
 
 
+def relative_rounding(values: np.ndarray, dtype: Any) -> float:
+    """Return the largest relative error that storing values in a type makes, 0 where it holds all of them."""
+    if dtype is wp.float64 or values.dtype == wp.dtype_to_numpy(dtype):
+        return 0.0
+    with np.errstate(invalid="ignore"):  # 0 / 0, which fmax passes over
+        ratio = np.asarray(np.divide(values.astype(wp.dtype_to_numpy(dtype)), values, dtype=np.float64))
+    ratio -= 1.0
+    return float(np.fmax.reduce(np.abs(ratio, out=ratio), axis=None, initial=0.0))
+
+
 class Layout:
     """Fields stored as they are.
 

@@ -8,6 +8,7 @@ steps stand here too.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -38,7 +39,7 @@ from warp_lcp.solvers.dense_problem import equilibration, factored
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
 from warp_lcp.solvers.principal_system_guarded import GuardedSystem
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
-from warp_lcp.solvers.principal_system_sparse import SparseSystem
+from warp_lcp.solvers.principal_system_sparse import MatrixSystem, SparseSystem
 
 NUDGES = (0.0, 1e-12, 1e-9, 1e-6)  # shifts of a singular banded block, in units of the matrix's largest column sum
 HEADERS = Path(__file__).parent / "headers"
@@ -122,8 +123,8 @@ class GridSystem(GuardedSystem):
         # one CPU thread, no ghost cells to fill
         self.fused = self.hierarchy.open_cycle is not None and A.symmetric and A.stencil.ghosts is None
         self._iterate_by(self._krylov_method(), self._weight)
-        if not A.symmetric:
-            self._guard()
+        if not A.symmetric and A.stencil.ghosts is None:
+            self._guard(partial(MatrixSystem, A, shifted=shifted))
 
     def _krylov_method(self) -> Any:
         """Return what iterates: it has `solve`, and the solution in `x`."""
@@ -135,7 +136,7 @@ class GridSystem(GuardedSystem):
     def refresh(self) -> None:
         """Take the rows and the weights again if the operator has changed."""
         if self._version != self._A.version:
-            self._version, self._matrix = self._A.version, None
+            self._version, self._substitute = self._A.version, None
             self.hierarchy.refresh()
             if isinstance(self._krylov, GridConjugateGradient):
                 self._krylov.clear()
@@ -183,13 +184,14 @@ class LineSystem(GuardedSystem):
         self._weight = zeros_like(self.r) if shifted else None
         method = ConjugateGradient if A.symmetric else GMRES
         self._iterate_by(method(finest.stencil.product, self, weight=self._weight), self._weight)
-        self._guard()
+        if A.stencil.ghosts is None:  # else other processes have parts of the grid
+            self._guard(partial(MatrixSystem, A, shifted=shifted))
         self._version = A.version
 
     def refresh(self) -> None:
         """Try cycles over lines again if the operator has changed; `restrict` takes A's entries."""
         if self._version != self._A.version:
-            self._version, self._matrix = self._A.version, None
+            self._version, self._substitute = self._A.version, None
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take another free set and shift, and coarsen."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
 
@@ -17,15 +18,21 @@ from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.aggregates import suits_multigrid
 from warp_lcp.multigrid.algebraic import AlgebraicHierarchy
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
+from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.protocol import FLUID, HasStencil
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch
+from warp_lcp.solvers.principal_system_guarded import GuardedSystem
 
 # symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
 FAR_FROM_M = partial(AlgebraicSettings, strength=0.08, interval=(0.05, 1.0))
 DROP, FILL = 1e-4, 10.0  # share of a column below which entries of the factors go, and the most of them in units of A's
 NUDGE, GOLDEN = 1e-14, (math.sqrt(5) - 1) / 2  # share of a row's largest entry; its multiples modulo 1 are all different
 DIRECT = 2000  # unknowns up to which factors are complete: that costs less than the iterations it saves
+# unknowns of a grid up to which factors are complete where cycles fail: a second or two
+FACTORED_IN_PLANE, FACTORED_IN_SPACE = 1 << 17, 1 << 14
+RAISED = 1e-13  # share by which diagonals are raised then
 
 
 class SparsePreconditioner(Preconditioner, Protocol):
@@ -40,15 +47,29 @@ class SparsePreconditioner(Preconditioner, Protocol):
         """q = M p, on the device."""
 
 
-class SparseSystem(KrylovSystem):
+class SparseSystem(GuardedSystem):
     """(P A P + P D P) e = r with a sparse A.
 
     Symmetric matrices whose diagonal is not negative take conjugate gradients with algebraic multigrid, which falls back on sweeps where
     nothing aggregates. Others take GMRES: with algebraic multigrid if most rows are diagonally dominant and nearly all off-diagonal
     entries negative (convection-diffusion), else with incomplete factors that SciPy makes anew and applies, on the host for any device.
+    On directed cycles, I - S with S nearly a permutation, multigrid fails, and factors take over.
+
+    Args:
+        A: the matrix.
+        real: type of the corrections.
+        shifted: as of `PrincipalSystem`.
+        settings: of the hierarchy.
+        substitute: makes what takes over where the hierarchy fails; None: factors, if A is not symmetric.
+
+    Attributes:
+        cycled: whether the preconditioner is algebraic multigrid: A is symmetric, or nearly an M-matrix.
     """
 
-    def __init__(self, A: SparseOperator, real: Any, *, shifted: bool = False, settings: AlgebraicSettings | None = None) -> None:
+    def __init__(
+        self, A: SparseOperator, real: Any, *, shifted: bool = False, settings: AlgebraicSettings | None = None,
+        substitute: Callable[[], FactoredSystem] | None = None,
+    ) -> None:  # fmt: skip
         host = A.matrix()
         self._A, self._version, self._symmetric = A, A.version, A.symmetric
         positive = bool((host.diagonal() >= 0).all())
@@ -63,6 +84,11 @@ class SparseSystem(KrylovSystem):
         method = ConjugateGradient if A.symmetric and positive else GMRES
         self.r = M.r
         self._iterate_by(method(M.product, M, weight=weight), weight)
+        if substitute is None and not A.symmetric:
+            substitute = partial(FactoredSystem.of, A, weighted=shifted)
+        self.cycled = isinstance(M, AlgebraicHierarchy)
+        if substitute is not None and self.cycled:
+            self._guard(substitute)
 
     def refresh(self) -> None:
         """Choose again where an update of A has changed whether it is symmetric; `restrict` takes the entries.
@@ -71,13 +97,15 @@ class SparseSystem(KrylovSystem):
             ValueError: A was symmetric and is not any more: this system's fields serve conjugate gradients.
         """
         if self._version != self._A.version:
-            self._version = self._A.version
+            self._version, self._substitute = self._A.version, None
             if self._symmetric and not self._A.symmetric:
                 raise ValueError("A was updated from a symmetric to an unsymmetric matrix: make a new workspace")
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take another free set and shift, and compute the preconditioner anew."""
-        self.preconditioner.restrict(free, shift)
+        if self._substitute is None:
+            self.preconditioner.restrict(free, shift)
+        self._note(free, shift)
 
 
 class IncompleteFactors:
@@ -147,3 +175,74 @@ def nudged(block: Any, share: float, *, small: float = 0.0) -> Any:
     largest = np.where(largest > 0, largest, 1.0)
     shares = np.where(np.abs(diagonal) <= small * largest, max(share, small), share) * (1 + np.arange(len(off)) * GOLDEN % 1)
     return (block + scipy.sparse.diags_array(np.where(diagonal < 0, -1.0, 1.0) * shares * largest)).tocsc()
+
+
+class CompleteFactors(IncompleteFactors):
+    """Complete factors of matrices that others fail on; of slightly raised diagonals, for a component may be singular."""
+
+    def _factor(self, block: Any) -> Any:
+        try:
+            return scipy.sparse.linalg.splu((block + RAISED * scipy.sparse.diags_array(np.abs(block.diagonal()))).tocsc()).solve
+        except RuntimeError:
+            return super()._factor(block)
+
+
+class FactoredSystem(KrylovSystem):
+    """GMRES in double precision, preconditioned by factors.
+
+    Args:
+        factors: of the free block.
+        weighted: whether residuals are measured in units of the shifted diagonal.
+    """
+
+    def __init__(self, factors: IncompleteFactors, *, weighted: bool) -> None:
+        self._factors, self.r, weight = factors, factors.r, factors.weight if weighted else None
+        self._iterate_by(GMRES(factors.product, factors, weight=weight), weight)
+
+    @staticmethod
+    def of(A: SparseOperator, *, weighted: bool, complete: int = 0) -> FactoredSystem:
+        """Return the system of a matrix, with complete factors of no more than so many unknowns."""
+        kind = CompleteFactors if A.unknowns <= complete else IncompleteFactors
+        return FactoredSystem(kind(A, wp.float64), weighted=weighted)
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
+        """Take another free set and shift, and factor."""
+        self._factors.restrict(free, shift)
+
+    def solve_for(self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Solve for e, a field like r of any precision."""
+        self.r.assign(r.numpy().astype(np.float64))
+        iterations, norm = self.solve(tolerance, max_iterations)
+        e.assign(self.e.numpy().astype(wp.dtype_to_numpy(e.dtype)))
+        return iterations, norm
+
+
+class MatrixSystem:
+    """The systems of a grid operator's matrix, in double precision: by algebraic multigrid, then by factors.
+
+    Args:
+        A: the operator.
+        shifted: as of `PrincipalSystem`.
+    """
+
+    def __init__(self, A: HasStencil, *, shifted: bool) -> None:
+        self._rows = np.flatnonzero(A.cells.numpy().ravel() == FLUID)
+        most = FACTORED_IN_SPACE if A.stencil.padding.counts[0] > 1 else FACTORED_IN_PLANE
+        self._operator = SparseOperator(grid_matrix(A), device=A.device, dtype=wp.float64)
+        factored = partial(FactoredSystem.of, self._operator, weighted=shifted, complete=most)
+        self._system = SparseSystem(self._operator, wp.float64, shifted=shifted, substitute=factored)
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None) -> None:
+        """Take another free set and shift, stored fields of the grid."""
+        device = self._operator.device
+        of_rows = None if shift is None else wp.array(shift.numpy()[self._rows], dtype=wp.float64, device=device)
+        self._system.restrict(wp.array(free.numpy()[self._rows], dtype=wp.uint8, device=device), of_rows)
+
+    def solve_for(self, r: wp.array[Any], e: wp.array[Any], tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Solve for e; fields of the grid."""
+        self._system.r.assign(r.numpy()[self._rows].astype(np.float64))
+        iterations, norm = self._system.solve(tolerance, max_iterations)
+        stored = np.zeros(e.size, dtype=wp.dtype_to_numpy(e.dtype))
+        stored[self._rows] = self._system.e.numpy()
+        e.assign(stored)
+        return iterations, norm
