@@ -184,7 +184,8 @@ class GridOperator(Pickled):
         """Return the operator of the same cells, its stored coefficients in float64; None where there is nothing to add up."""
         kind = wp.float64
         given = {
-            name: wp.array(v.numpy(), dtype=kind, device=self.device) if isinstance(v, wp.array) else v for name, v in self._arguments().items()
+            name: wp.array(v.numpy(), dtype=kind, device=self.device) if isinstance(v, wp.array) else v
+            for name, v in self._arguments().items()
         }
         cells = self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape)
         return type(self)(cells, periodic=self._wraps, device=self.device, dtype=kind, **given)

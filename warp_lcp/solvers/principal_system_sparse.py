@@ -131,7 +131,8 @@ class IncompleteFactors:
         mask = scipy.sparse.diags_array((free.numpy() != 0).astype(np.float64))
         self._M = (mask @ matrix @ mask).tocsr()
         diagonal = np.abs(self._M.diagonal())
-        self.weight.assign(np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0))
+        with np.errstate(over="ignore"):  # of a tiny entry in float32: the method sees that its iterate is not finite
+            self.weight.assign(np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0))
         self._solve = self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
