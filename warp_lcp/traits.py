@@ -91,8 +91,14 @@ class Traits:
 
     @cached_property
     def curved(self) -> bool:
-        """Return whether a matrix has a negative diagonal entry where a bound is infinite."""
+        """Return whether a matrix's diagonal entries are negative where a bound is infinite, none is positive there."""
         return self.kind in ("dense", "sparse") and self.diagonal == "negative" and has_negative_curvature(self._problem)
+
+    @cached_property
+    def unbounded(self) -> bool:
+        """Return whether a bound is infinite where a diagonal entry is negative."""
+        below = self._entries_on_diagonal < 0
+        return any(np.isinf(side.numpy()[self._known][below]).any() for side in (self._problem.lower, self._problem.upper))
 
     @cached_property
     def definiteness(self) -> str:

@@ -7,6 +7,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 import warp_lcp as wl
+from oracle import natural_residual
 from warp_lcp.problem.curvature import has_negative_curvature
 
 CURVED, INFEASIBLE = wl.SolveStatus.NEGATIVE_CURVATURE, wl.SolveStatus.INFEASIBLE
@@ -90,6 +91,23 @@ def test_finite_bounds_allow_any_sign():
     assert not has_negative_curvature(wl.LCP(-A, np.ones(A.shape[0]), 0.0, 1.0))
     upper = np.full(A.shape[0], np.inf)
     assert has_negative_curvature(wl.LCP(-A, np.ones(A.shape[0]), 0.0, upper))
+
+
+def test_some_negative_entries_are_no_wrong_sign():
+    """Convection makes some, as in a step of Newton's method for ice: such problems have solutions, which the default finds."""
+    rng = np.random.default_rng(6281)
+    for form in (np.asarray, scipy.sparse.csr_array):
+        A = drawn(6262)
+        A = A.toarray() if scipy.sparse.issparse(A) else A
+        n = A.shape[0]
+        A[n // 2, n // 2] *= -0.01
+        x, y = rng.random(n) * (np.arange(n) % 2), rng.random(n) * ((np.arange(n) + 1) % 2)
+        problem = wl.LCP(form(A), y - A @ x)
+        assert not has_negative_curvature(problem)
+        result = wl.solve(problem)
+        assert result
+        assert natural_residual(A, y - A @ x, 0.0, np.inf, result.x.numpy()) <= 1e-6 * np.linalg.norm(y - A @ x)
+        assert has_negative_curvature(wl.LCP(form(-np.abs(np.diag(A)) * np.eye(n)), y))
 
 
 def test_a_start_that_solves_stays_a_solution():

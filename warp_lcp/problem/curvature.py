@@ -14,7 +14,8 @@ NEGATIVE = 1e-8  # of ||z|| ||A z||: z'Az below minus this is no rounding of pro
 def has_negative_curvature(problem: LCP) -> bool:
     """Return whether A is surely neither positive semi-definite nor a P-matrix on the unknowns F that have an infinite bound.
 
-    A_ii < 0 shows that, for i in F. Of an operator without rows one product A z tells, z pointing away from the bounds of F: z'Az < 0 if
+    A_ii < 0 shows that, for i in F; it counts where no A_ii > 0, for Newton's method solves with some negative entries, as convection
+    makes them. Of an operator without rows one product A z tells, z pointing away from the bounds of F: z'Az < 0 if
     A is symmetric, of a random z; else z_i (A z)_i < 0 for all i in F, of a z of ones and minus ones (a P-matrix reverses the sign of no
     vector). A flipped sign shows itself so: -A of a positive definite or a diagonally dominant A.
     """
@@ -26,7 +27,8 @@ def has_negative_curvature(problem: LCP) -> bool:
     if not free.any():
         return False
     if has(A, HasRows):
-        return bool((A.diagonal().numpy().ravel()[free] < 0).any())
+        entries = A.diagonal().numpy().ravel()[free]
+        return bool((entries < 0).any() and (entries <= 0).all())
     away = np.where(np.isinf(upper), 1.0, -1.0)
     sizes = np.random.default_rng(19620701).uniform(0.5, 1.5, len(free)) if A.symmetric else 1.0
     z = np.where(free, sizes * away, 0.0)
