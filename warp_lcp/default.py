@@ -9,8 +9,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Never
 
+import scipy.sparse
 import warp as wp
 
+from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.matrix_stencil import stencil_of
 from warp_lcp.operators.renumbering import Renumbering
 from warp_lcp.operators.sparse import SparseOperator
@@ -28,6 +30,7 @@ from warp_lcp.solvers.mprgp import MPRGP
 LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
 ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
 LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
+PATIENT = StoppingCriteria(max_iterations=1000, patience=300)  # of bodies of mass ratios to 1e7, whose residual rises and falls
 RESERVED, FEW = 4, 40  # one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps on
 ENDED = (
     SolveStatus.CONVERGED,
@@ -126,6 +129,11 @@ def _try_alternatives(
     callback: Callable[[Record], None] | None, begun: float,
 ) -> None:  # fmt: skip
     """Solve by alternatives until one succeeds or a limit has come."""
+    if _tries_again(problem, advice, stopping):
+        criteria = _left(stopping or replace(PATIENT, rtol=advice.stopping.rtol), begun, [] if stopping is None else results)
+        attempt = partial(_solve_as_sparse, problem, advice.method)
+        if criteria.max_iterations > 0 and _try(results, advice.name, attempt, criteria, x0, callback, begun):
+            return
     for name in advice.alternatives if not isinstance(stopping, MeanCriteria) else ():
         criteria = _left(stopping or StoppingCriteria(max_iterations=steps_allowed(name)), begun, [] if stopping is None else results)
         if criteria.max_iterations == 0:
@@ -136,6 +144,17 @@ def _try_alternatives(
                 return
         except ValueError:  # a method that refuses this A
             continue
+
+
+def _tries_again(problem: LCP, advice: Recommendation, stopping: StoppingCriteria | MeanCriteria | None) -> bool:
+    """Return whether contacts with friction get inexact steps after exact ones, or more steps of those.
+
+    Free blocks of contacts are singular, and heavy bodies on light ones leave eigenvalues of 1 over the ratio of masses: on a free set that is
+    not the solution's, the exact step of a dense matrix is as much too long, where conjugate gradients stop early.
+    """
+    if advice.name != "subspace-minimization" or not advice.traits.affine:
+        return False
+    return isinstance(problem.A, DenseOperator) or (stopping is None and isinstance(problem.A, SparseOperator))
 
 
 def _try(
@@ -205,6 +224,18 @@ def _solve_as_grid(
     start = None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy().reshape(grid.A.shape)
     result = solve_by(grid, method, stopping=stopping, x0=start, callback=callback)
     return replace(result, x=result.x.flatten(), grid=grid.A.shape, problem=problem, version=version_of(problem.A))
+
+
+def _solve_as_sparse(
+    problem: LCP, method: Solver, stopping: StoppingCriteria | MeanCriteria, x0: Array | None, callback: Callable[[Record], None] | None,
+) -> SolveResult:  # fmt: skip
+    """Solve a dense problem with bounds that are affine in x on its sparse matrix; others as they are."""
+    A = problem.A
+    if not isinstance(A, DenseOperator) or problem.bounds.affine is None:
+        return solve_by(problem, method, stopping=stopping, x0=x0, callback=callback)
+    sparse = SparseOperator(scipy.sparse.csr_array(A.matrix.numpy()), device=A.device, dtype=A.dtype)
+    result = solve_by(LCP(sparse, problem.b.numpy(), *problem.bounds.affine.sides), method, stopping=stopping, x0=x0, callback=callback)
+    return replace(result, problem=problem, version=version_of(A))
 
 
 def _solve_in_order(
