@@ -42,6 +42,7 @@ ENDED = (
 )
 
 Attempt = Callable[[StoppingCriteria | MeanCriteria, Array | None, Callable[[Record], None] | None], SolveResult]
+Run = Callable[[LCP, Solver, StoppingCriteria | MeanCriteria, Array | None, Callable[[Record], None] | None], SolveResult]
 
 
 def default_method(problem: LCP) -> Solver:
@@ -115,30 +116,37 @@ def _solve_by_choice(
     return _best(results)
 
 
-def solve_by_alternatives(problem: LCP, first: SolveResult, stopping: StoppingCriteria, x0: Array | None) -> SolveResult:
-    """Return the result of the recommended method, or of its alternatives where it has failed."""
+def solve_by_alternatives(
+    problem: LCP, first: SolveResult, stopping: StoppingCriteria, x0: Array | None, run: Run, callback: Callable[[Record], None]
+) -> SolveResult:
+    """Return the result of the recommended method, or of its alternatives, by `run`, where it has failed."""
     if first.status in ENDED:
         return first
     begun, results = time.perf_counter() - first.history[-1].seconds, [first]
-    _try_alternatives(problem, recommend(problem, accuracy=_accuracy(stopping)), results, stopping, x0, None, begun)
+    _try_alternatives(problem, recommend(problem, accuracy=_accuracy(stopping)), results, stopping, x0, callback, begun, run)
     return _best(results)
 
 
 def _try_alternatives(
     problem: LCP, advice: Recommendation, results: list[SolveResult], stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None,
-    callback: Callable[[Record], None] | None, begun: float,
+    callback: Callable[[Record], None] | None, begun: float, run: Run | None = None,
 ) -> None:  # fmt: skip
     """Solve by alternatives until one succeeds or a limit has come."""
+    run = run or _solve_in_order
     if _tries_again(problem, advice, stopping):
         criteria = _left(stopping or replace(PATIENT, rtol=advice.stopping.rtol), begun, [] if stopping is None else results)
-        attempt = partial(_solve_as_sparse, problem, advice.method)
+        attempt = partial(_solve_as_sparse, run, problem, advice.method)
         if criteria.max_iterations > 0 and _try(results, advice.name, attempt, criteria, x0, callback, begun):
             return
     for name in advice.alternatives if not isinstance(stopping, MeanCriteria) else ():
-        criteria = _left(stopping or StoppingCriteria(max_iterations=steps_allowed(name)), begun, [] if stopping is None else results)
+        criteria = _left(
+            stopping or StoppingCriteria(max_iterations=steps_allowed(name, advice.traits.unknowns)),
+            begun,
+            [] if stopping is None else results,
+        )
         if criteria.max_iterations == 0:
             return
-        attempt = partial(_solve_in_order, problem, method_for(name, advice.traits))
+        attempt = partial(run, problem, method_for(name, advice.traits))
         try:
             if _try(results, name, attempt, criteria, x0, callback, begun):
                 return
@@ -149,8 +157,8 @@ def _try_alternatives(
 def _tries_again(problem: LCP, advice: Recommendation, stopping: StoppingCriteria | MeanCriteria | None) -> bool:
     """Return whether contacts with friction get inexact steps after exact ones, or more steps of those.
 
-    Free blocks of contacts are singular, and heavy bodies on light ones leave eigenvalues of 1 over the ratio of masses: on a free set that is
-    not the solution's, the exact step of a dense matrix is as much too long, where conjugate gradients stop early.
+    Free blocks of contacts are singular, and heavy bodies on light ones leave eigenvalues of 1 over the ratio of masses: on a free set
+    that is not the solution's, the exact step of a dense matrix is as much too long, where conjugate gradients stop early.
     """
     if advice.name != "subspace-minimization" or not advice.traits.affine:
         return False
@@ -227,14 +235,15 @@ def _solve_as_grid(
 
 
 def _solve_as_sparse(
-    problem: LCP, method: Solver, stopping: StoppingCriteria | MeanCriteria, x0: Array | None, callback: Callable[[Record], None] | None,
+    run: Run, problem: LCP, method: Solver, stopping: StoppingCriteria | MeanCriteria, x0: Array | None,
+    callback: Callable[[Record], None] | None,
 ) -> SolveResult:  # fmt: skip
     """Solve a dense problem with bounds that are affine in x on its sparse matrix; others as they are."""
     A = problem.A
     if not isinstance(A, DenseOperator) or problem.bounds.affine is None:
-        return solve_by(problem, method, stopping=stopping, x0=x0, callback=callback)
+        return run(problem, method, stopping, x0, callback)
     sparse = SparseOperator(scipy.sparse.csr_array(A.matrix.numpy()), device=A.device, dtype=A.dtype)
-    result = solve_by(LCP(sparse, problem.b.numpy(), *problem.bounds.affine.sides), method, stopping=stopping, x0=x0, callback=callback)
+    result = run(LCP(sparse, problem.b.numpy(), *problem.bounds.affine.sides), method, stopping, x0, callback)
     return replace(result, problem=problem, version=version_of(A))
 
 

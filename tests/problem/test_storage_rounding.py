@@ -42,7 +42,7 @@ def stencil(rng, kind, dtype):
     for (j, i), values in around.items():
         rows = np.argwhere(np.ones((n, m)))
         for row in rows:
-            there = row + (j, i)
+            there = row + np.array([j, i])
             if ((there >= 0) & (there < (n, m))).all():
                 matrix[row[0] * m + row[1], there[0] * m + there[1]] = values[tuple(row)]
     A = wl.Stencil(np.full((n, m), wl.FLUID), {(0, 0): center, **around}, outside=wl.AIR, device="cpu", dtype=dtype)
