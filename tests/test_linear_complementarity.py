@@ -269,3 +269,39 @@ A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
 def test_what_is_refused(arguments, options, message):
     with pytest.raises(ValueError, match=message):
         wl.linear_complementarity(*arguments, **options)
+
+
+def test_callbacks_see_the_iterates_of_alternatives_and_stop_them():
+    """Lemke's method follows sweeps, which go round in a circle here: each step's x has the residual that is told with it."""
+    A, b, lower, upper = next(drawn for drawn in map(circling, range(100)) if drawn is not None)
+    seen = []
+
+    def see(intermediate_result):
+        seen.append(intermediate_result)
+
+    found = wl.linear_complementarity(A, b, bounds=(lower, upper), callback=see)
+    assert found.success
+    assert found.result.method != "psor"
+    names = [record.step for record in found.result.history]
+    assert any(name == f"start of {found.result.method}" for name in names)
+    told = [record for record in found.result.history if not record.step.startswith("start")]
+    assert [(one.nit, one.residual) for one in seen] == [(record.iteration, record.residual) for record in told]
+    np.testing.assert_array_equal(seen[-1].x, found.x)
+    first = names.index(f"start of {found.result.method}")
+    after = told[first - 1].iteration + 1  # within the alternative
+
+    def stop(intermediate_result):
+        if intermediate_result.nit == after:
+            raise StopIteration
+
+    stopped = wl.linear_complementarity(A, b, bounds=(lower, upper), callback=stop)
+    assert (stopped.status, stopped.nit) == (99, after)
+
+
+def circling(seed):
+    """A matrix with a negative diagonal in a box on which sweeps do not converge, None if they do."""
+    rng = np.random.default_rng([seed, 223])
+    S = rng.standard_normal((12, 12))
+    A, b, lower = -np.eye(12) - 3 * (S - S.T), rng.standard_normal(12), -rng.random(12)
+    upper = lower + 1
+    return None if wl.solve(wl.LCP(A, b, lower, upper), wl.ProjectedSOR()) else (A, b, lower, upper)

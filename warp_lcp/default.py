@@ -9,8 +9,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Never
 
+import scipy.sparse
 import warp as wp
 
+from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.matrix_stencil import stencil_of
 from warp_lcp.operators.renumbering import Renumbering
 from warp_lcp.operators.sparse import SparseOperator
@@ -28,6 +30,7 @@ from warp_lcp.solvers.mprgp import MPRGP
 LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
 ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
 LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
+PATIENT = StoppingCriteria(max_iterations=1000, patience=300)  # of bodies of mass ratios to 1e7, whose residual rises and falls
 RESERVED, FEW = 4, 40  # one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps on
 ENDED = (
     SolveStatus.CONVERGED,
@@ -39,6 +42,7 @@ ENDED = (
 )
 
 Attempt = Callable[[StoppingCriteria | MeanCriteria, Array | None, Callable[[Record], None] | None], SolveResult]
+Run = Callable[[LCP, Solver, StoppingCriteria | MeanCriteria, Array | None, Callable[[Record], None] | None], SolveResult]
 
 
 def default_method(problem: LCP) -> Solver:
@@ -113,30 +117,53 @@ def _solve_by_choice(
     return _best(results)
 
 
-def solve_by_alternatives(problem: LCP, first: SolveResult, stopping: StoppingCriteria, x0: Array | None) -> SolveResult:
-    """Return the result of the recommended method, or of its alternatives where it has failed."""
+def solve_by_alternatives(
+    problem: LCP, first: SolveResult, stopping: StoppingCriteria, x0: Array | None, run: Run, callback: Callable[[Record], None]
+) -> SolveResult:
+    """Return the result of the recommended method, or of its alternatives, by `run`, where it has failed."""
     if first.status in ENDED:
         return first
     begun, results = time.perf_counter() - first.history[-1].seconds, [first]
-    _try_alternatives(problem, recommend(problem, accuracy=_accuracy(stopping)), results, stopping, x0, None, begun)
+    _try_alternatives(problem, recommend(problem, accuracy=_accuracy(stopping)), results, stopping, x0, callback, begun, run)
     return _best(results)
 
 
 def _try_alternatives(
     problem: LCP, advice: Recommendation, results: list[SolveResult], stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None,
-    callback: Callable[[Record], None] | None, begun: float,
+    callback: Callable[[Record], None] | None, begun: float, run: Run | None = None,
 ) -> None:  # fmt: skip
     """Solve by alternatives until one succeeds or a limit has come."""
+    run = run or _solve_in_order
+    if _tries_again(problem, advice, stopping):
+        criteria = _left(stopping or replace(PATIENT, rtol=advice.stopping.rtol), begun, [] if stopping is None else results)
+        attempt = partial(_solve_as_sparse, run, problem, advice.method)
+        if criteria.max_iterations > 0 and _try(results, advice.name, attempt, criteria, x0, callback, begun):
+            return
     for name in advice.alternatives if not isinstance(stopping, MeanCriteria) else ():
-        criteria = _left(stopping or StoppingCriteria(max_iterations=steps_allowed(name)), begun, [] if stopping is None else results)
+        criteria = _left(
+            stopping or StoppingCriteria(max_iterations=steps_allowed(name, advice.traits.unknowns)),
+            begun,
+            [] if stopping is None else results,
+        )
         if criteria.max_iterations == 0:
             return
-        attempt = partial(_solve_in_order, problem, method_for(name, advice.traits))
+        attempt = partial(run, problem, method_for(name, advice.traits))
         try:
             if _try(results, name, attempt, criteria, x0, callback, begun):
                 return
         except ValueError:  # a method that refuses this A
             continue
+
+
+def _tries_again(problem: LCP, advice: Recommendation, stopping: StoppingCriteria | MeanCriteria | None) -> bool:
+    """Return whether contacts with friction get inexact steps after exact ones, or more steps of those.
+
+    Free blocks of contacts are singular, and heavy bodies on light ones leave eigenvalues of 1 over the ratio of masses: on a free set
+    that is not the solution's, the exact step of a dense matrix is as much too long, where conjugate gradients stop early.
+    """
+    if advice.name != "subspace-minimization" or not advice.traits.affine:
+        return False
+    return isinstance(problem.A, DenseOperator) or (stopping is None and isinstance(problem.A, SparseOperator))
 
 
 def _try(
@@ -206,6 +233,19 @@ def _solve_as_grid(
     start = None if x0 is None else problem.layout.load(x0, wp.float64, "x0").numpy().reshape(grid.A.shape)
     result = solve_by(grid, method, stopping=stopping, x0=start, callback=callback)
     return replace(result, x=result.x.flatten(), grid=grid.A.shape, problem=problem, version=version_of(problem.A))
+
+
+def _solve_as_sparse(
+    run: Run, problem: LCP, method: Solver, stopping: StoppingCriteria | MeanCriteria, x0: Array | None,
+    callback: Callable[[Record], None] | None,
+) -> SolveResult:  # fmt: skip
+    """Solve a dense problem with bounds that are affine in x on its sparse matrix; others as they are."""
+    A = problem.A
+    if not isinstance(A, DenseOperator) or problem.bounds.affine is None:
+        return run(problem, method, stopping, x0, callback)
+    sparse = SparseOperator(scipy.sparse.csr_array(A.matrix.numpy()), device=A.device, dtype=A.dtype)
+    result = run(LCP(sparse, problem.b.numpy(), *problem.bounds.affine.sides), method, stopping, x0, callback)
+    return replace(result, problem=problem, version=version_of(A))
 
 
 def _solve_in_order(

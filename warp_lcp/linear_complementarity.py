@@ -13,8 +13,8 @@ from warp_lcp.default import default_method, solve, solve_by_alternatives
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.result import Record, SolveStatus
-from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.result import Record, SolveResult, SolveStatus
+from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
@@ -66,7 +66,7 @@ def linear_complementarity(
             alternatives where it fails. (Names are for this function and the command line alone.)
         maxiter: the most iterations of the method, >= 0.
         preconditioner: of `wl.LCP`.
-        callback: called after each iteration of the first method: `callback(intermediate_result)`, an
+        callback: called after each iteration, of alternatives too: `callback(intermediate_result)`, an
             OptimizeResult with x, nit and residual, if that is what its parameter is called, else
             `callback(x)`. Where it raises StopIteration the best x so far is returned, with status 99.
 
@@ -98,21 +98,25 @@ def linear_complementarity(
     problem = LCP(operator, fields.load(b, "b"), lower, upper, preconditioner=preconditioner)
     solver = default_method(problem) if method is None else _method(method)
     stopping = StoppingCriteria(rtol=rtol, atol=least, max_iterations=most, patience=max(30, most // 10))
-    work = solver.init(problem)
+    works = list[Workspace]()  # the last one has the iterate
 
     def told(record: Record) -> None:
-        if tell is not None and record.iteration > 0:
-            x = fields.unload(problem.layout.unload(work.x))
+        if tell is not None and not record.step.startswith("start"):
+            x = fields.unload(problem.layout.unload(works[-1].x))
             tell(OptimizeResult(x=x, nit=record.iteration, residual=record.residual))
 
+    def run(form: LCP, solver: Solver, stopping: Any, x0: Any, callback: Any) -> SolveResult:
+        works.append(solver.init(form))
+        return solve(form, solver, stopping=stopping, x0=x0, workspace=works[-1], callback=callback)
+
     guess = None if x0 is None else fields.load(x0, "x0")
-    result = solve(problem, solver, stopping=stopping, x0=guess, workspace=work, callback=told)
+    result = run(problem, solver, stopping, guess, told)
     if method is None:
-        result = solve_by_alternatives(problem, result, stopping, guess)
+        result = solve_by_alternatives(problem, result, stopping, guess, run, told)
     message = f"{result.status.name}: {result.status.value}"
     for word, here in WORDS.items():
         message = message.replace(word, here)
-    slack, active = _sides(problem, work.residual, result.x)
+    slack, active = _sides(problem, works[0].residual, result.x)
     return OptimizeResult(
         x=fields.unload(result.x), success=bool(result), status=STATUSES[result.status], message=message, nit=result.iterations,
         residual=result.residual, relative_residual=result.relative_residual, slack=fields.unload(slack),

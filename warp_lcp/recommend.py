@@ -21,6 +21,7 @@ from warp_lcp.traits import TRIAL, Traits
 ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}
 FEW_SWEEPS = {"grid": 25, "sparse": 30}  # fewer are faster than a multigrid hierarchy's set-up and some cycles, or than systems
 PIVOTED = 1000  # unknowns up to which a method that fails is followed by Lemke's: it takes seconds there
+SURE, LONG_PATHS = 100, 2000  # unknowns up to which Lemke's paths may take so many steps: ten seconds
 LONGEST = 5000  # steps of a method that sweeps: a prediction may be too low
 # numbers of 8 bytes besides A that methods hold for an entry of a matrix and for an unknown, rounded up from measured workspaces
 FIELDS_ONLY, SYSTEMS = (0, 18), (4, 40)
@@ -194,7 +195,7 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     elif rule.method == "psor" and math.isfinite(t.sweeps):
         expected = f"about {math.ceil(t.sweeps)} sweeps, by the rate of the first {TRIAL}"
     reasons = (f"{rule.reason}.", f"The problem: {t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}.")
-    limit = steps_allowed(rule.method) if rule.steps is None else max(100, 10 * rule.steps)
+    limit = steps_allowed(rule.method, t.unknowns) if rule.steps is None else max(100, 10 * rule.steps)
     stopping = _criteria(rtol, limit)
     concave = t.kind in ("dense", "sparse") and t.symmetric and t.diagonal == "negative"  # a sign error mostly: pivots may prove it
     names = ("lemke",) if concave else rule.alternatives
@@ -202,8 +203,10 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     return Recommendation(rule.method, method_for(rule.method, t), stopping, reasons, expected, alternatives, t)
 
 
-def steps_allowed(name: str) -> int:
+def steps_allowed(name: str, unknowns: int) -> int:
     """Return a limit of steps of a method that nothing else is known of."""
+    if name == "lemke" and unknowns <= SURE:
+        return LONG_PATHS
     return LONGEST if name in SWEEPING else 100
 
 

@@ -61,7 +61,7 @@ def test_boundaries_of_contact_do_not_creep_on_large_grids(make):
 def test_obstacles_against_lemke(problem):
     dense = problem.dense()
     result = wl.solve(problem.lcp(), stopping=wl.StoppingCriteria(rtol=1e-10))
-    assert result, result.status
+    assert result.relative_residual <= 1e-10, result.status  # with the stored A; FLOOR where float32 has rounded that
     x, fluid = result.x.numpy(), problem.sparse()
     rows = np.flatnonzero(problem.A.cells.numpy()[1, 1:-1, 1:-1].ravel() == wl.FLUID)
     n, gap = len(dense.b), dense.upper - dense.lower

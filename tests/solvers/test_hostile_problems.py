@@ -159,7 +159,7 @@ def test_an_active_set_that_goes_round_in_a_circle():
     problem = box_around_a_disc()
     for cycles in (0, 1, 2):
         result = wl.solve(problem, wl.ProjectedMultigrid(monotone_cycles=cycles), stopping=wl.StoppingCriteria(rtol=1e-8))
-        assert result, result.status
+        assert result.relative_residual <= 1e-8, result.status  # FLOOR: the sums of these faces are rounded in float32
         assert result.iterations <= 25
     expected = wl.solve(problem, wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-8))
     np.testing.assert_allclose(result.x.numpy(), expected.x.numpy(), atol=1e-6)

@@ -197,3 +197,32 @@ def test_units_do_not_matter(method, size, load):
     result = solve(A, b, solver=method())
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), x, rtol=1e-5, atol=1e-9 * x.max())
+
+
+def flipped(seed):
+    """-M of a definite matrix plus a skew one, in a box: a solution is sure to exist, and Lemke's usual covering vectors end in rays."""
+    rng = np.random.default_rng([seed, 222])
+    n = int(np.exp(rng.uniform(np.log(2), np.log(24))))
+    B, S = rng.standard_normal((n, n)), rng.standard_normal((n, n))
+    A = -(B @ B.T / n + 10 ** rng.uniform(-3, 0) * np.eye(n) + (S - S.T) * 10 ** rng.uniform(-2, 1))
+    lower = -(10 ** rng.uniform(-2, 2)) * rng.random(n)
+    return A, rng.standard_normal(n) * 10 ** rng.uniform(-1, 1), lower, lower + 10 ** rng.uniform(-2, 2) * rng.random(n) + 1e-3
+
+
+def test_finite_bounds_end_every_path_in_a_solution():
+    """A fifth of these ended STAGNATED, on rays of four covering vectors."""
+    for seed in range(40):
+        A, b, lower, upper = flipped(seed)
+        result = solve(A, b, lower, upper)
+        assert result, (seed, result.status)
+        x = result.x.numpy()
+        at = natural_residual(A, b, lower, upper, np.clip(0.0, lower, upper))
+        assert ((lower <= x) & (x <= upper)).all(), seed
+        assert np.linalg.norm(natural_residual(A, b, lower, upper, x)) <= 1e-8 * np.linalg.norm(at), seed
+
+
+def test_the_default_solves_flipped_matrices_in_boxes():
+    for seed in range(40, 60):
+        A, b, lower, upper = flipped(seed)
+        result = wl.solve(wl.LCP(A, b, lower, upper))
+        assert result, (seed, result.status)

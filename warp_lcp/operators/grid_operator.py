@@ -182,13 +182,10 @@ class GridOperator(Pickled):
 
     def _in_float64(self) -> Self | None:
         """Return the operator of the same cells, its stored coefficients in float64; None where there is nothing to add up."""
-        kind = wp.float64
-        given = {
-            name: wp.array(v.numpy(), dtype=kind, device=self.device) if isinstance(v, wp.array) else v
-            for name, v in self._arguments().items()
-        }
+        kind, device, given = wp.float64, self.device, self._arguments()
+        given |= {name: wp.array(v.numpy(), dtype=kind, device=device) for name, v in given.items() if isinstance(v, wp.array)}
         cells = self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape)
-        return type(self)(cells, periodic=self._wraps, device=self.device, dtype=kind, **given)
+        return type(self)(cells, periodic=self._wraps, device=device, dtype=kind, **given)
 
     def masked(self, free: Any, shift: Any = None) -> Self:
         """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""

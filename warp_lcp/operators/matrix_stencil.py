@@ -123,6 +123,4 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
     if not centers and faces in range(1, 256):  # a byte a cell
         unit = float(middle[13]) / faces
         d = wp.array(np.where(d.numpy() != 0, faces, 0).astype(np.uint8), device=device)
-    made = StoredStencil(cells, d, weights, pattern, unit=unit, symmetric=A.symmetric, monotone=not positive, strength=strength)  # type: ignore[arg-type]
-    made._rounding = A.storage_rounding()
-    return made
+    return StoredStencil(cells, d, weights, pattern, unit=unit, symmetric=A.symmetric, monotone=not positive, strength=strength)  # type: ignore[arg-type]

@@ -39,12 +39,14 @@ class LemkeForm:
         q: shape (m,).
         base: x at z = 0, shape (n,).
         map: x = base + map z, shape (n, m).
+        pairs: how many rows are s = u - l - z, the last ones.
     """
 
     M: Any
     q: np.ndarray
     base: np.ndarray
     map: Any
+    pairs: int = 0
 
     @classmethod
     def of(cls, data: DenseProblem) -> LemkeForm:
@@ -86,7 +88,7 @@ class LemkeForm:
             M = np.block([[M, pick.T], [-pick, np.zeros((k, k))]])
             q = np.r_[q, (upper - lower)[sided][both]]
             columns = np.hstack([columns, np.zeros((n, k))])
-        return cls(M, q, base, columns)
+        return cls(M, q, base, columns, len(both))
 
     @classmethod
     def _of_one_sided(cls, data: DenseProblem) -> LemkeForm:
@@ -186,6 +188,10 @@ class Lemke(Settings):
     prove that no x meets the inequalities (`certifies`), which they do where A is positive semi-definite, else STAGNATED. On a bimatrix
     game, M = [[0, E], [F', 0]] with E, F > 0 and q < 0, where every such d ends in a ray, it begins as Lemke and Howson's method does.
 
+    Where all bounds are finite, there is a solution whatever A is, and after a ray d = 0 in the rows s = u - l - z leads to one: on another
+    ray (z', s', z0') those rows ask for z' = -s' = 0, so that w' = v' + d z0'; where w' > 0, z = 0, so that s = u - l and v' = 0, which
+    leaves w' = d z0', the start's ray alone.
+
     Bounds far beyond the sizes of A and b count as infinite at first, and as they are if that leads
     nowhere. Boxes add a pair of variables, equations are eliminated or, where their block is
     singular, split (see LemkeForm). x0 is not used. A pivot costs O(m^2), m <= 2n. A step is a
@@ -225,7 +231,7 @@ class Basis:
     Args:
         M: shape (m, m).
         q: shape (m,).
-        d: covering vector > 0, shape (m,).
+        d: covering vector >= 0, shape (m,), > 0 where q < 0.
     """
 
     def __init__(self, M: np.ndarray, q: np.ndarray, d: np.ndarray) -> None:
@@ -241,7 +247,7 @@ class Basis:
         self.M, self.q, self.d, self.m = M, q, d, m
         self.variables, self.values = np.arange(m), q.copy()
         # the lexicographic minimum of (q_i, e_i) / d_i leaves: of equal ratios the last, whose row has the later 1
-        ratios = q / d
+        ratios = np.divide(q, d, out=np.full(m, np.inf), where=d > 0)
         self.row = int(np.flatnonzero(ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])
         self.entering, self.ends = 2 * m, (2 * m, 2 * m)  # variables with which the path ends when they leave
 
@@ -460,7 +466,10 @@ class LemkeWorkspace(DenseWorkspace):
         """Try another covering vector, or say what the rays mean."""
         if self.rays < self.covering_vectors:
             self.rays += 1
-            self._cover(self._random.uniform(0.5, 1.5, len(self.form.q)))
+            d, pairs = self._random.uniform(0.5, 1.5, len(self.form.q)), self.form.pairs
+            if 2 * pairs == len(d):
+                d[pairs:] = 0.0
+            self._cover(d)
             return
         if self._has_far and not self._keeps_far:  # a solution may lie out there
             self.rays, self._keeps_far = 0, True
