@@ -39,7 +39,7 @@ class SolveStatus(Enum):
         "if you expected one, check the signs: y = A x + b wants A, not -A"
     )
     NEGATIVE_CURVATURE = (
-        "A has a negative diagonal entry, or x'Ax < 0, where a bound is infinite: it is neither positive semi-definite nor a P-matrix; "
+        "A's diagonal entries are negative, or x'Ax < 0, where bounds are infinite: it is neither positive semi-definite nor a P-matrix; "
         "check the sign of A: y = A x + b wants A, not -A; where the sign is right, try wl.Lemke()"
     )
 
