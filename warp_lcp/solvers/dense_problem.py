@@ -269,14 +269,15 @@ def inconsistent(data: DenseProblem) -> bool:
 def incompatible(problem: LCP) -> bool:
     """Return whether it is proved that the equations A x + b = 0 of a dense problem without bounds have no solution.
 
-    The part y of b in the null space of A', b less the least change d with A'd = A'b, has b'y = y'y: -y are multipliers for `certifies`.
+    In units in which A is near 1, the part y of b in the null space of A', b less the least change d with A'd = A'b, has b'y = y'y: -y are multipliers for `certifies`.
     """
     data = DenseProblem.read(problem)
-    y = data.b
+    R, C = unit_rows_and_columns(data.A)
+    transpose, y = scaled(data.A, R, C).T, R * data.b
     for _ in range(1 + REFINEMENTS):
         check_time()
-        y = y - scipy.linalg.lstsq(data.A.T, data.A.T @ y, cond=RANK, lapack_driver="gelsy", check_finite=False)[0]
-        if certifies(data, -y):
+        y = y - scipy.linalg.lstsq(transpose, transpose @ y, cond=RANK, lapack_driver="gelsy", check_finite=False)[0]
+        if certifies(data, -R * y):
             return True
     return False
 

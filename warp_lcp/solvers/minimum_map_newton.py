@@ -163,7 +163,8 @@ class NewtonWorkspace(IterateMemory):
         self.stale = True
         self.norms: list[float] = []
         self.target = tolerance
-        self._equations = self.problem if isinstance(self.system, DenseSystem) and not self.bounded else None
+        # dense equations, of which it is not known yet whether they have a solution; a damped step has reduced the residual
+        self._equations, self._damped = isinstance(self.system, DenseSystem) and not self.bounded, False
         self.resort, self._smallest, self._waited, self._shrinks, self._active = None, math.inf, 0, False, math.inf
         # with an M-matrix each active set of whole steps is part of the one before, whatever the residual does
         self._monotone = isinstance(self.system, SparseSystem) and self.system.cycled and not self.problem.A.symmetric
@@ -211,9 +212,9 @@ class NewtonWorkspace(IterateMemory):
             return step
         if self.resort is not None or (self._stalls() and self._may_resort()):
             return self._resort(x)
-        if self._waited > 0 and self._equations is not None and residual.norm > self.target:
-            data, self._equations = self._equations, None
-            if incompatible(data):
+        if self._equations and (self._waited > 0 or self._damped) and residual.norm > self.target:
+            self._equations = False
+            if incompatible(p):
                 return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         size = residual.norm
@@ -364,6 +365,7 @@ class NewtonWorkspace(IterateMemory):
             x.assign(np.clip(start + dx, lower, upper))
             if residual.evaluate(x) <= (1 - 1e-6) * norm:
                 self.norms.clear()  # from here on no step may undo this one
+                self._damped = True
                 return True
         x.assign(start)
         return False
