@@ -269,7 +269,8 @@ def inconsistent(data: DenseProblem) -> bool:
 def incompatible(problem: LCP) -> bool:
     """Return whether it is proved that the equations A x + b = 0 of a dense problem without bounds have no solution.
 
-    In units in which A is near 1, the part y of b in the null space of A', b less the least change d with A'd = A'b, has b'y = y'y: -y are multipliers for `certifies`.
+    The part y of b in the null space of A', b less the least d with A'd = A'b, has b'y = y'y: -y are multipliers for `certifies`. It is
+    computed in units in which A has entries near 1.
     """
     data = DenseProblem.read(problem)
     R, C = unit_rows_and_columns(data.A)
