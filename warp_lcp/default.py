@@ -27,6 +27,7 @@ from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
 
+SMALL = 600  # unknowns up to which a factorization of a dense matrix takes a hundredth of a second
 LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
 ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
 LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
@@ -136,7 +137,7 @@ def _try_alternatives(
     run = run or _solve_in_order
     if _tries_again(problem, advice, stopping):
         criteria = _left(stopping or replace(PATIENT, rtol=advice.stopping.rtol), begun, [] if stopping is None else results)
-        attempt = partial(_solve_as_sparse, run, problem, advice.method)
+        attempt = partial(_solve_in_form, _as_sparse, run, problem, advice.method)
         if criteria.max_iterations > 0 and _try(results, advice.name, attempt, criteria, x0, callback, begun):
             return
     for name in advice.alternatives if not isinstance(stopping, MeanCriteria) else ():
@@ -148,6 +149,8 @@ def _try_alternatives(
         if criteria.max_iterations == 0:
             return
         attempt = partial(run, problem, method_for(name, advice.traits))
+        if name == "fischer-newton":
+            attempt = partial(_solve_in_form, _as_dense, run, problem, method_for(name, advice.traits))
         try:
             if _try(results, name, attempt, criteria, x0, callback, begun):
                 return
@@ -235,17 +238,32 @@ def _solve_as_grid(
     return replace(result, x=result.x.flatten(), grid=grid.A.shape, problem=problem, version=version_of(problem.A))
 
 
-def _solve_as_sparse(
-    run: Run, problem: LCP, method: Solver, stopping: StoppingCriteria | MeanCriteria, x0: Array | None,
-    callback: Callable[[Record], None] | None,
+def _solve_in_form(
+    form: Callable[[LCP], DenseOperator | SparseOperator | None], run: Run, problem: LCP, method: Solver,
+    stopping: StoppingCriteria | MeanCriteria, x0: Array | None, callback: Callable[[Record], None] | None,
 ) -> SolveResult:  # fmt: skip
-    """Solve a dense problem with bounds that are affine in x on its sparse matrix; others as they are."""
+    """Solve a problem with its matrix stored in another form, as it is where there is none."""
+    A, p = form(problem), problem
+    if A is None:
+        return run(p, method, stopping, x0, callback)
+    sides = (p.lower.numpy(), p.upper.numpy()) if p.bounds.affine is None else p.bounds.affine.sides
+    result = run(LCP(A, p.b.numpy(), *sides), method, stopping, x0, callback)
+    return replace(result, problem=p, version=version_of(p.A))
+
+
+def _as_sparse(problem: LCP) -> SparseOperator | None:
+    """Return a dense matrix as a sparse one."""
     A = problem.A
-    if not isinstance(A, DenseOperator) or problem.bounds.affine is None:
-        return run(problem, method, stopping, x0, callback)
-    sparse = SparseOperator(scipy.sparse.csr_array(A.matrix.numpy()), device=A.device, dtype=A.dtype)
-    result = run(LCP(sparse, problem.b.numpy(), *problem.bounds.affine.sides), method, stopping, x0, callback)
-    return replace(result, problem=problem, version=version_of(A))
+    return (
+        SparseOperator(scipy.sparse.csr_array(A.matrix.numpy()), device=A.device, dtype=A.dtype) if isinstance(A, DenseOperator) else None
+    )
+
+
+def _as_dense(problem: LCP) -> DenseOperator | None:
+    """Return a small sparse matrix as a dense one: its singular blocks are seen by LAPACK, which is faster than GMRES there, too."""
+    A = problem.A
+    small = isinstance(A, SparseOperator) and A.unknowns <= SMALL and problem.preconditioner is None
+    return DenseOperator(A.matrix().toarray(), device=A.device, dtype=A.dtype) if small and isinstance(A, SparseOperator) else None
 
 
 def _solve_in_order(

@@ -337,11 +337,10 @@ class _Loop:
             return self._floor_or(failure)
         idle = iteration - max(self.best_iteration, self.progress)
         status = self.stopping.status(norm, self.tolerance, first, iteration, idle, interim=interim)
-        if status is SolveStatus.CONVERGED:
-            return self._solved()
         if status is SolveStatus.STAGNATED or (status is SolveStatus.NON_FINITE and iteration > 0):
             return self._floor_or(status)
-        return SolveStatus.TIME_LIMIT if status is None and self.deadline.left() <= 0 else status
+        late = SolveStatus.TIME_LIMIT if status is None and self.deadline.left() <= 0 else status
+        return self._solved() if status is SolveStatus.CONVERGED else late
 
     def _solved(self) -> SolveStatus:
         """Return CONVERGED, or FLOOR where the tolerance is below what storing A in float32 has changed."""

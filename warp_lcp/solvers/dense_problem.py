@@ -266,6 +266,23 @@ def inconsistent(data: DenseProblem) -> bool:
     return False
 
 
+def incompatible(problem: LCP) -> bool:
+    """Return whether it is proved that the equations A x + b = 0 of a dense problem without bounds have no solution.
+
+    The part y of b in the null space of A', b less the least d with A'd = A'b, has b'y = y'y: -y are multipliers for `certifies`. It is
+    computed in units in which A has entries near 1.
+    """
+    data = DenseProblem.read(problem)
+    R, C = unit_rows_and_columns(data.A)
+    transpose, y = scaled(data.A, R, C).T, R * data.b
+    for _ in range(1 + REFINEMENTS):
+        check_time()
+        y = y - scipy.linalg.lstsq(transpose, transpose @ y, cond=RANK, lapack_driver="gelsy", check_finite=False)[0]
+        if certifies(data, -R * y):
+            return True
+    return False
+
+
 def _refined(transpose: Any, z: np.ndarray) -> np.ndarray:
     """Return the multipliers nearest to z, among those that are 0 where z is, with (A'z)_j = 0 where a vertex has it but for errors.
 

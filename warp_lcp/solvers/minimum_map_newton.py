@@ -20,6 +20,7 @@ from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, S
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
+from warp_lcp.solvers.dense_problem import incompatible
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.phases import (
@@ -162,6 +163,8 @@ class NewtonWorkspace(IterateMemory):
         self.stale = True
         self.norms: list[float] = []
         self.target = tolerance
+        # dense equations, of which it is not known yet whether they have a solution; a damped step has reduced the residual
+        self._equations, self._damped = isinstance(self.system, DenseSystem) and not self.bounded, False
         self.resort, self._smallest, self._waited, self._shrinks, self._active = None, math.inf, 0, False, math.inf
         # with an M-matrix each active set of whole steps is part of the one before, whatever the residual does
         self._monotone = isinstance(self.system, SparseSystem) and self.system.cycled and not self.problem.A.symmetric
@@ -209,6 +212,10 @@ class NewtonWorkspace(IterateMemory):
             return step
         if self.resort is not None or (self._stalls() and self._may_resort()):
             return self._resort(x)
+        if self._equations and (self._waited > 0 or self._damped) and residual.norm > self.target:
+            self._equations = False
+            if incompatible(p):
+                return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         size = residual.norm
         fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "scale": 1 / size}
@@ -358,6 +365,7 @@ class NewtonWorkspace(IterateMemory):
             x.assign(np.clip(start + dx, lower, upper))
             if residual.evaluate(x) <= (1 - 1e-6) * norm:
                 self.norms.clear()  # from here on no step may undo this one
+                self._damped = True
                 return True
         x.assign(start)
         return False
