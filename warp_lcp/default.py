@@ -31,7 +31,7 @@ SMALL = 600  # unknowns up to which a factorization of a dense matrix takes a hu
 LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
 ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
 LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
-PATIENT = StoppingCriteria(max_iterations=1000, patience=300)  # of bodies of mass ratios to 1e7, whose residual rises and falls
+PATIENT = {"max_iterations": 1000, "patience": 300}  # of bodies of mass ratios to 1e7, whose residual rises and falls
 RESERVED, FEW = 4, 40  # one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps on
 ENDED = (
     SolveStatus.CONVERGED,
@@ -136,7 +136,7 @@ def _try_alternatives(
     """Solve by alternatives until one succeeds or a limit has come."""
     run = run or _solve_in_order
     if _tries_again(problem, advice, stopping):
-        criteria = _left(stopping or replace(PATIENT, rtol=advice.stopping.rtol), begun, [] if stopping is None else results)
+        criteria = _left(stopping or StoppingCriteria(rtol=advice.stopping.rtol, **PATIENT), begun, [] if stopping is None else results)
         attempt = partial(_solve_in_form, _as_sparse, run, problem, advice.method)
         if criteria.max_iterations > 0 and _try(results, advice.name, attempt, criteria, x0, callback, begun):
             return

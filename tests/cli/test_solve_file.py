@@ -216,7 +216,7 @@ def test_a_recorded_problem(recorded_problem, tmp_path):
     assert f"{fluid.sum()} unknowns, 10 x 10 x 10 cells, by projected-multigrid on cpu" in result.stdout
     x, lower = np.load(out), np.where(recorded_problem.wall, 0.0, -np.inf)
     y = recorded_problem.matrix() @ x[fluid] + recorded_problem.b[fluid]
-    assert np.abs(np.minimum(x[fluid] - lower[fluid], y)).max() < 1e-6  # coefficients are stored in float32
+    assert np.abs(np.minimum(x[fluid] - lower[fluid], y)).max() < 1e-6
     assert 0 < (x[fluid][np.isfinite(lower[fluid])] == 0.0).sum() < np.isfinite(lower).sum()  # some walls are let go of
     assert (x[~fluid] == 0.0).all()
     by_psor = call(file, "--method", "psor", "--out", out, "--max-iterations", 5)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from warp_lcp.cli.solve_file import Outcome, criteria, method_named
 from warp_lcp.default import solve
@@ -16,6 +17,7 @@ from warp_lcp.files.atomic import replacing
 from warp_lcp.gallery.recorded import cell_counts, load_part
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import FLOAT32_ROUNDING
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS
@@ -98,7 +100,7 @@ def solve_recorded(
     try:
         shape = cell_counts(path)
         decomposition = None if ranks is None else _decomposition(shape, ranks)
-        problem = _problem(path, shape, decomposition, device)
+        problem = _problem(path, shape, decomposition, device, tolerance)
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
@@ -139,14 +141,15 @@ def _decomposition(shape: tuple[int, ...], ranks: Ranks) -> Decomposition:
     return Decomposition((nx, ny, nz), ranks)
 
 
-def _problem(path: Path, shape: tuple[int, ...], decomposition: Decomposition | None, device: str) -> LCP:
+def _problem(path: Path, shape: tuple[int, ...], decomposition: Decomposition | None, device: str, tolerance: float) -> LCP:
     """Return the problem, or this rank's part of it."""
     part = tuple(slice(0, n) for n in shape) if decomposition is None else decomposition.box.slices[-len(shape) :]
     kept = load_part(path, part)
     cells, b, lower, upper = (kept.pop(name) for name in ("cells", "b", "lower", "upper"))
     coefficients: dict[str, Any] = {**kept, "device": device}
     if decomposition is None:
-        return LCP(GridPoisson(cells, **coefficients), b, _bound(lower), _bound(upper))
+        kind = wp.float64 if tolerance < FLOAT32_ROUNDING else wp.float32  # less than float32 tells asks for the file's own numbers
+        return LCP(GridPoisson(cells, **coefficients, dtype=kind), b, _bound(lower), _bound(upper))
     from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 
     return LCP(DistributedGridPoisson(decomposition, cells, **coefficients), b, _bound(lower), _bound(upper))

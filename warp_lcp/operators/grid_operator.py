@@ -48,7 +48,6 @@ class GridOperator(Pickled):
     _across: Across | None = None
     _finder: Any = None  # of floating components
     _rounding = 0.0  # the largest relative one of coefficients that were given as arrays
-    _rounding_of_diagonal = -1, 0.0  # a version, and that of the diagonal then
     outside = SOLID  # what lies beyond the array
 
     def __init__(self, cells: Any, coefficients: dict[str, Any], periodic: tuple[bool, ...], device: Any, dtype: Any) -> None:
@@ -167,25 +166,8 @@ class GridOperator(Pickled):
         return wp.array(inner.reshape(self.shape), dtype=self.dtype, device=self.device)
 
     def storage_rounding(self) -> float:
-        """Return the largest relative rounding of a coefficient that was given, and of the diagonal, which adds them up.
-
-        That of the diagonal is computed when it is first asked for; on ranks, and of principal systems, it is left out.
-        """
-        whole = self._mask is None and self.layout.across is None
-        if whole and self.dtype is wp.float32 and self.stencil.d.dtype is wp.float32 and self._rounding_of_diagonal[0] != self.version:
-            exact = self._in_float64()
-            d, stored = (1.0, 1.0) if exact is None else (A.diagonal().numpy().astype(np.float64) for A in (exact, self))
-            there = np.asarray(d) != 0
-            error = np.abs(np.where(there, stored, 0.0) - d) / np.where(there, np.abs(d), 1.0)
-            self._rounding_of_diagonal = self.version, float(error.max())
-        return max(self._rounding, self._rounding_of_diagonal[1] if whole else 0.0)
-
-    def _in_float64(self) -> Self | None:
-        """Return the operator of the same cells, its stored coefficients in float64; None where there is nothing to add up."""
-        kind, device, given = wp.float64, self.device, self._arguments()
-        given |= {name: wp.array(v.numpy(), dtype=kind, device=device) for name, v in given.items() if isinstance(v, wp.array)}
-        cells = self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape)
-        return type(self)(cells, periodic=self._wraps, device=device, dtype=kind, **given)
+        """Return the largest relative rounding of a coefficient that was given in float64; sums on the diagonal do not count."""
+        return self._rounding
 
     def masked(self, free: Any, shift: Any = None) -> Self:
         """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""

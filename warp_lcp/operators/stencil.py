@@ -392,10 +392,6 @@ class StoredStencil(GridOperator):
     def _fill_stencil(self) -> None:
         self._wrap_cells()
 
-    def _in_float64(self) -> None:
-        """Nothing: the stencil is what it was given."""
-        return
-
 
 def _opposite(offset: Offset) -> Offset:
     """Return the offset by which a neighbor sees a cell."""

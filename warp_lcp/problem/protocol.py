@@ -187,7 +187,7 @@ class StoresRounded(Operator, Protocol):
     """Entries that may be rounded where they are stored: a tolerance below that is the stored A's alone, and the status FLOOR."""
 
     def storage_rounding(self) -> float:
-        """Return the largest relative rounding of what A is made of, as it was given in float64, and of the diagonal; 0: none."""
+        """Return the largest relative rounding of what A is made of, as it was given in float64; 0: none."""
 
 
 class HasCoefficients(Operator, Protocol):
