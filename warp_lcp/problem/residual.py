@@ -176,7 +176,8 @@ class NaturalResidual:
         d = np.abs(self.diagonal.numpy()[inside].astype(np.float64)) * self.unit
         d = np.where(d == 0, 1.0, d)
         y, at, b, lower, upper = (f.numpy()[inside] for f in (field, x, p.b, p.bounds.as_field(0), p.bounds.as_field(1)))
-        return y, np.maximum(np.minimum(y, d * (at - lower)), d * (at - upper)), d, b, at
+        with np.errstate(over="ignore"):  # bounds of 1e308 are infinite then
+            return y, np.maximum(np.minimum(y, d * (at - lower)), d * (at - upper)), d, b, at
 
     def _total(self, value: float) -> float:
         """Return the sum of a number over all ranks."""

@@ -26,6 +26,7 @@ PROVABLE = 250_000  # entries of A up to which a linear program is asked whether
 PROOF_SECONDS = 10.0  # of such a program: one that takes longer proves nothing
 TOLERANCE = 1e-10  # of such a program, the least that HiGHS takes; its optimum is a vertex, whose equations hold to rounding
 ROUNDING = 8.0  # times sqrt(k) eps of its terms: a sum of k of them below that may be 0
+LARGEST = float(np.finfo(np.float64).max)  # its costs are finite, whatever the bounds
 REFINEMENTS = 2  # of its optimum
 VERTEX = 1e-8  # of the terms of such an equation, and of the largest multiplier: what its solver leaves of zeros
 NULL = 1e-11  # of the terms of A z: below that, rounding of A and of a factorization has made it
@@ -249,7 +250,9 @@ def inconsistent(data: DenseProblem) -> bool:
     up, low = np.flatnonzero(above), np.flatnonzero(below)
     identity = scipy.sparse.eye_array(len(data.b), format="csc")
     system = scipy.sparse.hstack([scipy.sparse.csc_array(scaled(A, R, C).T), -identity[:, up], identity[:, low]], format="csc")
-    cost = np.concatenate([R * b, data.upper[up] / C[up], -data.lower[low] / C[low]]) / beta
+    with np.errstate(over="ignore"):  # of bounds near 1e308
+        cost = np.concatenate([R * b, data.upper[up] / C[up], -data.lower[low] / C[low]]) / beta
+    cost = np.clip(cost, -LARGEST, LARGEST)
     signs = [(-float(not below[i]), float(not above[i])) for i in rows] + [(0.0, None)] * (len(up) + len(low))
     options = dict.fromkeys(("primal_feasibility_tolerance", "dual_feasibility_tolerance"), TOLERANCE)
     options["time_limit"] = min(seconds_left(), PROOF_SECONDS)
