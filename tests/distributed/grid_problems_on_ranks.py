@@ -32,14 +32,15 @@ def scene(shape, *, solids=0.08, air=True):
 
 
 def coefficients(shape):
-    """Faces over two decades, some closed, and a shift."""
+    """Faces over two decades, some closed, and a shift; float32 holds them."""
     found = {}
     for name, axis in zip(("face_x", "face_y", "face_z"), range(len(shape)), strict=False):
         size = list(shape)
         size[-1 - axis] += 1
         faces = 10.0 ** rng.uniform(-1, 1, size)
         found[name] = np.where(rng.random(size) < 0.1, 0.0, faces)
-    return found | {"shift": np.where(rng.random(shape) < 0.05, rng.random(shape), 0.0)}
+    found["shift"] = np.where(rng.random(shape) < 0.05, rng.random(shape), 0.0)
+    return {name: values.astype(np.float32).astype(np.float64) for name, values in found.items()}
 
 
 def part(values, box, shape, axis=None):
@@ -71,9 +72,10 @@ def joined(A, columns, box):
 
 
 def compare(
-    ranks, name, cells, b, lower, upper=np.inf, *, method, decomposition=None, rtol=1e-9, same=1e-7, columns=None, counts_differ=1, **faces
+    ranks, name, cells, b, lower, upper=np.inf, *, method, decomposition=None, rtol=1e-9, same=1e-7, columns=None, counts_differ=1,
+    others=(), **faces
 ):  # fmt: skip
-    """Solve on all ranks and on one; statuses are the same, counts to one, x but for rounding."""
+    """Solve on all ranks and on one; statuses are the same (CONVERGED, INFEASIBLE or `others`), counts to one, x but for rounding."""
     shape = cells.shape
     counts = (*reversed(shape), 1)[:3]
     boxes = decomposition or Decomposition(counts, ranks)
@@ -97,6 +99,7 @@ def compare(
     own, whole = found.x.numpy(), expected.x.numpy()
     error = ranks.max(float(np.abs(own - part(whole, boxes.box, shape)).max(initial=0.0)))
     scale = max(float(np.abs(whole).max()), 1e-300)
+    assert expected.status in (wl.SolveStatus.CONVERGED, wl.SolveStatus.INFEASIBLE, *others), (name, expected.status)
     assert not expected or error <= same * scale, (name, error / scale)
     return found, problem.A
 
@@ -118,6 +121,19 @@ def shapes(ranks):
             compare(ranks, f"number a face {shape}", cells, b, 0.0, method=method, face_x=1.0, face_y=3.0)
             alike = np.where(np.indices(shape)[0] < shape[0] // 2, walls, -rng.random(shape))  # of one finite value on some ranks only
             compare(ranks, f"bounds alike on some ranks {shape}", cells, b, alike, method=method)
+
+
+def rounded_on_one_rank(ranks):
+    """A coefficient that float32 does not hold, in the box of one rank, gives all ranks the same status."""
+    shape = (34, 21, 40)
+    face = np.ones((34, 21, 41))
+    face[3, 4, 5] = 0.3
+    for method in (PM, NEWTON):
+        found, _ = compare(
+            ranks, "rounded", scene(shape), rng.standard_normal(shape), 0.0, method=method, rtol=1e-10, face_x=face,
+            others=(wl.SolveStatus.FLOOR,),
+        )  # fmt: skip
+        assert found.status is wl.SolveStatus.FLOOR, found.status
 
 
 def low_rank(ranks):
@@ -315,6 +331,9 @@ def messages_in_tables(ranks):
 if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
     everyone = Ranks.world()
-    for check in (halos, messages_in_tables, shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, legs, low_rank, wrong_input):
+    for check in (
+        halos, messages_in_tables, shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, legs, rounded_on_one_rank, low_rank,
+        wrong_input,
+    ):  # fmt: skip
         check(everyone)
     sys.stdout.write(f"rank {everyone.rank} of {everyone.size} is done\n")

@@ -146,10 +146,10 @@ def _problem(path: Path, shape: tuple[int, ...], decomposition: Decomposition | 
     part = tuple(slice(0, n) for n in shape) if decomposition is None else decomposition.box.slices[-len(shape) :]
     kept = load_part(path, part)
     cells, b, lower, upper = (kept.pop(name) for name in ("cells", "b", "lower", "upper"))
-    coefficients: dict[str, Any] = {**kept, "device": device}
+    kind = wp.float64 if tolerance < FLOAT32_ROUNDING else wp.float32  # less than float32 tells asks for the file's own numbers
+    coefficients: dict[str, Any] = {**kept, "device": device, "dtype": kind}
     if decomposition is None:
-        kind = wp.float64 if tolerance < FLOAT32_ROUNDING else wp.float32  # less than float32 tells asks for the file's own numbers
-        return LCP(GridPoisson(cells, **coefficients, dtype=kind), b, _bound(lower), _bound(upper))
+        return LCP(GridPoisson(cells, **coefficients), b, _bound(lower), _bound(upper))
     from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 
     return LCP(DistributedGridPoisson(decomposition, cells, **coefficients), b, _bound(lower), _bound(upper))

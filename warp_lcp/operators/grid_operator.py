@@ -166,8 +166,9 @@ class GridOperator(Pickled):
         return wp.array(inner.reshape(self.shape), dtype=self.dtype, device=self.device)
 
     def storage_rounding(self) -> float:
-        """Return the largest relative rounding of a coefficient that was given in float64; sums on the diagonal do not count."""
-        return self._rounding
+        """Return the largest relative rounding of a coefficient that was given in float64, on any rank; sums on the diagonal do not count."""
+        across = self.layout.across
+        return self._rounding if across is None else float(across.max(self._rounding))
 
     def masked(self, free: Any, shift: Any = None) -> Self:
         """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""
