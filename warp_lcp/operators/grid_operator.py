@@ -166,7 +166,7 @@ class GridOperator(Pickled):
         return wp.array(inner.reshape(self.shape), dtype=self.dtype, device=self.device)
 
     def storage_rounding(self) -> float:
-        """Return the largest relative rounding of a coefficient that was given in float64, on any rank; sums on the diagonal do not count."""
+        """Return the largest relative rounding, on any rank, of coefficients given in float64; sums on the diagonal do not count."""
         across = self.layout.across
         return self._rounding if across is None else float(across.max(self._rounding))
 
