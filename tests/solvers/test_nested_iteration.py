@@ -10,6 +10,7 @@ from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of, bandwidth
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.solvers.nested_iteration import COARSEST, BlockTridiagonalProblem, nested_iteration
 
+EPS = float(np.finfo(np.float64).eps)
 TIGHT = wl.StoppingCriteria(rtol=1e-7)
 
 
@@ -115,13 +116,20 @@ def test_default_solves_narrow_problems(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1500, 15000])
 def test_default_solves_large_narrow_problems(n):
-    """FLOOR is honest where the condition, about n^4 for beams, leaves fewer digits than are asked for."""
+    """The condition of beams is about n^4: 5e12 at 1,500 unknowns, where FLOOR is honest; at 15,000, 5e16, A is singular in float64."""
     for kind in KINDS:
+        beam = kind in ("beam", "supported beam", "frame")
         for seed in range(7341, 7361):
             p = narrow_problem(kind, seed, n)
             result = wl.solve(wl.LCP(p.A, p.b, p.lower, p.upper))
-            beam = kind in ("beam", "supported beam", "frame")
-            assert result or (beam and result.status is wl.SolveStatus.FLOOR), f"{p.name}: {result.status.name}"
+            honest = beam and (result.status is wl.SolveStatus.FLOOR or n > 1500)
+            assert result or honest, f"{p.name}: {result.status.name}"
+            if result:
+                x = result.x.numpy()
+                rounding = EPS * np.linalg.norm(abs(p.A) @ abs(x))  # of A x: another order of sums leaves another residual
+                start = np.clip(np.zeros(len(p.b)), p.lower, p.upper)
+                allowed = 1e-6 * natural_residual(p.A, p.b, p.lower, p.upper, start) + 4 * rounding
+                assert natural_residual(p.A, p.b, p.lower, p.upper, x) <= allowed, p.name
 
 
 def test_a_guess_far_from_the_solution_takes_nested_iteration_too():
