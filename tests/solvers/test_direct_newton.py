@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import scipy.sparse
+import scipy.sparse.linalg
 import warp as wp
 
 import warp_lcp as wl
@@ -214,6 +215,40 @@ def test_lemke_makes_the_same_pivots_with_banded_factors(flipped):
     assert plain
     assert banded.linear_iterations == plain.linear_iterations
     np.testing.assert_allclose(banded.x.numpy(), wl.solve(sparse, stopping=TIGHT).x.numpy(), atol=1e-8)
+
+
+@pytest.mark.parametrize("form", ["box", "some boxes", "mirrored"])
+def test_lemke_makes_the_same_pivots_in_narrow_boxes(form):
+    """Rows s = u - l - z stand beside their z: the bandwidth of 1 becomes 3 at most."""
+    for seed in range(5569, 5575):
+        p, rng = string(seed, n=60, between=False), np.random.default_rng(seed)
+        lower, upper = p.lower, p.lower + rng.uniform(0.01, 0.5, 60)
+        if form == "some boxes":
+            upper = np.where(rng.random(60) < 0.5, upper, np.inf)
+        b = p.b * 10
+        if form == "mirrored":
+            lower, upper, b = np.where(rng.random(60) < 0.3, -upper, -np.inf), -lower, -b
+        sparse, dense = wl.LCP(p.A, b, lower, upper), wl.LCP(p.A.toarray(), b, lower, upper)
+        work = [wl.Lemke().init(problem) for problem in (sparse, dense)]
+        banded, plain = (wl.solve(q, wl.Lemke(), workspace=w, stopping=TIGHT) for q, w in zip((sparse, dense), work, strict=True))
+        assert [type(w.basis) for w in work] == [BandedBasis, Basis]
+        assert banded
+        assert plain
+        assert work[0].basis.factors.k <= 3
+        assert banded.linear_iterations == plain.linear_iterations
+        np.testing.assert_allclose(banded.x.numpy(), plain.x.numpy(), atol=1e-8)
+        at = banded.x.numpy() == upper
+        assert at.any() or form != "box"
+
+
+@pytest.mark.parametrize("size", [1e9, 1e110])
+def test_lemke_on_narrow_matrices_with_far_bounds_alone(size):
+    """Left out at first, they would leave rows without a bound, of which the narrow form takes none."""
+    A = scipy.sparse.diags_array([-1.0, 4.0, -1.0], offsets=[-1, 0, 1], shape=(50, 50)).tocsr()
+    b = np.random.default_rng(5581).standard_normal(50)
+    result = wl.solve(wl.LCP(A, b, -size, np.inf), wl.Lemke(), stopping=TIGHT)
+    assert result
+    np.testing.assert_allclose(result.x.numpy(), scipy.sparse.linalg.spsolve(A.tocsc(), -b), atol=1e-7)
 
 
 def test_lemke_tells_how_far_it_is_on_a_large_narrow_problem():

@@ -39,20 +39,20 @@ class LemkeForm:
         q: shape (m,).
         base: x at z = 0, shape (n,).
         map: x = base + map z, shape (n, m).
-        pairs: how many rows are s = u - l - z, the last ones.
+        pairs: which rows are s = u - l - z, indices.
     """
 
     M: Any
     q: np.ndarray
     base: np.ndarray
     map: Any
-    pairs: int = 0
+    pairs: np.ndarray
 
     @classmethod
     def of(cls, data: DenseProblem) -> LemkeForm:
-        """Return the form of a boxed problem; of a sparse one whose rows are all one-sided, too."""
+        """Return the form of a boxed problem; of a sparse one whose rows all have a finite bound, too."""
         if scipy.sparse.issparse(data.A):
-            return cls._of_one_sided(data)
+            return cls._of_narrow(data)
         A, lower, upper, n = data.A, data.lower, data.upper, len(data.b)
         fixed = lower == upper
         below, above = np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
@@ -80,43 +80,51 @@ class LemkeForm:
                 M, q = columns.T @ A @ columns, columns.T @ (A @ base + data.b)
         else:  # a choice of rows and columns with signs, no product of matrices
             M, q = sign[:, None] * A[np.ix_(sided, sided)] * sign, sign * (A @ base + data.b)[sided]
-        both = np.flatnonzero((below & above)[sided])
+        both, m = np.flatnonzero((below & above)[sided]), len(q)
         if len(both):
-            m, k = len(q), len(both)
+            k = len(both)
             pick = np.zeros((k, m))
             pick[np.arange(k), both] = 1.0
             M = np.block([[M, pick.T], [-pick, np.zeros((k, k))]])
             q = np.r_[q, (upper - lower)[sided][both]]
             columns = np.hstack([columns, np.zeros((n, k))])
-        return cls(M, q, base, columns, len(both))
+        return cls(M, q, base, columns, m + np.arange(len(both)))
 
     @classmethod
-    def _of_one_sided(cls, data: DenseProblem) -> LemkeForm:
-        """Reformulate a sparse problem all of whose rows are one-sided."""
-        below = np.isfinite(data.lower)
+    def _of_narrow(cls, data: DenseProblem) -> LemkeForm:
+        """Reformulate a sparse problem all of whose rows have a finite bound.
+
+        The row s = u - l - z follows that of its z at once, so that a matrix of bandwidth k becomes one of 2 k + 1 at most.
+        """
+        below, n = np.isfinite(data.lower), len(data.b)
+        both = np.flatnonzero(below & np.isfinite(data.upper))
         S, base = scipy.sparse.diags_array(np.where(below, 1.0, -1.0)), np.where(below, data.lower, data.upper)
-        return cls((S @ data.A @ S).tocsr(), S @ data.affine(base), base, S)
+        M, q, columns = S @ data.A @ S, S @ data.affine(base), S
+        k = len(both)
+        if k:
+            pick = scipy.sparse.csr_array((np.ones(k), (np.arange(k), both)), shape=(k, n))
+            M = scipy.sparse.block_array([[M, pick.T], [-pick, None]])
+            q = np.r_[q, (data.upper - data.lower)[both]]
+            columns = scipy.sparse.hstack([S, scipy.sparse.csr_array((n, k))])
+        order = np.argsort(np.r_[np.arange(n), both], kind="stable")
+        return cls(M.tocsr()[order][:, order], q[order], base, columns.tocsr()[:, order], np.flatnonzero(order >= n))
 
     def solution(self, z: np.ndarray) -> np.ndarray:
         """Return x, shape (n,), for z of shape (m,)."""
         return self.base + self.map @ z
 
 
-def one_sided(data: DenseProblem) -> np.ndarray:
-    """Return which rows have one finite bound, shape (n,)."""
-    return np.isfinite(data.lower) != np.isfinite(data.upper)
-
-
 WIDEST, FEW = 3, 30  # bandwidth that is called narrow, and unknowns up to which a dense inverse costs no more
 
 
 def narrow_problem(problem: LCP) -> DenseProblem | None:
-    """Return a sparse problem of small bandwidth whose every row has one finite bound, None if it is another one."""
+    """Return a sparse problem of small bandwidth whose rows all have a finite bound and none has l = u, None if it is another one."""
     A = problem.A
     if not isinstance(A, SparseOperator) or A.unknowns <= FEW or A.bandwidth > WIDEST:
         return None
     data = DenseProblem.read(problem, keep_sparse=True)
-    return data if one_sided(data).all() else None
+    sided = (np.isfinite(data.lower) | np.isfinite(data.upper)) & (data.lower < data.upper)
+    return data if sided.all() else None
 
 
 class BandedFactors:
@@ -194,7 +202,8 @@ class Lemke(Settings):
 
     Bounds far beyond the sizes of A and b count as infinite at first, and as they are if that leads
     nowhere. Boxes add a pair of variables, equations are eliminated or, where their block is
-    singular, split (see LemkeForm). x0 is not used. A pivot costs O(m^2), m <= 2n. A step is a
+    singular, split (see LemkeForm). x0 is not used. A pivot costs O(m^2), m <= 2n, O(m) with a
+    matrix of bandwidth <= 3 whose rows all have a finite bound. A step is a
     block of pivots; `linear_iterations` counts pivots.
 
     Args:
@@ -407,11 +416,17 @@ class LemkeWorkspace(DenseWorkspace):
     def _take(self) -> None:
         """Scale the problem, and begin at z = 0 with the covering vector of ones."""
         scaled, self.units = self.data.scaled()
-        given, sides = (self.data.lower, self.data.upper), without_far(scaled.lower, scaled.upper, FAR)
-        self._has_far = any((np.isfinite(one) & np.isinf(other)).any() for one, other in zip(given, sides, strict=True))
-        if self._has_far:
-            lower, upper = without_far(scaled.lower, scaled.upper, BEYOND) if self._keeps_far else sides
-            scaled = replace(scaled, lower=lower, upper=upper)
+        lower, upper = without_far(scaled.lower, scaled.upper, BEYOND if self._keeps_far else FAR)
+        given = (self.data.lower, self.data.upper)
+        self._has_far = any((np.isfinite(one) & np.isinf(other)).any() for one, other in zip(given, (lower, upper), strict=True))
+        if scipy.sparse.issparse(scaled.A) and not (np.isfinite(lower) | np.isfinite(upper)).all():  # which a narrow form needs
+            if self._keeps_far:
+                self._widen()
+            else:
+                self._keeps_far = True
+                self._take()
+            return
+        scaled = replace(scaled, lower=lower, upper=upper)
         self.form = LemkeForm.of(scaled)
         m = len(self.form.q)
         self._sizes = (float(abs(self.form.M).max() if m else 0.0) or 1.0, float(np.abs(self.form.q).max(initial=0.0)) or 1.0)
@@ -454,7 +469,7 @@ class LemkeWorkspace(DenseWorkspace):
         data = self.data
         x = np.clip(self.units * self.form.solution(z), data.lower, data.upper)
         size = 16 * EPS * self.units * np.abs(x / self.units).max()
-        if not isinstance(self.basis, BandedBasis):  # whose factors are fresh
+        if self._keeps_far or not isinstance(self.basis, BandedBasis):  # whose factors are fresh
             x = data.polished(x, (x - data.lower > size) & (data.upper - x > size))
         if self.basis is not None and not data.residual(x) <= NOISE * data.residual(np.clip(0.0, data.lower, data.upper)):
             self._ray()
@@ -467,8 +482,8 @@ class LemkeWorkspace(DenseWorkspace):
         if self.rays < self.covering_vectors:
             self.rays += 1
             d, pairs = self._random.uniform(0.5, 1.5, len(self.form.q)), self.form.pairs
-            if 2 * pairs == len(d):
-                d[pairs:] = 0.0
+            if 2 * len(pairs) == len(d):
+                d[pairs] = 0.0
             self._cover(d)
             return
         if self._has_far and not self._keeps_far:  # a solution may lie out there
