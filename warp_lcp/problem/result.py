@@ -25,7 +25,7 @@ class SolveStatus(Enum):
     STAGNATED = "no smaller residual in the last `patience` steps: take another method or precision='double'"
     FLOOR = (
         "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'; "
-        "where A is stored in float32 and its entries are rounded, an rtol below 1e-7 needs dtype=wp.float64"
+        "where A is stored in float32 and its entries are rounded, rtol below 1e-7 needs dtype=wp.float64"
     )
     LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start elsewhere or take another method"
     NON_DESCENT = "no step reduces the merit function: take another method, for example ProjectedSOR"
