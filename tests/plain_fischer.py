@@ -6,6 +6,7 @@ import numpy as np
 
 DECREASE = 1e-4  # Armijo's constant
 LEAST_Q = 1e-6  # q where a system is divided by it
+KINK = 1e-14  # times the size of b: rounding of a point at a kink
 
 
 def psi(a, b):
@@ -13,10 +14,10 @@ def psi(a, b):
     return a + b - math.hypot(a, b)
 
 
-def slopes_of_psi(a, b, kink):
-    """Derivatives of psi by a and by b; `kink` where both are 0, where it has none."""
+def slopes_of_psi(a, b, kink, scale):
+    """Derivatives of psi by a and by b, and whether there are none: `kink` where both are 0."""
     rho = math.hypot(a, b)
-    return kink if rho == 0 else (1 - a / rho, 1 - b / rho)
+    return (*kink, True) if rho <= KINK * scale else (1 - a / rho, 1 - b / rho, False)
 
 
 def plain_row(form, d, x, y, lower, upper, *, share, scale, kink):
@@ -34,12 +35,11 @@ def plain_row(form, d, x, y, lower, upper, *, share, scale, kink):
         return least, float(low and a < y), float(not (low and a < y)), False
     f, p, q, kinked = y, 0.0, 1.0, False
     if high:  # dh = psi_a dy - psi_b dc, and dc = -d dx
-        f, kinked = -psi(-y, c), c == 0 and y == 0
-        by_y, by_c = slopes_of_psi(-y, c, (kink[1], kink[0]))
-        p, q = by_c, by_y
+        f = -psi(-y, c)
+        q, p, kinked = slopes_of_psi(-y, c, kink[::-1], scale)
     if low:
-        by_a, by_h = slopes_of_psi(a, f, kink)
-        kinked = kinked or (a == 0 and f == 0)
+        by_a, by_h, here = slopes_of_psi(a, f, kink, scale)
+        kinked = kinked or here
         f, p, q = psi(a, f), by_a + by_h * p, by_h * q
     if form == "penalized":
         rest, above, below = (1 - share) / scale, max(y, 0.0), max(-y, 0.0)
