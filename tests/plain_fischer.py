@@ -1,4 +1,4 @@
-"""The Fischer-Burmeister map of a box, its penalized form and the minimum map, written row by row from their definitions; no code of the library."""
+"""The Fischer-Burmeister map of a box, its penalized form and the minimum map, row by row from their definitions, without the library."""
 
 import math
 

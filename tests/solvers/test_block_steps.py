@@ -1,4 +1,4 @@
-"""Blocks in turn, iterate by iterate against plain loops: blocked Gauss-Seidel and staggering, the subproblems, friction within and across blocks."""
+"""Blocked Gauss-Seidel and staggering iterate by iterate against plain loops: subproblems, friction within blocks and across them."""
 
 import itertools
 

@@ -291,6 +291,6 @@ def of_kind(kind, A):
 
 
 def test_the_plain_search_is_armijos():
-    """The reference itself: f'f / 2 of f = x falls by half of the slope's promise at t = 1, so that the constant decides where it is near 1/2."""
+    """The reference itself."""
     assert armijo(lambda x: 0.5 * x * x, lambda t: 1 - t, 0.5, -1.0) == 1.0
     assert armijo(lambda x: math.inf, lambda t: t, 0.5, -1.0) == 0.0

@@ -131,14 +131,15 @@ def compare(method, work, problem, plain, place, steps, tolerance):
         plain.step()
         np.testing.assert_allclose(work.x.numpy()[place], plain.x, rtol=tolerance, atol=tolerance, err_msg=f"step {k + 1}")
         assert work.mu == pytest.approx(plain.mu, rel=1e-6)
-        for name, own, there in (("w", plain.w, plain.low), ("s", plain.s, plain.low), ("v", plain.v, plain.high), ("t", plain.t, plain.high)):
+        sides = (("w", plain.w, plain.low), ("s", plain.s, plain.low), ("v", plain.v, plain.high), ("t", plain.t, plain.high))
+        for name, own, there in sides:
             if work._upper or name in "ws":
                 np.testing.assert_allclose(work._pairs[name].numpy()[place][there], own[there], rtol=1e-5, atol=tolerance, err_msg=name)
 
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 @pytest.mark.parametrize(
-    "settings", [{}, {"start": 0.02}, {"backoff": 0.8}, {"mehrotra": False}, {"mehrotra": False, "horizon": 3}], ids=lambda s: repr(s)
+    "settings", [{}, {"start": 0.02}, {"backoff": 0.8}, {"mehrotra": False}, {"mehrotra": False, "horizon": 3}], ids=repr
 )
 def test_steps_are_those_of_the_algorithm(kind, settings, device):
     """Both rules; a start near the bounds, whose first steps are cut short; the book's horizon, after which `backoff` is the share."""
@@ -161,7 +162,8 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(bounds, mehrotra):
     A, n = dense[np.ix_(fluid, fluid)], int(fluid.sum())
     b, field = 2 * rng.standard_normal(n), np.zeros(cells.size)
     field[fluid] = b
-    problem, method = wl.LCP(wl.GridPoisson(cells, device="cpu"), field.reshape(cells.shape), *bounds), InteriorPoint(mehrotra=mehrotra, **EXACT)
+    problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), field.reshape(cells.shape), *bounds)
+    method = InteriorPoint(mehrotra=mehrotra, **EXACT)
     work = started(method.init(problem), problem)
     plain = PlainPath(A, b, *(np.full(n, side) for side in bounds), mehrotra=mehrotra)
     compare(method, work, problem, plain, problem.layout.places()[fluid], 7, 1e-7)

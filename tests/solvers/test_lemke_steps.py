@@ -1,4 +1,4 @@
-"""Lemke's method pivot by pivot against a tableau of fractions, in which ties are exact: the lexicographic rule, z0 first, the start's row."""
+"""Lemke's method pivot by pivot against a tableau of fractions, where ties are exact: the lexicographic rule, z0 first, the first row."""
 
 from fractions import Fraction
 
@@ -12,8 +12,8 @@ from warp_lcp.solvers.lemke import BandedBasis, Basis
 class PlainTableau:
     """[Book] appendix C: w - M z - d z0 = q in whole numbers; variables are w: 0 ... m-1, z: m ... 2m-1, z0: 2m.
 
-    The row that leaves has the lexicographically least (q, e_1, ..., e_m)-part over the entering column, but z0 leaves whenever its ratio is
-    least; z0 enters in the row whose (q_i, e_i) / d_i is lexicographically least.
+    The row that leaves has the lexicographically least (q, e_1, ..., e_m)-part over the entering column, but z0 leaves whenever its ratio
+    is least; z0 enters in the row whose (q_i, e_i) / d_i is lexicographically least.
     """
 
     def __init__(self, M, q, d):
@@ -108,8 +108,9 @@ def test_z0_leaves_as_soon_as_it_may():
             continue
         basis, plain, outcome = Basis(M.astype(float), q.astype(float), d.astype(float)), PlainTableau(M, q, d), None
         while outcome is None:
-            e, rows = plain.entering, [i for i in range(4) if plain.table[i][plain.entering] > 0]
-            tied = [] if e == 8 else [i for i in rows if plain.table[i][-1] / plain.table[i][e] == min(plain.table[k][-1] / plain.table[k][e] for k in rows)]
+            e = plain.entering
+            ratios = {i: plain.table[i][-1] / plain.table[i][e] for i in range(4) if e != 8 and plain.table[i][e] > 0}
+            tied = [i for i in ratios if ratios[i] == min(ratios.values())]
             there = [i for i in tied if plain.variables[i] == 8]
             seen += bool(there) and min(tied, key=lambda i: plain.key(i, plain.table[i][e])) != there[0]
             outcome = plain.pivot()

@@ -1,4 +1,4 @@
-"""Newton's method on the minimum map iterate by iterate against a plain loop, its index sets at ties, and the method without any other's help."""
+"""Newton's method on the minimum map: iterates against a plain loop, index sets at ties, and the method without any other's help."""
 
 import numpy as np
 import pytest

@@ -14,7 +14,8 @@ class PlainMPRGP:
 
     The residual r = max(min(y, d (x - l)), d (x - u)) has a free part phi, on unknowns off their bounds, and a chopped part beta, on those
     at one. If |beta|^2 > gamma^2 phi'y, a step along -D^-1 beta to the least energy comes first; then one of conjugate gradients on the
-    free set, whose direction is new where the set has changed. Both are projected, and halved while the set has changed and the energy rises.
+    free set, whose direction is new where the set has changed. Both are projected, and halved while the set has changed and the energy
+    rises.
     """
 
     def __init__(self, A, b, lower, upper, x, gamma):

@@ -125,7 +125,7 @@ def test_steps_are_those_of_the_algorithm(kind, settings, symmetric, device):
 
 @pytest.mark.parametrize("backtracks", [-1, 4])
 def test_friction_is_at_its_limit_before_and_after_a_correction(backtracks, device):
-    """Contacts of a normal force and two tangential ones, |t| <= mu n: a limit is a constant of each solve, and follows the normal force."""
+    """Contacts of a normal force and two tangential ones, |t| <= mu n: limits are constants of a solve, and follow the normal force."""
     slid = 0
     for seed in range(4721, 4727):
         rng = np.random.default_rng(seed)

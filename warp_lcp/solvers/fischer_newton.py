@@ -197,11 +197,11 @@ class FischerWorkspace(IterateMemory):
         return self._fall_back(x, iterations)
 
     def _take_full_step(self, x: wp.array[Any], size: float, merit: float) -> bool:
-        """Move by size e; return whether the merit falls by the share of it that a search asks of an exact direction, whose slope is -f'f."""
+        """Move by size e; return whether the merit falls by the share that a search asks of an exact direction, whose slope is -f'f."""
         return self._trial(x, size) <= self._search.limit - 2 * DECREASE * merit
 
     def _searched(self, x: wp.array[Any], size: float) -> bool:
-        """Go back and search along e by the merit's own slope, which the linear solve's error makes another one; return whether it helps."""
+        """Go back and search along e by the merit's own slope, which is another one where e is inexact; return whether it helps."""
         self._go(x, 0.0)
         self._evaluate(x)
         slope = size * self.map.slope(x, self.system.e)

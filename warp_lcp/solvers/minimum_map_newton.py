@@ -119,8 +119,9 @@ class MinimumMapNewton(Settings):
         """
         if self.direct:
             return DirectNewtonWorkspace(problem, self)
-        on_grid = takes_points(problem.A) and self.safeguard
-        return GridNewtonWorkspace(problem, problem.A, self) if on_grid else NewtonWorkspace(problem, self)
+        if self.safeguard and takes_points(problem.A):
+            return GridNewtonWorkspace(problem, problem.A, self)
+        return NewtonWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
