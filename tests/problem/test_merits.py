@@ -44,16 +44,16 @@ def test_sweeps_converge_linearly_in_the_modified_merit():
 
 
 def test_in_a_box_distances_are_those_to_the_bound_that_y_asks_for():
-    """y = x + b on rows at l = -1 (y = 1), at u = 2 (y = -3), of u alone (x = 0 under 4, y = 1), and of no bound (y = 5 at x = 0)."""
+    """y = x + b; x half above l where y > 0, half below u where y < 0, under u alone, and without a bound."""
     problem = wl.LCP(
-        wl.DenseOperator(np.eye(4), device="cpu"), np.array([2.0, -5.0, 1.0, 5.0]), np.array([-1.0, 1.0, -np.inf, -np.inf]),
+        wl.DenseOperator(np.eye(4), device="cpu"), np.array([2.0, -5.0, 1.0, 5.0]), np.array([-2.25, 1.0, -np.inf, -np.inf]),
         np.array([2.0, 2.0, 4.0, np.inf]),
     )  # fmt: skip
-    x = np.array([-0.5, 1.5, 0.0, 0.0])
+    x = np.array([-1.75, 1.5, 0.0, 0.0])
     result = wl.solve(problem, wl.ProjectedSOR(), x0=x, stopping=wl.StoppingCriteria(max_iterations=0, merits=True))
     y, distance, sign = x + np.array([2.0, -5.0, 1.0, 5.0]), np.array([0.5, 0.5, 4.0, 0.0]), np.array([1.0, -1.0, -1.0, 1.0])
     merits = result.history[0].merits
-    assert merits.largest == 1.5
+    assert merits.largest == 1.75
     assert merits.complementarity == pytest.approx(abs(distance @ (sign * y)))
     assert merits.absolute == pytest.approx(distance @ np.abs(y))
 

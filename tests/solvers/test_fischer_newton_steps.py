@@ -13,6 +13,7 @@ from plain_fischer import LEAST_Q, PlainMap, armijo
 from warp_lcp.gallery.contact_scenes import contact
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
+from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.nonsmooth_map import NonsmoothMap
 
 BOUNDS = [(0.0, np.inf), (-1.0, 0.5), (-np.inf, 0.25), (-np.inf, np.inf)]
@@ -142,6 +143,79 @@ def test_safeguarded_steps_on_the_host_are_those_of_the_algorithm():
             outside += int(((y < lower) | (y > upper)).any())
     assert outside > 3
     assert min(lengths) < 1
+
+
+def smoothed_row(a, y, c, low, high, mu):
+    """f of psi_mu(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu), and its derivatives by x / d and by y."""
+
+    def psi(a, b):
+        rho = math.sqrt(a * a + b * b + 2 * mu)
+        return a + b - rho, 1 - a / rho, 1 - b / rho
+
+    f, p, q = y, 0.0, 1.0
+    if high:
+        f, q, p = psi(-y, c)
+        f = -f
+    if low:
+        f, by_a, by_h = psi(a, f)
+        p, q = by_a + by_h * p, by_h * q
+    return f, p, q
+
+
+@pytest.mark.parametrize("stage", [0, 1])
+def test_steps_of_the_homotopies_are_those_of_the_smoothed_map(stage):
+    """Newton for A x + b = y and f_mu(x, y) = 0 at once, halved until (|A x + b - y|, |f_mu|) falls; mu falls by .3, then by .5 from 10."""
+    halved = 0
+    for seed in range(4210, 4216):
+        A, b, lower, upper, x, _ = unit_rows(seed, share=0.95)
+        low, high = np.isfinite(lower), np.isfinite(upper)
+        work = FischerNewton().init(wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper))
+        work.x.assign(x)
+        work.residual.evaluate(work.x)
+        work.start(warm=True, tolerance=0.0)
+        for _ in range(stage + 1):
+            work._next_stage()
+        x = np.clip(10.0, lower, upper) if stage else x
+        y, mu = np.where(low & ~high, np.maximum(A @ x + b, 1.0), A @ x + b), 1.0
+
+        def map_at(x, y, mu, low=low, high=high, lower=lower, upper=upper):
+            rows = [smoothed_row(x[i] - lower[i], y[i], upper[i] - x[i], low[i], high[i], mu) for i in range(len(x))]
+            return tuple(np.array(column) for column in zip(*rows, strict=True))
+
+        for _ in range(6):
+            work._homotopy()
+            gap, (f, p, q) = A @ x + b - y, map_at(x, y, mu)
+            dx = np.linalg.solve(np.diag(p) + q[:, None] * A, -f - q * gap)
+            dy, t, size = A @ dx + gap, 1.0, math.hypot(np.linalg.norm(gap), np.linalg.norm(f))
+            while t > 1e-6:
+                after = math.hypot(*(np.linalg.norm(v) for v in (A @ (x + t * dx) + b - y - t * dy, map_at(x + t * dx, y + t * dy, mu)[0])))
+                if after <= (1 - 1e-4 * t) * size:
+                    break
+                t, halved = t / 2, halved + 1
+            x, y, mu = x + t * dx, y + t * dy, (0.5 if stage else 0.3) * mu
+            np.testing.assert_allclose(work._iterate, x, rtol=1e-8, atol=1e-9)
+            np.testing.assert_allclose(work._y, y, rtol=1e-8, atol=1e-9)
+    assert halved > 0
+
+
+def test_gradient_steps_are_those_of_the_algorithm():
+    """[Book] algorithm 13: x = clip(x - t d^-2 J'f), t halved from Barzilai and Borwein's length until the merit falls."""
+    halved = 0
+    for seed, form in ((4205, "fischer"), (4207, "penalized"), (4209, "natural"), (4213, "fischer")):
+        A, b, lower, upper, x = unlike_rows(seed)
+        plain, method = PlainMap(form, A, b, lower, upper, share=0.95), GradientDescent(map=form, memory=3)
+        merits, length, last = [], 1.0, None
+        for got in steps_of(wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), method, x, 8):
+            g = plain.jacobian(x).T @ plain.rows(x)[0] / plain.d
+            if last is not None:
+                change = 1 - g @ last / (last @ last)
+                length = length / change if change > 1e-6 else 10 * length
+            last, merits = g, [*merits, plain.merit(x) * (1 - 1e-12)][-3:]
+            while plain.merit(np.clip(x - length * g / plain.d, lower, upper)) > max(merits):
+                length, halved = length / 2, halved + 1
+            x = np.clip(x - length * g / plain.d, lower, upper)
+            np.testing.assert_allclose(got, x, rtol=1e-9, atol=1e-10)
+    assert halved > 0
 
 
 def unit_rows(seed, share, n=7):
