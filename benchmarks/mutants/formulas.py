@@ -93,7 +93,6 @@ FORMULAS = [
         "solvers/fischer_newton.py",
         NEWTON,
         ("limit - 2 * DECREASE * merit", "limit + 2 * DECREASE * merit"),
-        ("limit - 2 * DECREASE * merit", "limit - 0.6 * merit"),
         (
             "self.map.advance(self._from, self.system.e, scale, x, projected=True)",
             "self.map.advance(self._from, self.system.e, scale, x, projected=False)",
@@ -237,7 +236,7 @@ FORMULAS = [
         ("residual.evaluate(x) < norm or", "residual.evaluate(x) < norm and"),
         ("if solve > 0 and not moved", "if not moved"),
         ("for halving in range(max(s.backtracks, 0) + 1)", "for halving in range(max(s.backtracks, 0) + 2)"),
-        ("return 0.5 * float(self._sums", "return float(self._sums"),
+        ("(self.residual.y, self.problem.b)", "(self.residual.y, self.residual.y)"),
         ("        wp.copy(x, self._before)\n        residual.current = False", "        residual.current = False"),
         ("            work.sweep.run(x, forward=True)", "            work.sweep.run(x, forward=False)"),
     ),

@@ -7,6 +7,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble
 from warp_lcp.solvers.mprgp import MPRGP
+from warp_lcp.solvers.projected_multigrid_kernels import conjugate
 
 
 class PlainMPRGP:
@@ -169,15 +170,28 @@ def test_a_narrow_box_shortens_the_chopped_gradient_not_the_way_to_the_least_ene
     assert (length * s < width)[s > 0].any()
 
 
-@pytest.mark.parametrize(("gamma", "releases"), [(0.9, True), (1.1, False)])
+@pytest.mark.parametrize(("gamma", "releases"), [(1.4, True), (1.6, False)])
 def test_gamma_is_the_ratio_of_the_parts(gamma, releases):
-    """|beta| = 3 and phi'y = 9: gamma = 1 is where proportioning begins, on a matrix and on a grid."""
-    dense = wl.LCP(wl.DenseOperator(np.diag([4.0, 1.0]), device="cpu"), np.array([-1.0, -3.0]), 0.0, 100.0)
+    """|beta| = 3 and phi'y = 1 * 4, as the bound is nearer than y asks for: gamma = 1.5 is where proportioning ends, on a grid too."""
+    dense = wl.LCP(wl.DenseOperator(np.eye(2), device="cpu"), np.array([3.0, -3.0]), 0.0, 100.0)
     cells = np.array([[wl.AIR, wl.FLUID, wl.AIR, wl.FLUID, wl.AIR]])
-    b = np.array([[0.0, -1.0, 0.0, -3.0, 0.0]])  # the diagonal is 2
+    b = np.array([[0.0, 3.0, 0.0, -3.0, 0.0]])  # the diagonal is 2
     on_grid = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b, 0.0, 100.0)
-    for problem, x0 in ((dense, np.array([1.0, 0.0])), (on_grid, np.array([[0.0, 2.0, 0.0, 0.0, 0.0]]))):
+    for problem, x0 in ((dense, np.array([1.0, 0.0])), (on_grid, np.array([[0.0, 0.5, 0.0, 0.0, 0.0]]))):
         method = MPRGP(gamma=gamma, monotone_cycles=0, precision="double")
         work = started(problem, method, x0)
-        assert (work.residual.chopped, work.residual.reduced) == pytest.approx((9.0, 9.0))
+        assert (work.residual.chopped, work.residual.reduced) == pytest.approx((9.0, 4.0))
         assert method.step(problem, work, work.x).name == ("proportioning" if releases else "conjugate gradient")
+
+
+def test_products_of_the_conjugate_direction():
+    """beta, curvature and gain of z + beta p from the products of z and p, which need not be orthogonal to the gradient."""
+    rng = np.random.default_rng(4621)
+    B, z, p, g = rng.standard_normal((5, 5)), *rng.standard_normal((3, 5))
+    A = B @ B.T
+    beta, curvature, gain = conjugate.func(z @ A @ z, z @ A @ p, g @ z, g @ p, p @ A @ p, 1e-3)
+    q = z + beta * p
+    assert q @ A @ p == pytest.approx(0.0, abs=1e-12)
+    assert (curvature, gain) == pytest.approx((q @ A @ q, g @ q))
+    z = p + 1e-3 * z  # nearly the last direction: what is left of it is rounding
+    assert conjugate.func(z @ A @ z, z @ A @ p, g @ z, g @ p, p @ A @ p, 1e-3) == pytest.approx((0.0, z @ A @ z, g @ z))
