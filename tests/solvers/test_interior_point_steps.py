@@ -110,6 +110,7 @@ def boxed_rows(seed, n=11):
     B, C = rng.standard_normal((2, n, n))
     lower, upper = np.array([ROWS[k % 5] for k in range(n)]).T
     upper[6] = 40.0  # a side that a start does not halve
+    lower[1], upper[1] = -0.25, 1.0  # and one that it does, from the lower end
     return B @ B.T + n * np.eye(n) + 0.3 * (C - C.T), 4 * rng.standard_normal(n), lower, upper
 
 
