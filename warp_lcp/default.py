@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Never
+from typing import Any, Never
 
 import scipy.sparse
 import warp as wp
@@ -31,7 +31,7 @@ SMALL = 600  # unknowns up to which a factorization of a dense matrix takes a hu
 LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
 ANY_NUMBERING = (MinimumMapNewton, MPRGP)  # methods whose steps do not depend on the unknowns' order, but for rounding and aggregates
 LEAST = 1e-9  # seconds that are left to a solve whose renumbering has taken them all
-PATIENT = {"max_iterations": 1000, "patience": 300}  # of bodies of mass ratios to 1e7, whose residual rises and falls
+PATIENT: dict[str, Any] = {"max_iterations": 1000, "patience": 300}  # of bodies of mass ratios to 1e7, whose residual rises and falls
 RESERVED, FEW = 4, 40  # one step of four is kept for the alternatives of a method for matrices, of limits from FEW steps on
 ENDED = (
     SolveStatus.CONVERGED,

@@ -21,7 +21,8 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any, NoReturn
 
-from warp_lcp.benchmarks.mutants.mutations import Mutant, draw, mutated
+from warp_lcp.benchmarks.mutants.formulas import FORMULAS
+from warp_lcp.benchmarks.mutants.mutations import FORMULA, Mutant, draw, mutated, of_formulas
 from warp_lcp.benchmarks.mutants.tests_of import tests_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -128,7 +129,8 @@ def judge(mutant: Mutant) -> dict[str, object]:
     """Apply a mutant, run its tests and take it back; tests that fail without it too are left out from then on."""
     path = TREE / mutant.module
     whole, stat = path.read_text(), path.stat()
-    chosen, spent, verdict, by = tests_of(TREE, mutant.module), 0.0, "alive", ""
+    chosen = [FORMULAS[mutant.occurrence].tests] if mutant.operator == FORMULA else tests_of(TREE, mutant.module)
+    spent, verdict, by = 0.0, "alive", ""
     rounds = list(FILES)
     while rounds and verdict == "alive":
         path.write_text(mutated(whole, mutant.operator, mutant.occurrence))
@@ -168,6 +170,9 @@ def options() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=7, help="of which ones")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--out", type=Path, default=ROOT / "out/mutants", help="folder of the report; of a run that was stopped: go on")
+    parser.add_argument(
+        "--formulas", action="store_true", help="the changes of formulas.py, with the tests named there, instead of drawn ones"
+    )
     parser.add_argument("--again", type=Path, help="a mutants.json whose survivors are tried, instead of new ones")
     parser.add_argument("--files", type=int, nargs=2, default=FILES, help="so many test files, then so many where a mutant survives")
     parser.add_argument("--seconds", type=float, default=5.0, help="of a file's tests on a processor: those that start later are left out")
@@ -185,7 +190,7 @@ def main() -> None:
     if given.again:
         drawn = [Mutant(*(r[name] for name in Mutant._fields)) for r in json.loads(given.again.read_text()) if r["verdict"] != "killed"]
     else:
-        drawn = draw(ROOT, given.count, given.seed)
+        drawn = of_formulas(ROOT) if given.formulas else draw(ROOT, given.count, given.seed)
     results = json.loads(kept.read_text()) if kept.exists() else []
     done = {tuple(r[name] for name in Mutant._fields[:4]) for r in results}
     todo = [mutant for mutant in drawn if mutant[:4] not in done]

@@ -1,4 +1,4 @@
-"""What is changed: cosmic-ray's operators that leave code plausible, calls left out, and operators in headers of C++."""
+"""What is changed: cosmic-ray's operators that leave code plausible, calls left out, operators in headers of C++, and formulas."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from cosmic_ray.ast import ast_nodes
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator
+
+from warp_lcp.benchmarks.mutants.formulas import FORMULAS
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
 # lines that only a type checker, the time of a compiler or an eye can tell
@@ -32,6 +34,7 @@ NAMES = (
 SWAPS = {"+": "-", "-": "+", "*": "/", "/": "*", "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "&&": "||", "||": "&&"}
 SWAPS |= {"&": "|", "|": "&"}
 NATIVE_SWAP = "NativeSwap"  # one of them for its neighbor
+FORMULA = "Formula"  # one of FORMULAS
 NATIVE = re.compile(r"(?<=[\w\])] )(?:[<>=!]=|&&|\|\||[-+*/<>&|])(?= [\w(!-])|(?<=[\w\])])[*/](?=[\w(])")
 
 
@@ -79,10 +82,21 @@ def native_places(source: str) -> list[re.Match[str]]:
 
 def mutated(source: str, name: str, occurrence: int) -> str:
     """Return the source with one change."""
+    if name == FORMULA:
+        return source.replace(FORMULAS[occurrence].before, FORMULAS[occurrence].after)
     if name == NATIVE_SWAP:
         match = native_places(source)[occurrence]
         return source[: match.start()] + SWAPS[match[0]] + source[match.end() :]
     return str(mutate_code(source, operator(name), occurrence))
+
+
+def of_formulas(root: Path) -> list[Mutant]:
+    """Return the mutants of FORMULAS."""
+    found = []
+    for number, (module, before, after, _) in enumerate(FORMULAS):
+        source = (root / module).read_text()
+        found.append(Mutant(module, source.count("\n", 0, source.index(before)) + 1, FORMULA, number, before.strip(), after.strip()))
+    return found
 
 
 def draw(root: Path, count: int, seed: int) -> list[Mutant]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from warp_lcp.benchmarks.mutants.formulas import FORMULAS
 from warp_lcp.benchmarks.mutants.tests_of import tests_of as chosen_for
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,6 +30,24 @@ def test_a_mutant_is_one_change_that_still_is_python():
             ast.parse(after)
         pairs = list(zip(before.splitlines(), after.splitlines(), strict=False))
         assert (mutant.before, mutant.after) in [(a.strip(), b.strip()) for a, b in pairs if a != b]
+
+
+def test_formulas_stand_where_their_mutants_look_for_them():
+    for formula in FORMULAS:
+        assert (ROOT / formula.module).read_text().count(formula.before) == 1, formula
+        assert formula.before != formula.after
+        assert (ROOT / formula.tests).exists()
+    assert len(FORMULAS) == len(set(FORMULAS)) >= 150
+
+
+def test_mutants_of_formulas_are_one_change():
+    pytest.importorskip("cosmic_ray")
+    from warp_lcp.benchmarks.mutants.mutations import mutated, of_formulas
+
+    for mutant, formula in zip(of_formulas(ROOT), FORMULAS, strict=True):
+        source = (ROOT / mutant.module).read_text()
+        assert formula.before.split("\n")[0].strip() in source.splitlines()[mutant.line - 1]
+        assert mutated(source, mutant.operator, mutant.occurrence) == source.replace(formula.before, formula.after) != source
 
 
 def test_headers_are_changed_between_operands_only():

@@ -11,6 +11,8 @@ from warp_lcp.problem.pickling import FieldsOnHost
 if TYPE_CHECKING:
     import warp as wp
 
+    from warp_lcp.problem.merits import Merits
+
 
 class SolveStatus(Enum):
     """How a solve ended. The value says what it means and what to try next."""
@@ -59,6 +61,7 @@ class Record:
         active: unknowns held at a bound in the last step; None where the method has no active set.
         step: what the last step was, a word of the method ("newton", "monotone cycle", "sweep", ...).
         seconds: wall time since the start of the solve.
+        merits: the book's merit functions, where `StoppingCriteria(merits=True)` asks for them.
     """
 
     iteration: int
@@ -67,6 +70,7 @@ class Record:
     active: int | None
     step: str
     seconds: float
+    merits: Merits | None = None
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import warp as wp
 from warp_lcp.deadline import Deadline, TimeIsUp
 from warp_lcp.problem.curvature import has_negative_curvature
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.merits import Merits, merits_at
 from warp_lcp.problem.protocol import NamesComponents, asks_beyond_storage, has, version_of
 from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
@@ -359,13 +360,17 @@ class _Loop:
 
     def _record(self, iteration: int, step: Step) -> None:
         seconds = time.perf_counter() - self.begun
-        record = Record(iteration, self.residual.norm, self.linear, step.active, step.name, seconds)
+        record = Record(iteration, self.residual.norm, self.linear, step.active, step.name, seconds, self._merits())
         self.history.append(record)
         if self.callback is not None:
             try:
                 self.callback(record)
             except StopIteration:
                 self.stopped = True
+
+    def _merits(self) -> Merits | None:
+        """Return the merit functions at the iterate, if they are asked for."""
+        return None
 
     def _keep(self, iteration: int) -> None:
         """Remember the iterate as the best one."""
@@ -394,6 +399,7 @@ class _LoopInBox(_Loop):
     """The state of a solve of an LCP."""
 
     problem: LCP
+    _y: wp.array[Any] | None = None  # of merit functions
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
         """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
@@ -441,6 +447,14 @@ class _LoopInBox(_Loop):
         self._record(0, Step("start", 0))
         self._keep(0)
         return True
+
+    def _merits(self) -> Merits | None:
+        """Return the merit functions at the iterate, if they are asked for."""
+        if not self.stopping.merits:
+            return None
+        if self._y is None:
+            self._y = self.problem.layout.zeros(wp.float64)
+        return merits_at(self.problem, self.work.x, self._y)
 
     def _trivial(self) -> SolveStatus | None:
         """Return how a solve ends whose data are not finite or solved by the start; refuse what would seem so."""

@@ -27,6 +27,7 @@ class StoppingCriteria(Settings):
         max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A method's set-up counts. What cannot be cut
             short is finished first: a pivot, a sweep, an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a
             linear solve, whose loop the host does not see. On ranks time is up for all as soon as it is for one.
+        merits: record the book's merit functions in the history as well (`Record.merits`), by one more product with A a step; no criteria.
 
     Example:
         >>> StoppingCriteria(rtol=1e-3, atol=1e-2).tolerance(5.0)
@@ -43,6 +44,7 @@ class StoppingCriteria(Settings):
     patience: Count = 30
     divergence: Annotated[float, Gt(1), OrInfinite] = 1e8
     max_seconds: Annotated[float, Gt(0), OrInfinite] = math.inf
+    merits: bool = False
 
     def tolerance(self, reference: float) -> float:
         """Return the absolute tolerance for a reference residual norm."""

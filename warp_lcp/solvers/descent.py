@@ -125,6 +125,11 @@ class NonmonotoneSearch:
         """Note the merit where a step starts."""
         self.merits = [*self.merits, merit][-self.memory :]
 
+    @property
+    def limit(self) -> float:
+        """The largest of the remembered merits, which a step may not exceed."""
+        return max(self.merits)
+
     def search(self, trial: Callable[[float], float], slope: float, *, first: float = 1.0) -> tuple[float, float]:
         """Return the first of the halved steps that the merits allow, and its merit; step 0 if none down to `least` is.
 
@@ -133,7 +138,7 @@ class NonmonotoneSearch:
             slope: derivative of the merit along the direction, < 0.
             first: the first length tried.
         """
-        limit, length = max(self.merits), first
+        limit, length = self.limit, first
         while length >= self.least:
             check_time()
             merit = trial(length)

@@ -18,9 +18,9 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import NoTranspose
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll
-from warp_lcp.solvers.descent import NonmonotoneSearch
+from warp_lcp.solvers.descent import DECREASE, NonmonotoneSearch
 from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
-from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
+from warp_lcp.solvers.fischer_newton_dense import STATIONARY, FischerDenseWorkspace
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
@@ -187,8 +187,7 @@ class FischerWorkspace(IterateMemory):
         self._gone = 0.0
         if not s.safeguard:
             wp.copy(self._from, x)
-        length, _ = self._search.search(lambda t: self._trial(x, t * size), -2 * merit)
-        if length > 0.0:
+        if self._take_full_step(x, size, merit) or self._searched(x, size):
             if self.residual.norm <= self.target:
                 self._project(x)
             return Step("fischer", iterations)
@@ -196,6 +195,17 @@ class FischerWorkspace(IterateMemory):
         self._go(x, 0.0)
         self._evaluate(x)
         return self._fall_back(x, iterations)
+
+    def _take_full_step(self, x: wp.array[Any], size: float, merit: float) -> bool:
+        """Move by size e; return whether the merit falls by the share that a search asks of an exact direction, whose slope is -f'f."""
+        return self._trial(x, size) <= self._search.limit - 2 * DECREASE * merit
+
+    def _searched(self, x: wp.array[Any], size: float) -> bool:
+        """Go back and search along e by the merit's own slope, which is another one where e is inexact; return whether it helps."""
+        self._go(x, 0.0)
+        self._evaluate(x)
+        slope = size * self.map.slope(x, self.system.e)
+        return slope < 0 and self._search.search(lambda t: self._trial(x, t * size), slope)[0] > 0.0
 
     def _project(self, x: wp.array[Any]) -> None:
         """Move x onto its bounds, which it may miss by what the criteria allow; the solve goes on if they are not met there."""
@@ -220,9 +230,10 @@ class FischerWorkspace(IterateMemory):
 
     def _fall_back(self, x: wp.array[Any], iterations: int) -> Step:
         """Go down the gradient where Newton's direction is of no use, or say so."""
-        if not self.settings.safeguard:
-            return Step("fischer", iterations, None, SolveStatus.NON_DESCENT)
         try:
+            if not self.settings.safeguard:
+                stationary = self.map.is_stationary(x, STATIONARY)
+                return Step("fischer", iterations, None, SolveStatus.LOCAL_MINIMUM if stationary else SolveStatus.NON_DESCENT)
             step = self.descend(x)
         except NoTranspose:  # of an operator that has products only
             return Step("fischer", iterations, None, SolveStatus.NON_DESCENT)

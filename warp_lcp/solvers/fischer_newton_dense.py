@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27
 REGULARIZATION = 1e-6  # nu is this times min(1, ||f||), A's entries being near 1: J'J + nu I has a factorization whatever J is
 HOMOTOPIES = ((None, 1.0, 0.3, 40), (10.0, 1.0, 0.5, 60))  # start of x (None: as the solve began), first mu, its factor, steps
+# projected gradient, in parts of ||f||, up to which a point where a search has failed is stationary: the shortest steps, 1e-8, leave up to
+# that of a local minimum's gradient; where searches fail on contacts for other reasons it is 1 to 4
+STATIONARY = 1e-4
 DESCENT = 1e-10  # a direction whose slope is less than this times ||dx||^2.1 is no descent
 
 
@@ -173,7 +176,9 @@ class FischerDenseWorkspace(DenseWorkspace):
         gradient = J.T @ f
         if np.linalg.norm(gradient / map_.d) <= 1e-12 * np.linalg.norm(f):
             return SolveStatus.LOCAL_MINIMUM
-        return self._searched(x, dx, float(gradient @ dx), 0.5 * float(f @ f), projected=True)
+        failure = self._searched(x, dx, float(gradient @ dx), 0.5 * float(f @ f), projected=True)
+        inside = map_.d * (x - np.clip(x - gradient / map_.d**2, map_.data.lower, map_.data.upper))
+        return SolveStatus.LOCAL_MINIMUM if failure and np.linalg.norm(inside) <= STATIONARY * np.linalg.norm(f) else failure
 
     def _regularized(self) -> SolveStatus | None:
         """Take a step of the safeguarded method, along the gradient if that of Newton's is no descent."""

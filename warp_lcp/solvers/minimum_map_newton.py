@@ -87,6 +87,8 @@ class MinimumMapNewton(Settings):
         cycle: how multigrid cycles go.
         direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200 unknowns or a bandwidth up to 3: what
             `default_method` chooses there. The steps above take over where these lead nowhere.
+        safeguard: True: what is described above. False: the book's method alone, its Newton steps with Armijo's monotone search from the
+            first to the last, and NON_DESCENT where no share of a step lowers the residual, as on some contacts ([Book] fig. C.2b).
     """
 
     needs: ClassVar[str] = "positive definite or P-matrix"
@@ -102,6 +104,12 @@ class MinimumMapNewton(Settings):
     memory: Count = 4
     cycle: CycleSettings = field(default_factory=CycleSettings)
     direct: bool = False
+    safeguard: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.direct and not self.safeguard:
+            raise ValueError("direct = True: goes on by safeguarded steps, and cannot be combined with safeguard = False")
 
     def init(self, problem: LCP) -> NewtonWorkspace | GridNewtonWorkspace | DirectNewtonWorkspace:
         """Return a workspace.
@@ -111,7 +119,9 @@ class MinimumMapNewton(Settings):
         """
         if self.direct:
             return DirectNewtonWorkspace(problem, self)
-        return GridNewtonWorkspace(problem, problem.A, self) if takes_points(problem.A) else NewtonWorkspace(problem, self)
+        if self.safeguard and takes_points(problem.A):
+            return GridNewtonWorkspace(problem, problem.A, self)
+        return NewtonWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
@@ -139,10 +149,11 @@ class NewtonWorkspace(IterateMemory):
         self.system = self._principal_system()
         self.free = layout.zeros(wp.uint8)
         self._sums = Sums(rows_of(self.x), 4, slots=SLOTS, across=layout.across)
-        cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
+        helped = self.bounded and settings.safeguard
+        cycled = helped and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
         self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
         self.coarse = CoarseProblem(problem.A, settings) if cycled else None
-        if self.bounded and isinstance(self.system, LineSystem):
+        if helped and isinstance(self.system, LineSystem):
             self.coarse = CoarseStencilProblem(problem.A, self.system, settings)  # type: ignore[arg-type]
         self.start(warm=True, tolerance=0.0)
 
@@ -152,7 +163,7 @@ class NewtonWorkspace(IterateMemory):
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the active set; the operator may have changed."""
-        cold_grid = isinstance(self.system, GridSystem) and self.bounded and not warm
+        cold_grid = isinstance(self.system, GridSystem) and self.bounded and self.settings.safeguard and not warm
         self.cycles_left = self.settings.monotone_cycles if cold_grid else 0
         if self.aggregates is not None and not warm and self.settings.monotone_cycles > 0 and self.aggregates.refresh():
             self.cycles_left = (2 if self.problem.A.shape[0] < HUGE else 6) * self.settings.monotone_cycles
@@ -216,7 +227,7 @@ class NewtonWorkspace(IterateMemory):
             self._equations = False
             if incompatible(p):
                 return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
-        self.norms = [*self.norms, residual.norm][-self.settings.memory :]
+        self.norms = [*self.norms, residual.norm][-(self.settings.memory if self.settings.safeguard else 1) :]
         size = residual.norm
         fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "scale": 1 / size}
         moved, active, shifted, square = self._sums.of(CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, **fields)
@@ -301,6 +312,10 @@ class NewtonWorkspace(IterateMemory):
             if norm < best:
                 best, best_scale = norm, scale
             scale *= 0.5
+        if not s.safeguard:
+            wp.copy(x, self.trial)
+            residual.evaluate(x)
+            return Step("newton", iterations, active, SolveStatus.NON_DESCENT)
         self._correct(self.trial, self.system.e, best_scale * size, x)
         if isinstance(self.system, GridSystem) and self.bounded:
             residual.evaluate(x)
@@ -330,6 +345,8 @@ class NewtonWorkspace(IterateMemory):
 
     def _may_resort(self) -> bool:
         """Return whether another iteration can be had, and the residual is above what rounding leaves."""
+        if not self.settings.safeguard:
+            return False
         floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
         return self.last_resort and self.residual.norm > floor and (ProximalPoint.suits(self.problem) or AlgebraicSteps.suits(self.problem))
 

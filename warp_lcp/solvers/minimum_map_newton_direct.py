@@ -100,6 +100,8 @@ class HostResidual(NaturalResidual):
         matrix: its A.
     """
 
+    _taken = False  # whether A, b and the bounds are at hand
+
     def __init__(self, problem: LCP, matrix: SmallMatrix | NarrowMatrix) -> None:
         self.problem, self.matrix = problem, matrix
         self.norm, self.current, self.unit = 0.0, False, 1.0
@@ -116,19 +118,26 @@ class HostResidual(NaturalResidual):
         """What `evaluate` computes y in, likewise."""
         return wp.array(self._y, dtype=wp.float64, device=self.problem.device, copy=False)
 
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
-        """Set x to clip(x, l, u), or to clip(0, l, u)."""
+    def _take(self) -> None:
+        """Take A, b and the bounds as they are now."""
         self.matrix.refresh()
         bounds = self.problem.bounds
         self.lower, self.upper, self.b = bounds.host(0), bounds.host(1), self.problem.b.numpy()
         self.scale = self.problem.A.scale()  # type: ignore[attr-defined]
         self.__dict__.pop("diagonal", None)
+        self._taken = True
+
+    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+        """Set x to clip(x, l, u), or to clip(0, l, u)."""
+        self._take()
         values = self.values(x)
         np.clip(values if keep else 0.0, self.lower, self.upper, out=values)
         self.current = False
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute y and return the norm of the natural residual at x."""
+        if not self._taken:  # a block among others is looked at before it is solved
+            self._take()
         values, y, d = self.values(x), self._y, self.scale
         np.add(self.matrix.product(values), self.b, out=y)
         with np.errstate(invalid="ignore", over="ignore"):

@@ -249,7 +249,8 @@ class MPRGPWorkspace(IterateMemory):
         self._product(direction)
         curvature = residual.dot(direction, self._q)
         if not (self.is_grid and curvature > 0):
-            return self._projected_step(direction, residual.release, curvature)
+            wp.copy(self._p, direction)  # where a step ends the residual writes another chopped step, and it may be taken again
+            return self._projected_step(self._p, residual.release, curvature)
         factor, target, p = residual.release / curvature, self._target(), self.problem
         fields = {"x": self.x, "step": direction, "q": self._q, "to": target, "free": residual.free, "g": self.preconditioner.r}
         numbers, stencil = {"part": factor, "length": factor * residual.size}, p.A.stencil  # type: ignore[attr-defined]

@@ -8,6 +8,7 @@ the type of corrections, the others over flat fields.
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.rows import RowPass, Rows, Wave
 from warp_lcp.rows.fields import PaddedLayout
-from warp_lcp.rows.vectors import Sums
+from warp_lcp.rows.vectors import Sums, convert
 
 LEAST_Q = 1e-6  # of q where it divides: measured; less makes D needlessly large, more slows convergence
 
@@ -202,6 +203,34 @@ class NonsmoothMap:
     def direction(self) -> wp.array[Any]:
         """The gradient that `descend` wrote last."""
         return self._gradients[0]
+
+    def slope(self, x: wp.array[Any], e: wp.array[Any]) -> float:
+        """Return the derivative of the merit at x along e, f'J e = (p d f)'e + (q f)'A e: one product, none with A'."""
+        p, layout = self.problem, self.problem.layout
+        along, product, by_x, by_y = (layout.zeros(wp.float64) for _ in range(4))
+        convert(e, along)
+        shape = (layout.size,) if isinstance(layout, PaddedLayout) else layout.stored_shape  # grids take stored fields flat
+        p.A.apply(along.reshape(shape), product.reshape(shape))
+        self._half_sum(WEIGHTED, x, by_x=by_x, by_y=by_y)
+        for slot, (weights, moved) in enumerate(((by_x, along), (by_y, product))):
+            self._sums.dot(weights, moved, slot)
+        return float(self._sums.scalars.numpy()[:2].sum())
+
+    def is_stationary(self, x: wp.array[Any], share: float) -> bool:
+        """Return whether no direction within the bounds lowers the merit at x to first order.
+
+        That is the projected gradient d (x - clip(x - d^-2 J'f)), of at most `share` times ||f||.
+
+        Raises:
+            NoTranspose: A has no products with A'.
+        """
+        p, inside = self.problem, self.problem.unknown.numpy() == 1
+        merit = self.merit(x)
+        self.descend(x)
+        at, step, lower, upper = (v.numpy()[inside] for v in (x, self.direction, *(p.bounds.as_field(k) for k in (0, 1))))
+        d = np.abs(self.residual.diagonal.numpy()[inside].astype(np.float64) * self.residual.unit)
+        projected = np.where(d == 0, 1.0, d) * (at - np.clip(at - step, lower, upper))
+        return float(np.linalg.norm(projected)) <= share * math.sqrt(2 * merit)
 
     def advance(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], *, projected: bool) -> None:
         """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""

@@ -11,7 +11,7 @@ for (int begin = 0; begin < n; begin += M) {
             const bool in = unknown[k] == 1, held = in & ((x[k] <= l + reach(l)) | (x[k] >= u - reach(u)));
             const T r0 = natural_residual(v, f*(x[k] - l), f*(x[k] - u)), r = in ? r0 : (T)0, h = held ? r : (T)0;
             const S w = (S)(-h*inverse)/(S)f;  // division is what would take longest in double precision
-            norm += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release -= h*inverse*(T)w;
+            norm += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release -= (held ? v : (T)0)*inverse*(T)w;
             energy += in ? (T)0.5*x[k]*(v + b[k]) : (T)0;
             now[k - begin] = in & !held; g[k] = (S)((in & !held) ? -v*inverse : (T)0); step[k] = w; } });
     SIMD64 for (int k = begin; k < end; ++k) {

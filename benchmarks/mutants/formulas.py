@@ -1,0 +1,320 @@
+"""Mutants of the formulas that make an algorithm: signs, constants, index sets, conditions; each with the test file that must notice it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Formula(NamedTuple):
+    """One change of a formula.
+
+    Attributes:
+        module: file, from the root.
+        before: text that stands there once.
+        after: what it becomes.
+        tests: the test file that fails with it.
+    """
+
+    module: str
+    before: str
+    after: str
+    tests: str
+
+
+def _changes(module: str, tests: str, *pairs: tuple[str, str]) -> list[Formula]:
+    """Return changes of one file."""
+    return [Formula(f"warp_lcp/{module}", before, after, f"tests/{tests}") for before, after in pairs]
+
+
+MAP, NEWTON, PATH = "solvers/test_nonsmooth_map.py", "solvers/test_fischer_newton_steps.py", "solvers/test_interior_point_steps.py"
+ACTIVE, GRADIENTS = "solvers/test_minimum_map_newton_steps.py", "solvers/test_mprgp_steps.py"
+SUBSPACE, BLOCKS, PIVOTS = "solvers/test_subspace_minimization_steps.py", "solvers/test_block_steps.py", "solvers/test_lemke_steps.py"
+
+FORMULAS = [
+    *_changes(
+        "solvers/headers/map.h",
+        MAP,
+        ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)1, kq = (R)0;"),
+        ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)0, kq = (R)0;"),
+        ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)-1, kq = (R)5;"),
+        ("kp = 1 - 0.7071067811865476*first", "kp = 1 - first"),
+        ("kq = 1 - 0.7071067811865476*second", "kq = 1 + 0.7071067811865476*second"),
+        ("z1*0x94D049BB133111EBull", "z1*1ull"),
+        ("kink2 = high & (e <= tiny)", "kink2 = false"),
+        ("kink1 = low & (rho <= tiny)", "kink1 = low & (rho < 0)"),
+        ("w*w/(es*(es + c0)) : 1 - c/es", "w*w/(es*(es + c0)) : 1 + c/es"),
+        ("c*c/(es*(es + w0)) : 1 + w/es", "c*c/(es*(es + w0)) : 1 - w/es"),
+        ("h = high ? -below : w", "h = high ? below : w"),
+        ("2*a*h : t - rho", "2*a*h : t + rho"),
+        ("p = p1 + q1*p2, q = q1*q2;", "p = p1 - q1*p2, q = q1*q2;"),
+        ("part*f1 + g*extra", "part*f1 - g*extra"),
+        ("part*f1 + g*extra", "part*f1"),
+        ("a0*yp : (R)0) - (high ? c0*w0", "a0*yp : (R)0) + (high ? c0*w0"),
+        ("(low & (a > 0)) ? yp", "(low & (a < 0)) ? yp"),
+        ("(high & (c > 0)) ? w0", "(high & (c < 0)) ? w0"),
+        ("(low & (w > 0)) ? a0", "(low & (w < 0)) ? a0"),
+        ("(high & (w < 0)) ? c0", "(high & (w > 0)) ? c0"),
+        ("g = (1 - part)*over_b", "g = part*over_b"),
+        ("least = (low & (a < w)) ? a : w", "least = (low & (a > w)) ? a : w"),
+        ("top = high & (-c > least)", "top = high & (c > least)"),
+    ),
+    *_changes(
+        "solvers/headers/map_condense.h",
+        MAP,
+        ("solved ? size*p/qs : 0.0", "solved ? p/qs : 0.0"),
+        ("-scale*f/qs", "-scale*f"),
+        ("(S)size*p*inverse", "(S)p*inverse"),
+        ("solved ? -f*inverse", "solved ? f*inverse"),
+        ("inverse = (S)1/qs; const bool solved = inside & !(drop & kink)", "inverse = (S)1/qs; const bool solved = inside"),
+        ("least_q; const bool solved = inside & !(drop & kink)", "least_q; const bool solved = inside"),
+    ),
+    *_changes(
+        "solvers/headers/map_gradient.h",
+        MAP,
+        ("(gradient[i] + product[i])/size", "(gradient[i] - product[i])/size"),
+        ("gradient[i] = g/size", "gradient[i] = g"),
+    ),
+    *_changes("solvers/headers/map_weighted.h", MAP, ("size*p*f", "p*f")),
+    *_changes(
+        "solvers/nonsmooth_map.py",
+        MAP,
+        ("LEAST_Q = 1e-6", "LEAST_Q = 1e-3"),
+        ("(Kink.ZERO, Kink.APPROXIMATION)", "(Kink.ZERO,)"),
+        ("self.residual.norm_of_b() / np.sqrt(count)", "self.residual.norm_of_b()"),
+    ),
+    *_changes(
+        "solvers/nonsmooth_map.py",
+        NEWTON,
+        ("((by_x, along), (by_y, product))", "((by_y, along), (by_x, product))"),
+        ("np.clip(at - step, lower, upper)", "np.clip(at + step, lower, upper)"),
+        ("share * math.sqrt(2 * merit)", "0 * math.sqrt(2 * merit)"),
+    ),
+    *_changes(
+        "solvers/fischer_newton.py",
+        NEWTON,
+        ("limit - 2 * DECREASE * merit", "limit + 2 * DECREASE * merit"),
+        (
+            "self.map.advance(self._from, self.system.e, scale, x, projected=True)",
+            "self.map.advance(self._from, self.system.e, scale, x, projected=False)",
+        ),
+        ("return slope < 0 and self", "return slope < 1e300 and self"),
+        ("slope = size * self.map.slope(x, self.system.e)", "slope = -2 * self._merit"),
+        ("settings.memory if settings.safeguard else 1", "settings.memory"),
+        ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.LOCAL_MINIMUM if not stationary"),
+        ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.NON_DESCENT if stationary"),
+    ),
+    *_changes(
+        "solvers/descent.py",
+        NEWTON,
+        ("DECREASE = 1e-4", "DECREASE = 0.3"),
+        ("limit + DECREASE * length * slope", "limit - DECREASE * length * slope"),
+        ("            length *= 0.5", "            length *= 0.25"),
+        ("return max(self.merits)", "return min(self.merits)"),
+        ("[*self.merits, merit][-self.memory :]", "[*self.merits, merit]"),
+    ),
+    *_changes(
+        "solvers/fischer_newton_dense.py",
+        NEWTON,
+        ("            return 0.0, 1.0", "            return 1.0, 0.0"),
+        ("            return 0.0, 1.0", "            return 0.0, 0.0"),
+        ("            return 0.0, 1.0", "            return -1.0, 5.0"),
+        ("move = ~kinks if map_.kink is Kink.ZERO", "move = ~kinks if map_.kink is Kink.RANDOM"),
+        ("_solve(J[np.ix_(move, move)], -f[move])", "_solve(J[np.ix_(move, move)], f[move])"),
+        ("(1 - self.share) * extra / self.scale", "(1 - self.share) * extra"),
+        ("self.share * f + (1", "self.share * f - (1"),
+        ("(y > 0) * lowered", "(y < 0) * lowered"),
+        ("0.5 * float(f @ f), projected=True)", "0.5 * float(f @ f), projected=False)"),
+        ("0.5 * float(f @ f), projected=False)", "0.5 * float(f @ f), projected=True)"),
+        ("REGULARIZATION = 1e-6", "REGULARIZATION = 1e-3"),
+        ("2 * (a * b - smoothing)", "2 * (a * b + smoothing)"),
+        ("-f - q * gap", "-f + q * gap"),
+        ("A @ dx + gap, float", "A @ dx - gap, float"),
+        ("self._mu *= self._factor", "self._mu *= 0.5 * self._factor"),
+        ("np.maximum(y, 1.0), y)", "y, y)"),
+        ("(1 - length) * np.linalg.norm(gap)", "np.linalg.norm(gap)"),
+        ("x - gradient / map_.d**2", "x + gradient / map_.d**2"),
+        ("LOCAL_MINIMUM if failure and", "LOCAL_MINIMUM if not failure and"),
+    ),
+    *_changes(
+        "solvers/fischer_newton_dense.py",
+        MAP,
+        ("1 - np.sqrt(0.5) * self._rng.random(n), 1", "1 - self._rng.random(n), 1"),
+        ("np.where(at, kp, 1 - a / safe)", "np.where(at, kp, 1 + a / safe)"),
+        ("p, q = p1 + q1 * p2, q1 * q2", "p, q = p1 + p2, q1 * q2"),
+    ),
+    *_changes(
+        "solvers/interior_point.py",
+        PATH,
+        ("else self.mu / self.steps", "else 0.5 * self.mu / self.steps"),
+        ("else self.mu / self.steps", "else 0.1 * self.mu"),
+        ("self.steps / (s.horizon + 1)", "2 * self.steps / (s.horizon + 1)"),
+        ("min(s.backoff, self.steps", "max(s.backoff, self.steps"),
+        ("after / self.mu)) ** 3", "after / self.mu)) ** 2"),
+        ("length**2 * products / self.count", "length * products / self.count"),
+        ("tau, second = self._center(longest, products), 1.0", "tau, second = self._center(longest, products), 0.0"),
+        ("length = min(1.0, share / longest)", "length = min(1.0, 1 / longest)"),
+        ("min(1.0, s.backoff / longest)", "min(1.0, 1 / longest)"),
+        ("LARGEST_START * self.residual.norm), self.residual.norm)", "LARGEST_START * self.residual.norm), 0.0)"),
+        ("self.settings.start * size / math.sqrt(unknowns)", "self.settings.start * size"),
+    ),
+    *_changes(
+        "solvers/headers/path_condense.h",
+        PATH,
+        ("+ tau*sides", "- tau*sides"),
+        ("sides = iw - iv", "sides = iw + iv"),
+        ("shift = shift + t[i]/v[i]", "shift = shift - t[i]/v[i]"),
+        ("s[i]*iw + t[i]*iv", "s[i]*iw"),
+    ),
+    *_changes(
+        "solvers/headers/path_center.h",
+        PATH,
+        ("double g = (tau - dp*dsp)*iw", "double g = (tau + dp*dsp)*iw"),
+        ("- (tau + dp*dtp)*iv", "- (tau - dp*dtp)*iv"),
+        ("dtp = -t[i] + t[i]*iv*dp", "dtp = -t[i] - t[i]*iv*dp"),
+    ),
+    *_changes(
+        "solvers/headers/path_direction.h",
+        PATH,
+        ("ds = (tau - dp*dsp)*iw", "ds = (tau + dp*dsp)*iw"),
+        ("dt = (tau + dp*dtp)*iv", "dt = tau*iv"),
+        ("- t[i] + t[i]*iv*dx", "- t[i] - t[i]*iv*dx"),
+    ),
+    *_changes(
+        "solvers/headers/path_ratios.h",
+        PATH,
+        ("m = -q > next ? -q : next", "m = -q"),
+        ("k = o > last ? o : last", "k = last"),
+        ("products += dx*ds - dx*dt", "products += dx*ds + dx*dt"),
+        ("third = dx*iv", "third = -dx*iv"),
+    ),
+    *_changes("solvers/headers/path_inside.h", PATH, ("k0 = c < 0.5*span ? c : 0.5*span", "k0 = c < 0.25*span ? c : 0.25*span")),
+    *_changes("solvers/headers/path_multipliers.h", PATH, ("c = -y[i] > least ? -y[i] : least", "c = y[i] > least ? y[i] : least")),
+    *_changes("solvers/headers/path_move.h", PATH, ("vn = v[i] - length*dx", "vn = v[i] + length*dx")),
+    *_changes(
+        "solvers/headers/classify.h",
+        ACTIVE,
+        ("low = v < l", "low = v <= l"),
+        ("high = v > u", "high = v >= u"),
+        ("held ? (low ? l : u)", "held ? (low ? u : l)"),
+        ("v = x[k] - known[k]/e", "v = x[k] - known[k]"),
+    ),
+    *_changes(
+        "solvers/headers/assess.h",
+        ACTIVE,
+        ("low = below < v", "low = below <= v"),
+        ("high = above > v", "high = above >= v"),
+        ("(low ? -mark : mark)", "(low ? mark : -mark)"),
+    ),
+    *_changes("solvers/headers/hold.h", ACTIVE, ("high = g[k] >= mark", "high = g[k] > mark")),
+    *_changes(
+        "solvers/minimum_map_newton_direct.py",
+        ACTIVE,
+        ("target < self._lower", "target <= self._lower"),
+        ("target > self._upper", "target >= self._upper"),
+    ),
+    *_changes(
+        "solvers/minimum_map_newton.py",
+        ACTIVE,
+        ("norm <= (1 - 1e-4 * scale) * limit", "norm <= (1 - 0.5 * scale) * limit"),
+        ("norm <= (1 - 1e-4 * scale) * limit", "norm <= 2 * limit"),
+        ("self.settings.memory if self.settings.safeguard else 1", "self.settings.memory"),
+        ("            scale *= 0.5", "            scale *= 0.25"),
+        ("        if not s.safeguard:\n", "        if s.safeguard and not s.safeguard:\n"),
+        ("        if not self.settings.safeguard:\n            return False\n", ""),
+        ("if self.safeguard and takes_points", "if takes_points"),
+        ("helped = self.bounded and settings.safeguard", "helped = self.bounded"),
+        ("limit, scale, best, best_scale = max(self.norms)", "limit, scale, best, best_scale = min(self.norms)"),
+    ),
+    *_changes(
+        "solvers/headers/between.h", SUBSPACE, ("(x[k] > lower(k))", "(x[k] >= lower(k))"), ("(x[k] < upper(k))", "(x[k] <= upper(k))")
+    ),
+    *_changes("solvers/headers/follow.h", SUBSPACE, ("(v <= was_l)", "(v < was_l)"), ("(v >= was_u)", "(v > was_u)")),
+    *_changes(
+        "solvers/subspace_minimization.py",
+        SUBSPACE,
+        ("size * 0.5**halving", "size * 0.25**halving"),
+        ("residual.evaluate(x) < norm or", "residual.evaluate(x) < norm and"),
+        ("if solve > 0 and not moved", "if not moved"),
+        ("for halving in range(max(s.backtracks, 0) + 1)", "for halving in range(max(s.backtracks, 0) + 2)"),
+        ("(self.residual.y, self.problem.b)", "(self.residual.y, self.residual.y)"),
+        ("        wp.copy(x, self._before)\n        residual.current = False", "        residual.current = False"),
+        ("            work.sweep.run(x, forward=True)", "            work.sweep.run(x, forward=False)"),
+    ),
+    *_changes(
+        "solvers/partition.py",
+        BLOCKS,
+        ("[rows] + self._outer @", "[rows] - self._outer @"),
+        ("            slab[:, rows] = 0.0\n", ""),
+        ("        whole.bounds.follow(self._x)\n        problem.b.assign", "        problem.b.assign"),
+        ("others[rows] = 0.0", "others[rows] = 1.0"),
+        ("x=self._y, less=self._z, target=self._b", "x=self._y, less=None, target=self._b"),
+    ),
+    *_changes("solvers/coupled_problem.py", BLOCKS, ("range(count) if forward else reversed(range(count))", "range(count)")),
+    *_changes(
+        "solvers/blocked_gauss_seidel_kernels.py",
+        BLOCKS,
+        ("c += v * x[j]", "c -= v * x[j]"),
+        ("t[p, j] -= slope", "t[p, j] += slope"),
+        ("new[p] = old[p] + omega * (new[p] - old[p])", "new[p] = old[p] + (new[p] - old[p])"),
+        ("if y < -ROUNDING * terms", "if y > ROUNDING * terms"),
+        ("if x[p] < l - ROUNDING * size", "if x[p] < l - size"),
+        ("                    slope = high.slope[p]\n", ""),
+        ("made.slope[p] = S.coefficient[i]", "made.slope[p] = ZERO"),
+        ("if low.at[p] < 0 and high.at[p] < 0", "if low.at[p] >= 0 and high.at[p] >= 0"),
+    ),
+    *_changes(
+        "solvers/mprgp.py",
+        GRADIENTS,
+        ("self.gamma**2 * work.residual.reduced", "self.gamma * work.residual.reduced"),
+        ("beta = -residual.dot(M.z, self._q)", "beta = residual.dot(M.z, self._q)"),
+        ("            length *= 0.5\n", "            length *= 0.25\n"),
+        ("self._projected_step(self._p, residual.release, curvature)", "self._projected_step(direction, residual.release, curvature)"),
+        ("residual.moved, self._carry = False, False", "residual.moved, self._carry = False, self._carry"),
+        ("factor, target, p = residual.release / curvature", "factor, target, p = 2 * residual.release / curvature"),
+        ("length = gain / curvature * residual.size\n        else", "length = 0.5 * gain / curvature * residual.size\n        else"),
+    ),
+    *_changes(
+        "solvers/headers/split_known.h",
+        GRADIENTS,
+        ("(held ? v : (T)0)*h/e", "h*h/e"),
+        ("(x[k] >= u - reach(u))", "false"),
+        ("reduced += held ? (T)0 : r*v", "reduced += held ? (T)0 : r*r"),
+    ),
+    *_changes(
+        "solvers/headers/split.h",
+        GRADIENTS,
+        ("(held ? v : (T)0)*inverse*(T)w", "h*inverse*(T)w"),
+        ("reduced += held ? (T)0 : r*v", "reduced += held ? (T)0 : r*r"),
+    ),
+    *_changes(
+        "solvers/headers/release.h",
+        GRADIENTS,
+        ("before - share*q[k]", "before + share*q[k]"),
+        ("before = s != 0 ? own : g[k]", "before = g[k]"),
+    ),
+    *_changes(
+        "solvers/projected_multigrid_kernels.py",
+        GRADIENTS,
+        ("ratio = -zap / pap", "ratio = zap / pap"),
+        ("gz + ratio * gp", "gz - ratio * gp"),
+    ),
+    *_changes(
+        "solvers/lemke.py",
+        PIVOTS,
+        ("ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])", "ratios <= ratios.min() + TIE * abs(ratios.min()))[0])"),
+        ("        if ends.any():\n            return int(rows[ends][0])\n", ""),
+        ("least = ratios <= ratios.min() + TIE * np.abs(ratios).max()", "least = ratios >= ratios.max() - TIE * np.abs(ratios).max()"),
+        ("ratios = inverse[:, column] / direction[rows]", "ratios = inverse[:, column]"),
+        ("for column in range(self.m):\n            if inverse", "for column in range(1):\n            if inverse"),
+        ("ratios = np.divide(q, d, out", "ratios = np.divide(q, np.ones(m), out"),
+        ("t[:-1] - np.multiply.outer", "t[:-1] + np.multiply.outer"),
+    ),
+    *_changes(
+        "problem/merits.py",
+        "problem/test_merits.py",
+        ("(slope < 0)", "(slope > 0)"),
+        ("np.abs(terms)", "terms"),
+        ("abs(float(sums[0]))", "float(sums[1])"),
+        ("np.abs(at).max", "at.max"),
+    ),
+]

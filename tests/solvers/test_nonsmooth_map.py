@@ -1,0 +1,167 @@
+"""The maps that Newton-type methods descend on: each row against its definition, at kinks too, in all places where they are computed."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from oracle import assemble
+from plain_fischer import LEAST_Q, PlainMap
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.solvers.dense_problem import DenseProblem
+from warp_lcp.solvers.fischer_newton import FischerNewton
+from warp_lcp.solvers.fischer_newton_dense import FischerMap
+from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
+
+FORMS = ["natural", "fischer", "penalized"]
+BOUNDS = [(0.0, np.inf), (-2.0, 3.0), (-np.inf, 1.0), (-np.inf, np.inf), (1.0, 1.0)]
+
+
+def at_kinks(seed, n=60):
+    """A diagonally dominant matrix of integers, every kind of row, x at a bound with y = 0 in a third of them: kinks without rounding."""
+    rng = np.random.default_rng(seed)
+    A = rng.integers(-2, 3, (n, n)).astype(float)
+    np.fill_diagonal(A, 2.0 ** rng.integers(7, 9, n))
+    lower, upper = np.array([BOUNDS[k] for k in rng.integers(0, len(BOUNDS), n)]).T
+    x = rng.integers(-4, 5, n).astype(float)
+    x = np.where((rng.random(n) < 0.5) & np.isfinite(lower), lower, x)
+    x = np.where((rng.random(n) < 0.5) & np.isfinite(upper), upper, x)
+    y = np.where(rng.random(n) < 0.5, 0.0, rng.integers(-400, 401, n).astype(float))
+    return A, y - A @ x, lower, upper, x
+
+
+def device_map(A, b, lower, upper, x, form, share, kink, device):
+    """The map on the device where the residual was evaluated at x, and x there."""
+    problem = wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper)
+    residual, field = NaturalResidual(problem), wp.array(x, dtype=wp.float64, device=device)
+    made = NonsmoothMap(problem, residual, MapForm(form), share, kink)
+    residual.evaluate(field)
+    return made, field, problem
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("kink", [Kink.PERTURBATION, Kink.ZERO, Kink.APPROXIMATION])
+def test_systems_on_the_device_are_those_of_the_definition(form, kink, device):
+    """(A + D) e = -f / q with D = d p / q, and which unknowns move: those at a kink do not by `zero` and by `approximation`."""
+    A, b, lower, upper, x = at_kinks(4001)
+    made, field, problem = device_map(A, b, lower, upper, x, form, 0.7, kink, device)
+    f, p, q, kinks = PlainMap(form, A, b, lower, upper, share=0.7).rows(x)
+    assert form == "natural" or 5 < kinks.sum() < 30
+    fields = [problem.layout.zeros(t) for t in (wp.float64, wp.float64, wp.uint8, wp.float64)]
+    shift, r, free, values = fields
+    merit = made.condense(field, shift, r, free, 0.25, 3)
+    made.values(field, values)
+    moves = ~kinks if kink is not Kink.PERTURBATION else np.ones(len(x), dtype=bool)
+    q = np.maximum(q, LEAST_Q)
+    np.testing.assert_allclose(values.numpy(), f, rtol=1e-13, atol=1e-12)
+    np.testing.assert_allclose(shift.numpy(), np.where(moves, np.diag(A) * p / q, 0.0), rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(r.numpy(), np.where(moves, -0.25 * f / q, 0.0), rtol=1e-8, atol=1e-12)
+    np.testing.assert_array_equal(free.numpy(), moves)
+    assert merit == pytest.approx(0.5 * f @ f, rel=1e-13)
+    assert made.merit(field) == pytest.approx(0.5 * f @ f, rel=1e-13)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_gradients_are_those_of_the_definition(form, device):
+    """J'f over d^2, with the element (0, 1) at kinks, where f = 0 but not in other rows of the column."""
+    A, b, lower, upper, x = at_kinks(4003)
+    made, field, _ = device_map(A, b, lower, upper, x, form, 0.7, Kink.PERTURBATION, device)
+    plain = PlainMap(form, A, b, lower, upper, share=0.7)
+    expected = plain.jacobian(x).T @ plain.rows(x)[0]
+    square, _ = made.descend(field)
+    np.testing.assert_allclose(made.direction.numpy(), expected / plain.d**2, rtol=1e-10, atol=1e-12)
+    assert square == pytest.approx(np.sum((expected / plain.d) ** 2), rel=1e-12)
+
+
+@pytest.mark.parametrize("form", ["fischer", "penalized"])
+@pytest.mark.parametrize("kink", [Kink.PERTURBATION, Kink.ZERO])
+def test_the_map_on_the_host_is_that_of_the_definition(form, kink):
+    A, b, lower, upper, x = at_kinks(4007)
+    share = 1.0 if form == "fischer" else 0.7
+    data = DenseProblem(np.arange(len(b)), A, b, lower, upper, 0.0)
+    made = FischerMap(data, share, kink, np.random.default_rng(1))
+    plain = PlainMap(form, A, b, lower, upper, share=share)
+    f, p, q, kinks = made.linearized(x)
+    for got, expected in zip((f, p, q), plain.rows(x), strict=False):
+        np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-9)
+    np.testing.assert_array_equal(kinks, plain.rows(x)[3])
+    np.testing.assert_allclose(made.jacobian(p, q), plain.jacobian(x), rtol=1e-8, atol=1e-7)
+
+
+def test_random_elements_on_the_host_are_from_the_disc():
+    """(1 - p)^2 + (1 - q)^2 <= 1, up to the edge, and not the same for all."""
+    n = 2000
+    data = DenseProblem(np.arange(n), np.eye(n), np.zeros(n), np.zeros(n), np.full(n, np.inf), 0.0)
+    _, p, q, kinks = FischerMap(data, 1.0, Kink.RANDOM, np.random.default_rng(1)).linearized(np.zeros(n))
+    assert kinks.all()
+    assert ((1 - p) ** 2 + (1 - q) ** 2 <= 1).all()
+    for one in (p, q):
+        assert 1 - np.sqrt(0.5) <= one.min() < 0.31 and 0.98 < one.max() <= 1
+
+
+def test_random_elements_on_the_device_are_from_the_disc(device):
+    """D = d p / q: with p and q in [1 - sqrt(1/2), 1] its extremes are 0.293 and 3.414; others in the next step."""
+    n, share = 4000, 1 - np.sqrt(0.5)
+    problem = wl.LCP(wl.LinearOperator(lambda x: x, (n,), symmetric=True, diagonal=1.0, device=device), np.zeros(n))
+    residual, x = NaturalResidual(problem), problem.layout.zeros(wp.float64)
+    made = NonsmoothMap(problem, residual, MapForm.FISCHER, 1.0, Kink.RANDOM)
+    residual.evaluate(x)
+    shift, r = (problem.layout.zeros(wp.float64) for _ in range(2))
+    free, drawn = problem.layout.zeros(wp.uint8), []
+    for turn in (1, 2):
+        made.condense(x, shift, r, free, 1.0, turn)
+        drawn.append(shift.numpy().copy())
+        assert free.numpy().all()
+        assert share <= drawn[-1].min() < 1.1 * share
+        assert 1 / (1.1 * share) < drawn[-1].max() <= 1 / share
+        assert np.mean(drawn[-1] < 1) == pytest.approx(0.5, abs=0.05)  # p and q are drawn alike
+        assert np.abs(r.numpy()).max() == 0  # f = 0 at a kink
+    assert np.abs(np.corrcoef(*drawn)[0, 1]) < 0.1
+
+
+def grid_at_kinks(seed, bounds):
+    """Cells, b and x on a grid with AIR and SOLID: integers, so that y = 0 is exact, in half of the cells that are at a bound."""
+    rng = np.random.default_rng(seed)
+    cells = rng.choice(3, (5, 7, 6), p=[0.1, 0.8, 0.1])
+    fluid, dense = cells.ravel() == wl.FLUID, assemble(cells)
+    A, n = dense[np.ix_(fluid, fluid)], int(fluid.sum())
+    lower, upper = (np.full(n, side) for side in bounds)
+    x = np.where(rng.random(n) < 0.5, lower if np.isfinite(bounds[0]) else upper, rng.integers(-3, 4, n))
+    y = np.where(rng.random(n) < 0.5, 0.0, rng.integers(-6, 7, n))
+    return cells, fluid, A, y - A @ x, lower, upper, x
+
+
+@pytest.mark.parametrize("bounds", [(0.0, np.inf), (-2.0, 2.0), (-np.inf, 1.0)])
+@pytest.mark.parametrize("kink", ["perturbation", "zero"])
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_systems_over_the_rows_of_a_grid_are_those_of_the_definition(bounds, kink, share):
+    """The one pass that moves x, evaluates y there and condenses: D on top of A's diagonal, in units of `scale`."""
+    cells, fluid, A, b, lower, upper, x = grid_at_kinks(4013, bounds)
+    problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), _on(fluid, b, cells.shape), *bounds)
+    work = FischerNewton(kink=kink, share=share, precision="double").init(problem)
+    layout, place = problem.layout, problem.layout.places()[fluid]
+    field, move = (layout.load(_on(fluid, v, cells.shape), wp.float64) for v in (x - 0.5, np.full(len(x), 2.0)))
+    finest, scale = work.system.hierarchy.finest, 0.125
+    work.residual.start(work.x, keep=False)  # takes the size of b
+    work.map.begin()
+    merit = work.map.step(field, move, 0.25, finest, scale, 1)
+    plain = PlainMap("fischer" if share == 1 else "penalized", A, b, lower, upper, share=share)
+    f, p, q, kinks = plain.rows(x)
+    q, moves = np.maximum(q, LEAST_Q), ~kinks if kink == "zero" else np.full(len(x), True)
+    assert 10 < kinks.sum() < len(x) - 10
+    D, r = (v.numpy().ravel()[place] for v in (finest.stencil.d, finest.b))
+    np.testing.assert_array_equal(field.numpy()[place], x)
+    np.testing.assert_allclose(D, np.where(moves, plain.d * (1 + p / q), 0.0), rtol=1e-8)
+    np.testing.assert_allclose(r, np.where(moves, -scale * f / q, 0.0), rtol=1e-8, atol=1e-13)
+    assert merit == pytest.approx(0.5 * f @ f, rel=1e-12)
+    assert work.map.norm == pytest.approx(np.sqrt(np.sum(r[moves] ** 2 / D[moves])), rel=1e-10)
+    y = A @ x + b
+    own = np.maximum(np.minimum(y, plain.d * (x - lower)), plain.d * (x - upper))
+    assert work.residual.norm == pytest.approx(np.linalg.norm(own), rel=1e-12)
+
+
+def _on(fluid, values, shape):
+    """A field with values on FLUID cells."""
+    field = np.zeros(fluid.size)
+    field[fluid] = values
+    return field.reshape(shape)

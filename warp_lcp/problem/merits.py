@@ -1,0 +1,52 @@
+"""The book's merit functions beside the natural residual, for those who plot or compare convergence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.problem.lcp import LCP
+
+
+@dataclass(frozen=True)
+class Merits:
+    """Merit functions of an iterate.
+
+    They are stated for x >= 0. In a box x_i is the distance to the bound that y_i's sign asks for, u_i - x_i with -y_i where that is the
+    upper one; rows without bounds count as they are.
+
+    Attributes:
+        largest: max |x_i|, units of x ([Book] eq. 2.55).
+        complementarity: |x'(A x + b)|, units of x y ([Book] eq. 2.56); 0 at solutions, but at x = 0, too, whatever b is.
+        absolute: x'|A x + b|, units of x y ([Book] eq. 2.200); the same, without terms that cancel: >= 0 within the bounds.
+    """
+
+    largest: float
+    complementarity: float
+    absolute: float
+
+
+def merits_at(problem: LCP, x: wp.array[Any], y: wp.array[Any]) -> Merits:
+    """Return the merit functions at x, a stored field, by one product.
+
+    Args:
+        problem: the problem.
+        x: where.
+        y: stored float64 field that receives A x + b.
+    """
+    problem.apply_plus(x, problem.b, y)
+    inside, across = problem.unknown.numpy() == 1, problem.layout.across
+    at, slope, lower, upper = (v.numpy()[inside] for v in (x, y, problem.lower, problem.upper))
+    by_upper = np.isfinite(upper) & ((slope < 0) | np.isinf(lower))
+    by_lower = np.isfinite(lower) & ~by_upper
+    with np.errstate(invalid="ignore", over="ignore"):
+        distance = np.where(by_upper, upper - at, np.where(by_lower, at - lower, at))
+        terms = np.where(by_upper, -slope, slope)
+        sums = np.array([distance @ terms, distance @ np.abs(terms)])
+    largest = float(np.abs(at).max(initial=0.0))
+    if across is not None:
+        sums, largest = np.asarray(across.sum(sums)), float(across.max(largest))
+    return Merits(largest, abs(float(sums[0])), float(sums[1]))
