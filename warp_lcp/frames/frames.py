@@ -63,7 +63,7 @@ class FrameFolder:
         Raises:
             OSError: a file cannot be written; the earlier ones are intact.
         """
-        make_folder(self.frames)
+        make_folder(self.frames, within=self.folder)
         files = []
         for part in frame:
             file = self.write_part(self.frames / f"{part.name}_{index:06d}", part)

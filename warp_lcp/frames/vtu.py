@@ -59,7 +59,7 @@ def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
         points, corners = writable("points", part.points, size), part.corners.astype("<i4", copy=False)
     else:
         points, corners = _corners(part)
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as file:
         file.writelines(_vtu(points, corners, fields, "CellData" if isinstance(part, Cells) else "PointData"))
 
 
