@@ -280,6 +280,19 @@ class RunFolder:
         logs = {self.log.with_stem(name): columns for name, columns in tables.items()}
         return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
 
+    def lacks(self, index: int, frame: list[Part]) -> bool:
+        """Return whether a file of a frame is missing or cut, given the frame as the run would write it.
+
+        Raises:
+            OSError: a file cannot be read.
+        """
+        return bool(self.collective.share(self._lacks(index, frame)))
+
+    @on_root
+    def _lacks(self, index: int, frame: list[Part]) -> bool:
+        whole = self.frames.whole if isinstance(self.frames, RankFrames) else self.frames
+        return any(index in whole.missing(kind, index + 1) for kind in whole.kinds(frame))
+
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
 
