@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 import warp as wp
 
+from warp_lcp.frames.meshio_format import to_meshio
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.pour import pour
@@ -71,6 +72,14 @@ class Frame:
         """
         faces = _of_particles(self.simulation).velocity
         return {f"velocity_{axis}": field for axis, field in zip("xyz", faces, strict=False)}
+
+    def to_meshio(self) -> dict[str, Any]:
+        """Return a `meshio.Mesh` for each part of the frame, by its name: points [m], cells, and the fields as point data or cell data.
+
+        The parts are `particles`, `grid` (its cells are quadrilaterals or hexahedra), and `surface`, `bodies`, `level_set` and `density`
+        where the scene has them. Of volumes the cells are those within the level set's band, and where the density is not 0.
+        """
+        return {part.name: to_meshio(part) for part in self.parts()}
 
     def parts(self) -> list[Part]:
         """Return copies of what a frame's files show: points, cells with their pressure, surfaces and volumes if the scene wants them."""

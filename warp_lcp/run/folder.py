@@ -134,7 +134,8 @@ class RunFolder:
         self.collective, self._shared = collective or Collective.of_one(), collective is not None
         with self.collective.together():
             self.mesh_files = mesh_digests(scene)
-        whole = FrameFolder(path, scene.output.grid_format, surface_ply=scene.output.surface_ply)
+        output = scene.output
+        whole = FrameFolder(path, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
         self.frames = RankFrames(whole, collective) if collective else whole
         self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene), collective)
 

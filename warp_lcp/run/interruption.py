@@ -25,8 +25,8 @@ class Interruption:
 
     Until it is called first there is nothing to lose, and much to wait for, as kernels are compiled: there a signal raises `Interrupted`.
     Python hands a signal on only once the compiler is back, which may take many seconds, so a thread of its own says at once that it has
-    come, and ends the process, if asked to, when it is not handed on soon. What ignores a signal, as nohup does SIGHUP, goes on ignoring it. A second
-    Ctrl-C does not wait for the step's end.
+    come, and ends the process, if asked to, when it is not handed on soon. What ignores a signal, as nohup does SIGHUP, goes on ignoring
+    it. A second Ctrl-C does not wait for the step's end.
 
     Args:
         say: takes a line for the user.

@@ -15,7 +15,7 @@ import numpy as np
 
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.frames.frames import FrameWriter, frame_bytes
-from warp_lcp.run.check import check_memory, check_ranks, start
+from warp_lcp.run.check import check_memory, check_output, check_ranks, start
 from warp_lcp.run.checkpoint import PIECES, Checkpoint
 from warp_lcp.run.devices import Engine
 from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
@@ -135,6 +135,7 @@ def running_scene(
     with everyone.together():
         if collective is not None:
             check_ranks(scene)
+        output_notes = check_output(scene) if request.out is not None else []
         if not request.force_memory:
             check_memory(scene, request.device, share=share)
     folder: RunFolder = NoFolder(scene) if request.out is None else RunFolder(request.out, scene, collective)
@@ -142,7 +143,7 @@ def running_scene(
     if collective is not None:
         record.engine, record.ranks = Engine.PETSC.value, collective.ranks.size
     with folder.held(resume=request.resume) as remarks:
-        record.warnings, record.mesh_files = list(remarks), folder.mesh_files
+        record.warnings, record.mesh_files = [*remarks, *output_notes], folder.mesh_files
         continued: Continuation | None = None
         if request.resume:
             continued = folder.resume()
@@ -301,7 +302,8 @@ class RunLoop:
         frames = max(0, last - self._frames_done() + 1)
         state = sum(array.nbytes for array in self.simulation.state().values())
         states = self.output.checkpoints_kept + 1  # the one being written too
-        each = frame_bytes(frame, self.output.grid_format, surface_ply=self.output.surface_ply)
+        output = self.output
+        each = frame_bytes(frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
         self.folder.check_space(int(SPACE_MARGIN * (each * frames + states * state)))
 
     def _start(self, last: int, frame: list[Part]) -> Log:
