@@ -27,7 +27,8 @@ def invoke(*words):
 
 
 @pytest.mark.parametrize("code", blocks(TUTORIAL, "python"))
-def test_python_examples_run(code, capsys):
+def test_python_examples_run(code, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     run(code, TUTORIAL)
     out = capsys.readouterr().out
     assert out.startswith("CONVERGED") or "not rough" in code or out.endswith("finished\n")

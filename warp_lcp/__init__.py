@@ -52,6 +52,7 @@ from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
 if TYPE_CHECKING:
+    from warp_lcp.frames.read_frame import read_frame
     from warp_lcp.run.driven import Run
 
 hear_kernels()
@@ -64,6 +65,8 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 def __getattr__(name: str) -> Any:
     """Import what drives simulations when it is asked for: who solves problems needs none of it."""
+    if name == "read_frame":
+        return import_module("warp_lcp.frames.read_frame").read_frame
     if name == "Run":
         return import_module("warp_lcp.run.driven").Run
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -125,6 +128,7 @@ __all__ = [
     "enumerate_batch",
     "get_threads",
     "linear_complementarity",
+    "read_frame",
     "recommend",
     "set_threads",
     "solve",

@@ -222,9 +222,87 @@ def test_binary_stl_may_begin_like_a_text_one(tmp_path):
     assert_unit_cube(read_mesh(path))
 
 
+OBJ = obj_text(["f " + " ".join(str(v + 1) for v in quad) for quad in QUADS])
+TEXT_STL = (
+    "solid cube\n"
+    + "".join(
+        "facet normal 0 0 0\nouter loop\n" + "".join("vertex {} {} {}\n".format(*v) for v in CUBE[t]) + "endloop\nendfacet\n"
+        for t in CUBE_TRIANGLES
+    )
+    + "endsolid cube\n"
+)
+PLY = (
+    "ply\nformat ascii 1.0\ncomment a cube\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\nelement face 6\n"
+    "property list uchar int vertex_indices\nend_header\n"
+    + "".join("{} {} {}\n".format(*v) for v in CUBE)
+    + "".join("4 {} {} {} {}\n".format(*quad) for quad in QUADS)
+)
+TEXTS = {"obj": OBJ, "stl": TEXT_STL, "ply": PLY}
+SPELLINGS = {
+    "mark": lambda text: b"\xef\xbb\xbf" + text,
+    "CRLF": lambda text: text.replace(b"\n", b"\r\n"),
+    "CR": lambda text: text.replace(b"\n", b"\r"),
+    "mark and CRLF": lambda text: b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n"),
+    "tabs": lambda text: text.replace(b" ", b"\t"),
+    "blanks at the ends": lambda text: text.replace(b"\n", b"  \n"),
+    "bytes behind": lambda text: text + b"\n\0\0",
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+@pytest.mark.parametrize("suffix", TEXTS)
+def test_however_a_text_is_spelled(tmp_path, suffix, spelling):
+    path = tmp_path / f"cube.{suffix}"
+    path.write_bytes(SPELLINGS[spelling](TEXTS[suffix].encode()))
+    assert_unit_cube(read_mesh(path))
+
+
+@pytest.mark.parametrize("suffix", TEXTS)
+def test_wide_text_is_refused_as_such(tmp_path, suffix):
+    path = tmp_path / f"cube.{suffix}"
+    path.write_bytes(TEXTS[suffix].encode("utf-16"))
+    with pytest.raises(ValueError, match="it is UTF-16 text; save it as UTF-8"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("head", [b"", b"solid cube", b"  SOLID"])
+@pytest.mark.parametrize("behind", [b"", b"x", bytes(49), bytes(50), b"made by a scanner"])
+def test_binary_stl_with_bytes_behind_its_triangles(tmp_path, head, behind):
+    path = tmp_path / "cube.stl"
+    meshio.Mesh(CUBE, [("triangle", CUBE_TRIANGLES)]).write(path, binary=True)
+    path.write_bytes(head.ljust(80, b" ") + path.read_bytes()[80:] + behind)
+    assert_unit_cube(read_mesh(path))
+
+
+@pytest.mark.parametrize("head", [b"", b"solid cube"])
+@pytest.mark.parametrize(
+    ("count", "message"), [(13, "it says 13 and holds 12"), (2**32 - 1, "holds 12"), (0, "it says that it has no triangles")]
+)
+def test_binary_stl_with_a_wrong_count(tmp_path, head, count, message):
+    path = tmp_path / "cube.stl"
+    meshio.Mesh(CUBE, [("triangle", CUBE_TRIANGLES)]).write(path, binary=True)
+    path.write_bytes(head.ljust(80, b"\0") + count.to_bytes(4, "little") + path.read_bytes()[84:])
+    with pytest.raises(ValueError, match=message):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("suffix", TEXTS)
+@pytest.mark.parametrize(("word", "message"), [("nan", "not finite"), ("-inf", "not finite"), ("1_0", "1_0"), ("0,5", "0,5")])
+def test_coordinates_that_are_no_numbers(tmp_path, suffix, word, message):
+    path = tmp_path / f"cube.{suffix}"
+    first = " ".join(map(str, CUBE[3]))
+    assert first in TEXTS[suffix]
+    path.write_text(TEXTS[suffix].replace(first, f"{word} 0 0"))
+    with pytest.raises(ValueError, match=message):
+        read_mesh(path)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
+        ("a.stl", "", "the mesh file is empty"),
+        ("a.ply", PLY.replace("4 ", "-4 ", 1), "a list of a face has -4 entries"),
+        ("a.obj", OBJ.replace("f ", "f 1_", 1), "1_"),
         ("a.obj", "", "no vertices"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nl 1 2\n", "no triangles"),
         ("a.obj", "v 0 0 zero\n", "not a readable OBJ"),

@@ -127,8 +127,8 @@ def test_no_checkpoint_at_all(tmp_path):
 def test_a_failed_write_leaves_the_file_as_it_was(tmp_path):
     path = tmp_path / "a.txt"
     write_text(path, "before")
-    with pytest.raises(OSError, match="No space"), replacing(path) as temporary:
-        temporary.write_text("half")
+    with pytest.raises(OSError, match="No space"), replacing(path) as file:
+        file.write(b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
     assert path.read_text() == "before"
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]

@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 from small_runs import run_into
+from warp_lcp.files.atomic import SUFFIX
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
@@ -52,7 +53,8 @@ def killed(run: Callable[[], Any], folder: Path, operation: int) -> bool:
         left = [operation]
 
         def hook(event: str, arguments: tuple) -> None:
-            if event in OPERATIONS and str(arguments[0]).startswith(str(folder)):
+            name = str(arguments[0]) if event in OPERATIONS else ""
+            if name and (name.startswith(str(folder)) or name.endswith(SUFFIX)):  # a temporary file's, relative to its folder
                 left[0] -= 1
                 if left[0] == 0:
                     os.kill(os.getpid(), signal.SIGKILL)

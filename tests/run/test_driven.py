@@ -2,6 +2,8 @@
 
 import csv
 import json
+import signal
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,7 @@ POOL = {
     "domain": {"size": (1.0, 0.5), "resolution": 24},
     "liquid": [{"shape": "box", "min": np.array([0.0, 0.0]), "max": [1.0, 0.2]}],
 }
+FINE = {**POOL, "time": {"duration": 0.2, "frames_per_second": 50, "dt_max": 0.012}}  # two steps a frame
 CRATE = {**POOL, "solid": [{"shape": "box", "min": [0.4, 0.25], "max": [0.6, 0.4], "density": 400.0}]}
 SHORT = {"duration": 0.1, "resolution": 32}
 
@@ -119,6 +122,122 @@ def test_a_loop_with_an_error_leaves_a_run_that_can_be_resumed(tmp_path):
     with pytest.raises(LookupError, match="mine"):
         drive()
     assert next(frame.index for frame in wl.Run.resume(tmp_path / "run", device="cpu")) == 4
+
+
+def without_checkpoints(folder: Path) -> dict:
+    return {name: value for name, value in contents(folder).items() if "step" not in name}
+
+
+def failing_at(step: int, action):
+    def callback(run):
+        if run.row["step"] == step:
+            action()
+
+    return callback
+
+
+def fail() -> None:
+    raise LookupError("mine")
+
+
+def test_a_callback_that_fails_in_any_step_costs_no_frame(tmp_path):
+    """Of the steps some end a frame: the run that goes on writes it, and hands it to its loop."""
+    whole = tmp_path / "whole"
+    steps = [(frame.index, frame.row["step"]) for frame in wl.Run(FINE, folder=whole, device="cpu", frames=3) if frame.index]
+    assert steps == [(1, 2), (2, 4), (3, 6)]
+    ends = {step: index for index, step in steps}
+    for step in range(1, steps[-1][1] + 1):
+        out = tmp_path / f"{step}"
+        with pytest.raises(LookupError, match="mine"):
+            wl.Run(FINE, folder=out, device="cpu", frames=3, on_step=failing_at(step, fail)).finish()
+        assert json.loads((out / "run.json").read_text())["reason"] == "LookupError: mine"
+        run = wl.Run.resume(out, device="cpu", frames=3)
+        seen = [frame.index for frame in run]
+        first = ends.get(step) or min(index for index, end in steps if end > step)
+        assert seen == list(range(first, 4)), step
+        assert run.record.resumed_from_step == step
+        assert not [warning for warning in run.record.warnings if "missing" in warning]
+        assert without_checkpoints(out) == without_checkpoints(whole), step
+
+
+def test_a_frame_of_which_a_file_was_deleted_is_written_again(tmp_path):
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    for folder in (whole, out):
+        wl.Run(FINE, folder=folder, device="cpu", frames=2).finish()
+    (out / "frames" / "grid_000002.vtu").unlink()
+    run = wl.Run.resume(out, device="cpu", frames=2)
+    assert [frame.index for frame in run] == [2]
+    assert not [warning for warning in run.record.warnings if "missing" in warning]
+    assert without_checkpoints(out) == without_checkpoints(whole)
+    (out / "frames" / "grid_000001.vtu").unlink()  # before the checkpoint: told, as ever
+    run = wl.Run.resume(out, device="cpu", frames=3)
+    assert [frame.index for frame in run] == [3]
+    assert [warning for warning in run.record.warnings if "grid 1 are missing" in warning]
+
+
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_ctrl_c_in_a_loop_stops_the_run_after_its_step(tmp_path, step):
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    wl.Run(FINE, folder=whole, device="cpu", frames=3).finish()
+    handler = signal.getsignal(signal.SIGINT)
+    run = wl.Run(FINE, folder=out, device="cpu", frames=3)
+    run.on_step(failing_at(step, lambda: signal.raise_signal(signal.SIGINT)))
+    with pytest.raises(KeyboardInterrupt):
+        run.finish()
+    assert signal.getsignal(signal.SIGINT) is handler
+    record = json.loads((out / "run.json").read_text())
+    if step == 1:  # the first step has not ended: nothing is lost
+        assert (record["status"], record["steps"]) == ("stopped", 1)
+    else:
+        assert (record["status"], record["reason"], record["steps"]) == ("stopped", "interrupted by SIGINT", step)
+        assert (out / "checkpoints" / f"step_{step:06d}.npz").is_file()
+    wl.Run.resume(out, device="cpu", frames=3).finish()
+    assert without_checkpoints(out) == without_checkpoints(whole)
+
+
+def test_ctrl_c_in_a_step_waits_for_its_end(dots, scene_file, tmp_path):
+    dots.before_step = lambda simulation, dt: signal.raise_signal(signal.SIGINT) if simulation.step_count == 5 else None
+    with pytest.raises(KeyboardInterrupt):
+        wl.Run(scene_file, folder=tmp_path / "out", device="cpu").finish()
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (record["status"], record["reason"], record["steps"]) == ("stopped", "interrupted by SIGINT", 6)
+    dots.before_step = lambda simulation, dt: None
+    assert wl.Run.resume(tmp_path / "out", device="cpu").finish().resumed_from_step == 6
+
+
+def test_a_second_ctrl_c_does_not_wait(dots, scene_file, tmp_path):
+    """In a callback, which may take long: the step is kept."""
+
+    def twice() -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("goes on")
+
+    with pytest.raises(KeyboardInterrupt):
+        wl.Run(scene_file, folder=tmp_path / "out", device="cpu", on_step=failing_at(4, twice)).finish()
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (record["status"], record["reason"], record["steps"]) == ("stopped", "interrupted after step 4", 4)
+    assert wl.Run.resume(tmp_path / "out", device="cpu").finish().resumed_from_step == 4
+
+
+def test_ctrl_c_between_frames_is_the_program_s(tmp_path):
+    def drive():
+        for frame in wl.Run(FINE, folder=tmp_path / "run", device="cpu"):
+            if frame.index == 2:
+                signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        drive()
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (record["status"], record["reason"]) == ("stopped", "left by its program after frame 2")
+
+
+def test_a_run_in_another_thread_leaves_signals_alone(tmp_path):
+    records = []
+    thread = threading.Thread(target=lambda: records.append(wl.Run(FINE, folder=tmp_path / "run", device="cpu", frames=1).finish()))
+    thread.start()
+    thread.join()
+    assert [record.status for record in records] == ["finished"]
 
 
 def test_callbacks_see_every_step_and_stop_the_run(tmp_path):

@@ -5,6 +5,7 @@ import errno
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -47,9 +48,10 @@ class Disk:
         return sum(sizes)
 
     def open(self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **options: Any) -> Any:
-        if "opener" in options or isinstance(file, int) or "r" in mode.replace("r+", "") or not str(file).startswith(str(self.folder)):
+        path = os.readlink(f"/proc/self/fd/{file}") if isinstance(file, int) else str(file)
+        if "opener" in options or "r" in mode.replace("r+", "") or not path.startswith(str(self.folder)):
             return self._open(file, mode, buffering, *more, **options)
-        raw = Limited(str(file), mode.replace("b", "").replace("t", ""), disk=self)
+        raw = Limited(file, mode.replace("b", "").replace("t", ""), path=path, disk=self)
         stream = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
         return stream if "b" in mode else io.TextIOWrapper(stream, *more, line_buffering=buffering == 1, **options)
 
@@ -65,17 +67,18 @@ class Disk:
 class Limited(io.FileIO):
     """A file on such a disk."""
 
-    def __init__(self, name: str, mode: str, *, disk: Disk) -> None:
-        super().__init__(name, mode)
+    def __init__(self, file: Any, mode: str, *, path: str, disk: Disk) -> None:
+        super().__init__(file, mode)
         self._disk = disk
+        self.path = path
 
     def write(self, data: Any) -> int:
         before = os.fstat(self.fileno()).st_size
         end = (before if "a" in self.mode else self.tell()) + len(data)
         grows = self._disk.rounded(max(end, before)) - self._disk.rounded(before)
         if grows and self._disk.used() + grows > self._disk.size:
-            self._disk.refused.append(Path(str(self.name)).name)
-            raise OSError(self._disk.code, os.strerror(self._disk.code), str(self.name))
+            self._disk.refused.append(Path(self.path).name)
+            raise OSError(self._disk.code, os.strerror(self._disk.code), self.path)
         return super().write(data) or 0
 
 
@@ -103,7 +106,8 @@ def fill(scene: Path, folder: Path, sizes: list[int], *, code: int = errno.ENOSP
             assert record is not None
             assert record.status == "finished", record.reason
             break
-        first = disk.refused[0].lstrip(".").removesuffix(".part").rstrip("0123456789").split("_")[0]
+        temporary = atomic.TEMPORARY.fullmatch(disk.refused[0])
+        first = (temporary["name"] if temporary else disk.refused[0]).rstrip("0123456789").split("_")[0]
         where[first] = where.get(first, 0) + 1
         if (out / "run.json").exists():
             ends_truly(out, record)
@@ -150,8 +154,8 @@ def test_full_in_each_kind_of_file(quick, scene_file, tmp_path, monkeypatch, nam
     out, write, full = tmp_path / "out", Limited.write, []
 
     def fails(self: Limited, data: Any) -> int:
-        if full or name in Path(str(self.name)).name:
-            full.append(self.name)
+        if full or name in re.sub(r"\.[0-9a-f]{16}\.part$", ".part", Path(self.path).name):
+            full.append(self.path)
             self._disk.size = 0
         return write(self, data)
 

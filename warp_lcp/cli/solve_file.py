@@ -170,7 +170,7 @@ def write_vector(path: Path, x: np.ndarray) -> None:
         ProblemError: the file cannot be written.
     """
     try:
-        with replacing(path) as temporary, temporary.open("wb") as stream:
+        with replacing(path) as stream:
             scipy.io.mmwrite(stream, x.reshape(-1, 1), precision=17)
     except OSError as error:
         raise ProblemError(f"--out {path}: {error.strerror}") from error

@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_lcp.cli.solve_file import Outcome, criteria, method_named
 from warp_lcp.default import solve
-from warp_lcp.files.atomic import replacing
+from warp_lcp.files.atomic import replacing, replacing_by_name
 from warp_lcp.gallery.recorded import cell_counts, load_part
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem.lcp import LCP
@@ -62,7 +62,7 @@ class GridOutcome(Outcome):
         try:
             x = self.result.x.numpy()
             if self.decomposition is None:
-                with replacing(path) as temporary, temporary.open("wb") as stream:
+                with replacing(path) as stream:
                     np.save(stream, x)
             else:
                 _write_boxes(path, x, self.shape, self.decomposition)
@@ -169,7 +169,7 @@ def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decompositio
         with waiting("the root rank, which writes"):
             comm.Send(np.ascontiguousarray(x, dtype=np.float64), dest=0)
         return
-    with replacing(path) as temporary:
+    with replacing_by_name(path) as temporary:
         whole = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float64, shape=shape)
         for rank, box in enumerate(boxes):
             part = box.slices[-len(shape) :]

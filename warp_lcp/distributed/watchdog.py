@@ -19,7 +19,7 @@ from typing import Self
 
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.waiting import Waiting, waiting
-from warp_lcp.files.atomic import SUFFIX
+from warp_lcp.files.atomic import SUFFIX, open_in_place
 
 LIMIT = 600.0  # seconds: kernels that are compiled, and the largest frames, take less
 BEATS = 20  # of the thread within the limit; it looks at the clock no more often
@@ -70,7 +70,7 @@ class Board:
     def write(self, rank: int, post: Post) -> None:
         """Put up a post."""
         line = (json.dumps({**asdict(post), "place": post.place[: ROOM // 2]}) + "\n").encode()
-        descriptor = os.open(self.path(rank), os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | getattr(os, "O_NOFOLLOW", 0), 0o600)
+        descriptor = open_in_place(self.path(rank), os.O_WRONLY | os.O_CREAT, 0o600)
         with open(descriptor, "wb") as file:  # closed each time: that is when other machines see it
             file.write(line.ljust(ROOM))
 

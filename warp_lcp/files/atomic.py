@@ -1,32 +1,137 @@
-"""Files that are there whole or not at all."""
+"""Write files whole or not at all, and never through a link that somebody has laid in their place."""
 
 from __future__ import annotations
 
+import errno
 import os
+import re
+import secrets
+import stat
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 SPARE = ".spare"  # of room that is kept
 SUFFIX = ".part"  # of the temporary files, which a killed run may leave behind
+LINK = "is a link, which is not written through"
+TEMPORARY = re.compile(rf"\.(?P<name>.+?)(?:\.[0-9a-f]{{16}})?{re.escape(SUFFIX)}")  # those of older versions have no random part
+NO_LINKS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+BY_DESCRIPTOR = {os.open, os.rename, os.unlink} <= os.supports_dir_fd  # not on Windows
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """A folder in which files are opened, renamed and deleted by name, whatever its path leads to meanwhile.
+
+    Args:
+        path: of the folder.
+        descriptor: of the folder; None where the platform takes paths alone.
+    """
+
+    path: Path
+    descriptor: int | None
+
+    @classmethod
+    @contextmanager
+    def opened(cls, path: Path) -> Iterator[_Folder]:
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC) if BY_DESCRIPTOR else None
+        try:
+            yield cls(path, descriptor)
+        finally:
+            if descriptor is not None:
+                os.close(descriptor)
+
+    def open(self, name: str, flags: int) -> int:
+        return os.open(self._at(name), flags | NO_LINKS, 0o666, dir_fd=self.descriptor)
+
+    def rename(self, name: str, other: str) -> None:
+        os.replace(self._at(name), self._at(other), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
+
+    def unlink(self, name: str) -> None:
+        os.unlink(self._at(name), dir_fd=self.descriptor)
+
+    def sync(self) -> None:
+        if self.descriptor is None:
+            sync_folder(self.path)
+        else:
+            os.fsync(self.descriptor)
+
+    def _at(self, name: str) -> str:
+        return name if self.descriptor is not None else str(self.path / name)
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path in the same folder; what was written there takes `path`'s place at the end, unless something was raised.
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Give a new file in the same folder to write; it takes `path`'s place at the end, unless something was raised.
 
     Raises:
         OSError: the file cannot be written; `path` is as before.
     """
-    temporary = path.with_name(f".{path.name}{SUFFIX}")
-    try:
-        yield temporary
-        with open(temporary, "rb+") as file:
+    with _temporary(path) as (folder, name):
+        with open(folder.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
+            yield file
+            file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
-        sync_folder(path.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
+        folder.rename(name, path.name)
+        folder.sync()
+
+
+@contextmanager
+def replacing_by_name(path: Path) -> Iterator[Path]:
+    """Give the path of a new, empty file, for an encoder that opens it itself; the rest is as in `replacing`.
+
+    Raises:
+        OSError: the file cannot be written; `path` is as before.
+    """
+    with _temporary(path) as (folder, name):
+        os.close(folder.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
+        yield path.with_name(name)
+        descriptor = folder.open(name, os.O_RDWR)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        folder.rename(name, path.name)
+        folder.sync()
+
+
+@contextmanager
+def _temporary(path: Path) -> Iterator[tuple[_Folder, str]]:
+    """Give the folder of a file and a name there that nobody knows before; what has that name at the end is deleted."""
+    name = f".{path.name.removeprefix('.').removesuffix(SUFFIX)}.{secrets.token_hex(8)}{SUFFIX}"
+    with _Folder.opened(path.parent) as folder:
+        try:
+            yield folder, name
+        finally:
+            with suppress(FileNotFoundError):
+                folder.unlink(name)
+
+
+def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
+    """Return the descriptor of a file that is written where it is: a plain one of this name alone.
+
+    Args:
+        path: the file.
+        flags: of `os.open`.
+        mode: of a file that is made.
+
+    Raises:
+        OSError: it cannot be opened, or is a link, has other names too, or is a pipe, a device or a folder.
+    """
+    try:
+        descriptor = os.open(path, flags | NO_LINKS | getattr(os, "O_NONBLOCK", 0), mode)  # a pipe would be waited for
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EMLINK):
+            raise OSError(errno.ELOOP, LINK, str(path)) from error
+        raise
+    status = os.fstat(descriptor)
+    if stat.S_ISREG(status.st_mode) and status.st_nlink <= 1:
+        return descriptor
+    os.close(descriptor)
+    what = "has other names too" if stat.S_ISREG(status.st_mode) else "is not a plain file"
+    raise OSError(errno.ELOOP, f"{what}: it is not written", str(path))
 
 
 def sync_folder(folder: Path) -> None:
@@ -44,12 +149,20 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def make_folder(folder: Path) -> None:
+def make_folder(folder: Path, *, within: Path | None = None) -> None:
     """Make a folder and those above it, unless they are there, so that a power failure does not take them away with what is in them.
 
+    Args:
+        folder: the folder.
+        within: a folder; if it is above, none in between may be a link: what is written there stays there.
+
     Raises:
-        OSError: it cannot be made.
+        OSError: it cannot be made, or leads elsewhere.
     """
+    if within is not None and within in folder.parents:
+        if folder.is_symlink():
+            raise OSError(errno.ELOOP, LINK, str(folder))
+        make_folder(folder.parent, within=within)
     if folder.is_dir():
         return
     make_folder(folder.parent)
@@ -69,13 +182,9 @@ def write_text(path: Path, text: str, *, spare: bool = False) -> None:
     Raises:
         OSError: the file cannot be written; `path` is as before.
     """
-    with replacing(path) as temporary:
-        if spare:
-            with suppress(FileNotFoundError):
-                _spare(path).replace(temporary)
-        with open(temporary, "r+b" if temporary.exists() else "wb") as file:  # over what is there: on a full disk, that has its room
-            file.write(text.encode())
-            file.truncate()
+    with ExitStack() as stack:
+        if not (spare and _write_over(_spare(path), text.encode(), path)):
+            stack.enter_context(replacing(path)).write(text.encode())
 
 
 def reserve(path: Path, size: int) -> None:
@@ -84,10 +193,26 @@ def reserve(path: Path, size: int) -> None:
     Raises:
         OSError: there is no such room.
     """
-    with open(_spare(path), "wb") as file:
+    with replacing(_spare(path)) as file:
         file.write(bytes(size))
-        file.flush()
-        os.fsync(file.fileno())
+
+
+def _write_over(spare: Path, data: bytes, path: Path) -> bool:
+    """Write over a file, on a full disk into the room that it has, and give it the name `path`; return whether there was one."""
+    with _temporary(path) as (folder, name):
+        try:
+            descriptor = open_in_place(spare, os.O_RDWR)
+        except OSError:  # nobody has kept room, or something else lies in its place
+            return False
+        with open(descriptor, "r+b") as file:
+            folder.rename(spare.name, name)
+            file.write(data)
+            file.truncate()
+            file.flush()
+            os.fsync(file.fileno())
+        folder.rename(name, path.name)
+        folder.sync()
+    return True
 
 
 def _spare(path: Path) -> Path:

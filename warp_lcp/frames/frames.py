@@ -1,4 +1,7 @@
-"""Frames as ParaView opens them: VTU or VTI files, and PVD collections that give each its time; volumes as NanoVDB, surfaces as PLY too."""
+"""Frames as ParaView opens them: VTU or VTI files, and PVD collections that give each its time; volumes as NanoVDB, surfaces as PLY too.
+
+Or in a format of meshio's, in which no collection is written: ParaView takes numbered files as a series.
+"""
 
 from __future__ import annotations
 
@@ -9,27 +12,27 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Protocol, Self, cast
 
 from warp_lcp.files.atomic import make_folder, write_text
+from warp_lcp.frames.meshio_format import SUFFIXES, FrameFormat, holds, kind_of, meshio_bytes, write_meshio
 from warp_lcp.frames.nvdb import nvdb_bytes, write_nvdb
 from warp_lcp.frames.pieces import WHOLE, in_ranks, piece_files
 from warp_lcp.frames.ply import ply_bytes, write_ply
 from warp_lcp.frames.vti import vti_bytes, write_vti
 from warp_lcp.frames.vtu import vtu_bytes, write_vtu
-from warp_lcp.simulation import Cells, NoStopwatch, Part, Stopwatch, Surface, Volume
+from warp_lcp.simulation import Cells, NoStopwatch, Part, Points, Stopwatch, Surface, Volume
 
-FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.(?P<format>p?vtu|p?vti|ply|nvdb)")
+FRAME_FILE = re.compile(rf"(?P<name>[a-z][a-z_]*)_(?P<index>\d{{6,}})\.(?P<format>p?vtu|p?vti|nvdb|{'|'.join(SUFFIXES.values())})")
 COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # what ParaView opens as a series
 WAITING = 2  # frames in memory, the one being written included
 END = b"</VTKFile>\n"  # of those that are whole
 
 GridFormat = Literal["vtu", "vti"]
-FORMATS: dict[str, tuple[Callable[[Path, Any], None], Callable[[Any], int]]] = {  # what writes a part, and how many bytes that takes
+OWN_FORMATS: dict[str, tuple[Callable[[Path, Any], None], Callable[[Any], int]]] = {  # what writes a part, how many bytes that takes
     "vtu": (write_vtu, vtu_bytes),
     "vti": (write_vti, vti_bytes),
     "nvdb": (write_nvdb, nvdb_bytes),
-    "ply": (write_ply, ply_bytes),
 }
 
 
@@ -38,14 +41,17 @@ class FrameFolder:
 
     Args:
         folder: of the run.
-        grid_format: of the cells.
+        grid_format: of the cells; "vtu": as the rest.
         surface_ply: write surfaces as PLY files too.
+        frame_format: of particles, surfaces and bodies; one without points, where the format does not hold that, is a VTU file.
     """
 
-    def __init__(self, folder: Path, grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> None:
+    def __init__(
+        self, folder: Path, grid_format: GridFormat = "vtu", *, surface_ply: bool = False, frame_format: FrameFormat = "vtu"
+    ) -> None:
         """Look at a run's folder; nothing is written before the first frame."""
         self.folder = folder
-        self.grid_format, self.surface_ply = grid_format, surface_ply
+        self.grid_format, self.surface_ply, self.frame_format = grid_format, surface_ply, frame_format
         self.frames = folder / "frames"
         self._times: dict[str, list[tuple[float, str]]] = {}
 
@@ -63,7 +69,7 @@ class FrameFolder:
         Raises:
             OSError: a file cannot be written; the earlier ones are intact.
         """
-        make_folder(self.frames)
+        make_folder(self.frames, within=self.folder)
         files = []
         for part in frame:
             file = self.write_part(self.frames / f"{part.name}_{index:06d}", part)
@@ -71,9 +77,15 @@ class FrameFolder:
             if self.surface_ply and isinstance(part, Surface):
                 files.append(file.with_suffix(".ply"))
                 write_ply(files[-1], part)
-            if not isinstance(part, Volume):
+            if self.has_collection(part):
                 self.collect(part.name, time, file)
         return files
+
+    def has_collection(self, part: Part) -> bool:
+        """Return whether the frames of a part are in a PVD collection, which names files of VTK's XML formats alone."""
+        if isinstance(part, Volume):
+            return False
+        return self.frame_format == "vtu" or (isinstance(part, Cells) and self.grid_format == "vti")
 
     def collect(self, name: str, time: float, file: Path) -> None:
         """Add the file of a frame's part to the part's collection.
@@ -105,6 +117,8 @@ class FrameFolder:
             elif match["format"] in COLLECTED and file.parent == self.frames:
                 self._times.setdefault(match["name"], []).append((times[index], f"frames/{file.name}"))
         for name, entries in self._times.items():
+            if self.frame_format != "vtu" and not (self.folder / f"{name}.pvd").is_file():
+                continue  # of a format without collections, in which those are empty frames
             write_text(self.folder / f"{name}.pvd", collection(entries))
 
     def kinds(self, frame: Sequence[Part]) -> list[str]:
@@ -117,10 +131,13 @@ class FrameFolder:
         Raises:
             OSError: a file cannot be read.
         """
-        found, ply = set(), kind.endswith(".ply")
+        found, name, is_beside = set(), kind.removesuffix(".ply"), kind.endswith(".ply")
         for file in self.frames.iterdir() if self.frames.is_dir() else ():
             match = FRAME_FILE.fullmatch(file.name)
-            if match and match["name"] == kind.removesuffix(".ply") and (match["format"] == "ply") == ply and _is_whole(file):
+            if match is None or match["name"] != name:
+                continue
+            is_ply = match["format"] == "ply" and self.frame_format != "ply"  # a file beside the frame's own
+            if is_ply == is_beside and _is_whole(file):
                 found.add(int(match["index"]))
         return sorted({*range(count)} - found)
 
@@ -130,9 +147,12 @@ class FrameFolder:
         Raises:
             OSError: the file cannot be written.
         """
-        suffix = part_format(part, self.grid_format)
-        file = path.with_suffix(f".{suffix}")
-        FORMATS[suffix][0](file, part)
+        name = part_format(part, self.grid_format, self.frame_format)
+        file = path.with_suffix(f".{SUFFIXES.get(name, name)}")
+        if name in OWN_FORMATS:
+            OWN_FORMATS[name][0](file, part)
+        else:
+            write_meshio(file, cast(Points | Cells | Surface, part), name)
         return file
 
 
@@ -231,22 +251,30 @@ class FrameWriter:
         self._failed = False
 
 
-def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> int:
+def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_ply: bool = False, frame_format: FrameFormat = "vtu") -> int:
     """Return about how many bytes the files of a frame take; rather more than less.
 
     Args:
         frame: what it shows.
         grid_format: of the cells.
         surface_ply: count the PLY files of surfaces.
+        frame_format: of the rest.
     """
-    formats = [(part, part_format(part, grid_format)) for part in frame]
-    formats += [(part, "ply") for part in frame if surface_ply and isinstance(part, Surface)]
-    return sum(FORMATS[suffix][1](part) for part, suffix in formats)
+    total = sum(ply_bytes(part) for part in frame if surface_ply and isinstance(part, Surface))
+    for part in frame:
+        name = part_format(part, grid_format, frame_format)
+        total += OWN_FORMATS[name][1](part) if name in OWN_FORMATS else meshio_bytes(cast(Points | Cells | Surface, part), name)
+    return total
 
 
-def part_format(part: Part, grid_format: GridFormat) -> str:
-    """Return the suffix of a part's file, a key of FORMATS; surfaces may have a PLY file besides."""
-    return "nvdb" if isinstance(part, Volume) else grid_format if isinstance(part, Cells) else "vtu"
+def part_format(part: Part, grid_format: GridFormat, frame_format: FrameFormat = "vtu") -> str:
+    """Return the format of a part's file; surfaces may have a PLY file besides."""
+    if isinstance(part, Volume):
+        return "nvdb"
+    if isinstance(part, Cells) and grid_format == "vti":
+        return "vti"
+    size = len(part.index if isinstance(part, Cells) else part.points)
+    return frame_format if frame_format == "vtu" or size or holds(frame_format, *kind_of(part)).empty else "vtu"
 
 
 def _is_whole(file: Path) -> bool:

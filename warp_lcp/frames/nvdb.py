@@ -85,7 +85,7 @@ def write_nvdb(path: Path, volume: Volume) -> None:
     if volume.values.ndim != 3 or not np.isfinite(volume.values).all() or max(volume.values.shape) > LARGEST:
         raise ValueError(f"the volume {volume.name!r} must hold finite values of a 3-D grid, at most {LARGEST} along an axis")
     grid, header = _grid(volume)
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as file:
         file.write(header)
         for part in grid:
             file.write(raw(part))

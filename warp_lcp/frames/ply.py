@@ -43,7 +43,7 @@ def write_ply(path: Path, surface: Surface) -> None:
     else:
         elements = surface.corners.astype("<i4")
         header += [f"element edge {count}", "property int vertex1", "property int vertex2"]
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode())
         file.write(vertices.tobytes())
         file.write(elements.tobytes())

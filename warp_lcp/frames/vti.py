@@ -38,7 +38,7 @@ def write_vti(path: Path, cells: Cells) -> None:
     x, y, z = (column - first for column, first in zip(columns, low, strict=True))
     flat = (z * counts[1] + y) * counts[0] + x
     end = image_end(low, counts, cells.dimension)
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as file:
         file.writelines(_vti(low, end, cells.spacing, fields, flat, int(counts.prod())))
 
 

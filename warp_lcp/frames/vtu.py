@@ -52,6 +52,17 @@ def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
         OSError: the file cannot be written.
         ValueError: a field has another length than the points or cells.
     """
+    mesh = mesh_of(part)
+    with replacing(path) as file:
+        file.writelines(_vtu(mesh.points, mesh.corners, mesh.fields, "CellData" if mesh.on_cells else "PointData"))
+
+
+def mesh_of(part: Points | Cells | Surface) -> Mesh:
+    """Return the mesh of a part, its fields in types that VTK has: points are vertices, cells share their corners.
+
+    Raises:
+        ValueError: a field has another length than the points or cells.
+    """
     size, fields = writable_fields(part)
     if isinstance(part, Points):
         points, corners = writable("points", part.points, size), np.arange(size, dtype="<i4")[:, None]
@@ -59,8 +70,7 @@ def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
         points, corners = writable("points", part.points, size), part.corners.astype("<i4", copy=False)
     else:
         points, corners = _corners(part)
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_vtu(points, corners, fields, "CellData" if isinstance(part, Cells) else "PointData"))
+    return Mesh(points, corners, fields, isinstance(part, Cells))
 
 
 def read_vtu(path: Path) -> Mesh:

@@ -14,6 +14,9 @@ import numpy as np
 from warp_lcp.files.claims import check_claim
 
 FORMATS = (".obj", ".ply", ".stl")
+MARK = b"\xef\xbb\xbf"  # that some editors write before UTF-8 text
+WIDE = (b"\xff\xfe", b"\xfe\xff")  # and before UTF-16
+STL_WORDS = re.compile(rb"^[ \t]*(?:facet|endsolid)\b", flags=re.MULTILINE | re.IGNORECASE)  # of a text STL, behind the first
 STL_HEADER = 84  # bytes before the first triangle of a binary STL: 80 of text and a count
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("color", "<u2")])
 PLY_TYPES = {
@@ -55,6 +58,10 @@ def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"{path}: there is no such mesh file") from None
     except OSError as error:
         raise ValueError(f"{path}: the mesh file cannot be read ({error.strerror or error})") from error
+    if not data:
+        raise ValueError(f"{path}: the mesh file is empty: it has no vertices, so it is not a readable {suffix[1:].upper()} file")
+    if data.startswith(WIDE) and (suffix != ".stl" or data[2:].replace(b"\0", b"")[:5].lower() == b"solid"):
+        raise ValueError(f"{path}: not a readable {suffix[1:].upper()} file (it is UTF-16 text; save it as UTF-8)")
     if suffix == ".stl" and not _is_binary_stl(data):
         return _parse_text_stl(path, data)
     try:
@@ -83,18 +90,31 @@ def _blocks(polygons: Sequence[Sequence[int] | np.ndarray]) -> Corners:
 
 
 def _is_binary_stl(data: bytes) -> bool:
-    """Tell a binary STL by its length: its first bytes may say "solid" all the same."""
-    return len(data) >= STL_HEADER and len(data) == STL_HEADER + STL_TRIANGLE.itemsize * int.from_bytes(data[80:84], "little")
+    """Tell a binary STL by its length, or by what no text has: its first bytes may say "solid" all the same."""
+    if len(data) < STL_HEADER:
+        return False
+    is_text = data.removeprefix(MARK).lstrip()[:5].lower() == b"solid" and (b"\0" not in data or STL_WORDS.search(data) is not None)
+    return len(data) == STL_HEADER + STL_TRIANGLE.itemsize * _stl_count(data) or not is_text
+
+
+def _stl_count(data: bytes) -> int:
+    return int.from_bytes(data[STL_HEADER - 4 : STL_HEADER], "little")
 
 
 def _parse_binary_stl(data: bytes) -> tuple[np.ndarray, Corners]:
-    """Read the corners of a binary STL, three for each triangle."""
-    points = np.frombuffer(data, STL_TRIANGLE, offset=STL_HEADER)["corners"].reshape(-1, 3).astype(np.float64)
+    """Read the corners of a binary STL, three for each triangle; bytes behind the last one, which some programs write, are passed over."""
+    count, held = _stl_count(data), (len(data) - STL_HEADER) // STL_TRIANGLE.itemsize
+    if held < count:
+        raise ValueError(f"neither text nor of the length that its number of triangles asks for: it says {count} and holds {held}")
+    if not count:
+        raise ValueError(f"it says that it has no triangles, and {len(data) - STL_HEADER} bytes follow")
+    points = np.frombuffer(data, STL_TRIANGLE, count, STL_HEADER)["corners"].reshape(-1, 3).astype(np.float64)
     return points, [np.arange(len(points)).reshape(-1, 3)]
 
 
 def _parse_text_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Read the corners of a text STL; blank lines and words in capitals do not matter."""
+    data = data.removeprefix(MARK).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if not data.lstrip()[:5].lower() == b"solid":
         raise ValueError(f"{path}: not a readable STL file (neither text nor of the length that its number of triangles asks for)")
     corners = re.findall(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", data, flags=re.MULTILINE | re.IGNORECASE)
@@ -104,7 +124,7 @@ def _parse_text_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     if not facets:
         raise ValueError(f"{path}: the mesh has no triangles")
     try:
-        vertices = np.array([[float(number) for number in corner] for corner in corners])
+        vertices = np.array([[_number(number) for number in corner] for corner in corners])
     except ValueError as error:
         raise ValueError(f"{path}: not a readable STL file ({error})") from error
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
@@ -121,10 +141,11 @@ class _Element:
 
 def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
     """Read vertices and faces of a PLY file; other elements and properties are passed over."""
-    head = re.match(rb"ply\s(.*?\n)\s*end_header[ \t]*\r?\n", data, flags=re.DOTALL)
+    data = data.removeprefix(MARK)
+    head = re.match(rb"ply[ \t]*(?P<end>\r\n|\n|\r)(?P<lines>.*?(?P=end))\s*end_header[ \t]*(?P=end)", data, flags=re.DOTALL)
     if not head:
         raise ValueError("its header does not begin with ply and end with end_header")
-    order, elements = _ply_header(head[1].decode("ascii", "replace"))
+    order, elements = _ply_header(head["lines"].decode("ascii", "replace"))
     points = np.empty((0, 3))
     polygons: list[Sequence[int] | np.ndarray] = []
     source = _Records(data[head.end() :], order)
@@ -187,7 +208,7 @@ class _Records:
         """Return records without lists, float64 of shape (count, properties)."""
         if self.order is None:
             words = self._take("f8", element.count * len(element.properties), element)
-            return np.array([float(word) for word in words]).reshape(element.count, -1)
+            return np.array([_number(word) for word in words]).reshape(element.count, -1)
         record = np.dtype([(str(number), self.order + kind) for number, (_, kind, _) in enumerate(element.properties)])
         rows = np.frombuffer(self.body, record, element.count, self.at)
         self.at += rows.nbytes
@@ -198,7 +219,10 @@ class _Records:
         found: list[Sequence[int] | np.ndarray] = []
         for _ in range(element.count):
             for number, (_, kind, length) in enumerate(element.properties):
-                entries = self._take(kind, int(self._take(length, 1, element)[0]) if length else 1, element)
+                count = _index(self._take(length, 1, element)[0]) if length else 1
+                if count < 0:
+                    raise ValueError(f"a list of a {element.name} has {count} entries")
+                entries = self._take(kind, count, element)
                 if number == wanted:
                     found.append(entries if self.order else [_index(word) for word in entries])
         return found
@@ -218,20 +242,30 @@ def _parse_obj(data: bytes) -> tuple[np.ndarray, Corners]:
     """Read vertices and faces of an OBJ file, whose indices count from 1, or backwards from the last vertex so far."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    for line in data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
+    for line in data.removeprefix(MARK).decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
         words = line.split("#", 1)[0].split()
         if words[:1] == ["v"]:
             if len(words) < 4:
                 raise ValueError("a vertex has fewer than three coordinates")
-            vertices.append([float(word) for word in words[1:4]])
+            vertices.append([_number(word) for word in words[1:4]])
         elif words[:1] == ["f"]:
             indices = [_index(word.split("/", 1)[0]) for word in words[1:]]
             polygons.append([index - 1 if index >= 0 else index + len(vertices) for index in indices])
     return np.array(vertices, dtype=np.float64).reshape(-1, 3), _blocks(polygons)
 
 
-def _index(word: str | bytes) -> int:
-    """Return the number of a vertex, no larger than any mesh has."""
+def _number(word: str | bytes) -> float:
+    """Return a coordinate; Python alone would take 1_0 for 10."""
+    text = word.decode("ascii", "replace") if isinstance(word, bytes) else word
+    if "_" in text:
+        raise ValueError(f"could not convert string to float: {text!r}")
+    return float(text)
+
+
+def _index(word: Any) -> int:
+    """Return the number of a vertex, or of entries, no larger than any mesh has."""
+    if isinstance(word, (str, bytes)) and ("_" if isinstance(word, str) else b"_") in word:  # type: ignore[operator]
+        raise ValueError(f"a face names a vertex by {word!r}")
     index = int(word)
     if abs(index) > LARGEST_INDEX:
         raise ValueError(f"a face names a vertex by a number of {len(str(abs(index)))} digits")

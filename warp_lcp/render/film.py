@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from warp_lcp.files.atomic import replacing
+from warp_lcp.files.atomic import replacing_by_name
 from warp_lcp.render.recording import RenderError
 
 INSTALL_ENCODER = "pip install 'imageio-ffmpeg>=0.6'"
@@ -62,7 +62,7 @@ class Film:
         with ExitStack() as stack:
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                self._writer = self._encoder(stack.enter_context(replacing(self.file)))
+                self._writer = self._encoder(stack.enter_context(replacing_by_name(self.file)))
             except OSError as error:
                 raise self._failure(error) from error
             stack.callback(self._writer.close)

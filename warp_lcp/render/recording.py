@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -12,17 +12,14 @@ from typing import Any, cast
 import numpy as np
 
 from warp_lcp.frames.frames import FRAME_FILE
-from warp_lcp.frames.pieces import one_grid, one_mesh, piece_files
-from warp_lcp.frames.vti import read_vti
-from warp_lcp.frames.vtu import read_vtu
+from warp_lcp.frames.meshio_format import WRITTEN_ONLY
+from warp_lcp.frames.read_frame import READABLE, read_part
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
 from warp_lcp.simulation import Cells, InputError, Points, Surface
 
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
-READERS: dict[str, tuple[Callable[[Path], Any], Callable[[list[Any]], Any]]] = {"vtu": (read_vtu, one_mesh), "vti": (read_vti, one_grid)}
-SUFFIXES = (".vti", ".pvti", ".pvtu", ".vtu")  # of a frame's files; at most one of them is there
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 PALETTES = {  # of speeds, by `Scene.palette`
     "water": ("#0e3e8a", "#166abe", "#3aa0e0", "#82d0f0", "#cef0fa"),
@@ -240,8 +237,13 @@ class Recording:
         return float(self.scene.spacing * (len(cells) / len(points)) ** (1.0 / self.scene.dimension))
 
     def _numbers(self, name: str) -> list[int]:
-        matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*.*vt[ui]")]
-        return sorted({int(match["index"]) for match in matches if match and match["name"] == name})
+        matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*")]
+        return sorted({int(match["index"]) for match in matches if match and match["name"] == name and match["format"] in self._readable})
+
+    @cached_property
+    def _readable(self) -> list[str]:
+        """Return the suffixes of a part's file; a PLY file of a surface, beside one of another format, is not the run's frame."""
+        return [suffix for suffix in READABLE if suffix != "ply" or self.scene.output.format == "ply"]
 
     def look_again(self) -> list[int]:
         """Look which frames there are by now, and return the numbers of those that have all that is shown.
@@ -253,7 +255,10 @@ class Recording:
         found = {part: self._numbers(part) for part in parts}
         for part, numbers in found.items():
             if not numbers:
-                why = "" if getattr(self.scene.output, part) else f"; the scene's output.{part} is false"
+                output = self.scene.output
+                why = "" if getattr(output, part) else f"; the scene's output.{part} is false"
+                if output.format in WRITTEN_ONLY:
+                    why = f'; output.format = "{output.format}" is for other programs and not read back'
                 raise RenderError(f"{self.folder}: holds no frames of {'a surface' if part == 'surface' else part}{why}")
         numbers = sorted(set.intersection(*map(set, found.values())))
         if not numbers:
@@ -290,8 +295,8 @@ class Recording:
 
     def _file(self, name: str, number: int) -> Path:
         path = self.folder / "frames" / f"{name}_{number:06d}"
-        files = [path.with_suffix(suffix) for suffix in SUFFIXES]
-        return next((file for file in files if file.is_file()), files[-1])
+        files = [path.with_suffix(f".{suffix}") for suffix in self._readable]
+        return next((file for file in files if file.is_file()), path.with_suffix(".vtu"))
 
     def _field(self, fields: dict[str, Any], name: str, components: int = 1) -> np.ndarray:
         if name not in fields or fields[name].shape[1:] != (components,)[: components - 1]:
@@ -321,13 +326,8 @@ def _read(file: Path) -> Any:
     Raises:
         RenderError: a file cannot be read.
     """
-    read, joined = READERS[file.suffix[-3:]]
     try:
-        if not file.suffix.startswith(".p"):
-            return read(file)
-        if pieces := piece_files(file):
-            return joined([read(piece) for piece in pieces])
-        raise ValueError("names no pieces")
+        return read_part(file)
     except OSError as error:
         raise RenderError(f"{error.filename or file}: cannot be read: {error.strerror}") from error
     except ValueError as error:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.files.atomic import replacing
+from warp_lcp.files.atomic import make_folder, replacing
 from warp_lcp.render.film import Film, film_suffix
 from warp_lcp.render.page import Page, Painter
 from warp_lcp.render.recording import Color, Recording, RenderError, Show, spread
@@ -81,7 +81,7 @@ def render_run(
         stack.enter_context(closing(page.painter))
         told(0, len(groups))
         for done, (file, group) in enumerate(groups.items(), 1):
-            _save(page.draw(group), out / file)
+            _save(page.draw(group), out / file, folder)
             told(done, len(groups))
             yield out / file
 
@@ -163,12 +163,13 @@ def parse_size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _save(pixels: np.ndarray, file: Path) -> None:
+def _save(pixels: np.ndarray, file: Path, folder: Path) -> None:
+    """Write an image; below a run's folder no link is written through."""
     from PIL import Image
 
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as temporary:
-            Image.fromarray(pixels).save(temporary, format="PNG", compress_level=PACKING)
+        make_folder(file.parent, within=folder)
+        with replacing(file) as stream:
+            Image.fromarray(pixels).save(stream, format="PNG", compress_level=PACKING)
     except OSError as error:
         raise RenderError(f"{file}: cannot be written: {error.strerror}") from error

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warp_lcp.files.atomic import make_folder, replacing
+from warp_lcp.files.atomic import make_folder, replacing_by_name
 from warp_lcp.render.actors import BODY_COLORS, SURFACES
 from warp_lcp.render.recording import Recording, RenderError, Show
 from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
@@ -70,7 +70,7 @@ def export_run(
                 told(done, len(numbers))
                 yield number
             whole = stage.saved_as(suffix)
-            with replacing(file) as temporary:
+            with replacing_by_name(file) as temporary:
                 whole.replace(temporary)
     except (OSError, Tf.ErrorException) as error:
         why = error.strerror if isinstance(error, OSError) else error.args[0].commentary  # of the first thing that went wrong

@@ -6,13 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.files.claims import one_line
+from warp_lcp.frames.meshio_format import Dress, holds
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.run.devices import free_memory
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
 from warp_lcp.scene.simulator import DistributedSimulator, simulators
 from warp_lcp.scene.table import KeyFault, SceneError, written
-from warp_lcp.simulation import Simulation
+from warp_lcp.simulation import Cells, Points, Simulation, Surface
+
+EVERYTHING = ("vtu", "xdmf", "vtk", "gmsh")  # formats that hold all parts with their fields
 
 
 def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene, list[tuple[str, str]]]:
@@ -28,6 +32,7 @@ def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene
     scene = load_scene(path_or_name, overrides)
     check_shapes(scene, path_or_name)
     _check_bodies(scene, path_or_name)
+    check_output(scene)
     return scene, [("scene", scene.scene.name), ("simulator", scene.scene.simulator), *scene.plan()]
 
 
@@ -63,10 +68,51 @@ def check_ranks(scene: Scene) -> None:
     problems = []
     if not isinstance(simulators()[name], DistributedSimulator):
         problems.append(KeyFault("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
+    if scene.output.format != "vtu":
+        problems.append(KeyFault("output.format", "--engine petsc writes .vtu pieces alone", written(scene.output.format)))
     if scene.output.surface_ply:
         problems.append(KeyFault("output.surface_ply", "--engine petsc writes surfaces as .vtu pieces alone", "true"))
     if problems:
         raise SceneError(scene.scene.name, problems)
+
+
+def check_output(scene: Scene) -> list[str]:
+    """Refuse a format of frames that does not hold what the scene writes; return a line for parts whose fields it does not hold.
+
+    Raises:
+        SceneError: naming the parts, why, and what the format holds.
+    """
+    output = scene.output
+    if output.format == "vtu":
+        return []
+    if output.format == "ply" and output.surface_ply:
+        raise SceneError(
+            scene.scene.name, [KeyFault("output.surface_ply", 'output.format = "ply" writes surfaces so; leave one out', "true")]
+        )
+    has_bodies, cells = any(solid.is_body for solid in scene.solid), output.grid_format == "vtu"
+    kinds: dict[str, tuple[bool, type, int]] = {
+        "particles": (output.particles, Points, 3),
+        "grid": (output.grid and cells, Cells, scene.dimension),
+        "surface": (output.surface, Surface, scene.dimension),
+        "the surfaces of bodies": (has_bodies, Surface, scene.dimension),
+    }
+    found = {name: holds(output.format, kind, dimension) for name, (wanted, kind, dimension) in kinds.items() if wanted}
+    refused = {name: held.why for name, held in found.items() if held.dress is None}
+    if refused:
+        what = f"does not hold {' and '.join(refused)}"
+        why = next((f" ({one_line(why.strip())})" for why in refused.values() if why.strip()), "")
+        off = [f"output.{name} = false" for name in refused if name in type(output).model_fields]
+        others = " or ".join(name for name in EVERYTHING if name != output.format)
+        raise SceneError(
+            scene.scene.name,
+            [
+                KeyFault(
+                    "output.format", f"{what}{why}; " + ", ".join([*off, f"or choose {others}, which hold all"]), written(output.format)
+                )
+            ],
+        )
+    bare = [name for name, held in found.items() if held.dress is Dress.BARE]
+    return [f'output.format = "{output.format}" holds the shape of {" and ".join(bare)}, without their fields'] if bare else []
 
 
 def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:

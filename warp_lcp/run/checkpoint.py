@@ -127,7 +127,7 @@ class CheckpointFolder:
         if checkpoint.step == self._continued:
             return self.path(checkpoint.step)
         with self.collective.together():
-            make_folder(self.folder)
+            make_folder(self.folder, within=self.folder.parent)
             file = self.of_rank(self.collective.ranks.rank)._write(checkpoint)
         checksums = self.collective.exchange(checkpoint.checksum)
         with self.collective.led():
@@ -139,7 +139,7 @@ class CheckpointFolder:
         pickled = [name for name, array in checkpoint.state.items() if array.dtype.hasobject]
         if pickled:
             raise ValueError(f"these arrays hold Python objects, which would need a pickle: {', '.join(pickled)}")
-        make_folder(self.folder)
+        make_folder(self.folder, within=self.folder.parent)
         meta = {
             "format": FORMAT,
             "scene": self.fingerprint,
@@ -150,7 +150,7 @@ class CheckpointFolder:
         }
         arrays: dict[str, Any] = {META: np.array(json.dumps(meta))}
         arrays |= {STATE + name: array for name, array in checkpoint.state.items()}
-        with replacing(self.path(checkpoint.step)) as temporary, open(temporary, "wb") as file:
+        with replacing(self.path(checkpoint.step)) as file:
             np.savez(file, **arrays)
         return self.path(checkpoint.step)
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -12,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 import warp as wp
 
+from warp_lcp.frames.meshio_format import to_meshio
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.pour import pour
@@ -19,6 +23,7 @@ from warp_lcp.rigid.body import RigidBody
 from warp_lcp.run.devices import choose_device
 from warp_lcp.run.folder import RunRecord
 from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
+from warp_lcp.run.interruption import Interruption
 from warp_lcp.run.log import Value
 from warp_lcp.run.loop import RunLoop, RunRequest, running_scene
 from warp_lcp.scene.scene import Scene
@@ -68,6 +73,14 @@ class Frame:
         faces = _of_particles(self.simulation).velocity
         return {f"velocity_{axis}": field for axis, field in zip("xyz", faces, strict=False)}
 
+    def to_meshio(self) -> dict[str, Any]:
+        """Return a `meshio.Mesh` for each part of the frame, by its name: points [m], cells, and the fields as point data or cell data.
+
+        The parts are `particles`, `grid` (its cells are quadrilaterals or hexahedra), and `surface`, `bodies`, `level_set` and `density`
+        where the scene has them. Of volumes the cells are those within the level set's band, and where the density is not 0.
+        """
+        return {part.name: to_meshio(part) for part in self.parts()}
+
     def parts(self) -> list[Part]:
         """Return copies of what a frame's files show: points, cells with their pressure, surfaces and volumes if the scene wants them."""
         return self.simulation.frame()
@@ -77,7 +90,8 @@ class Run:
     """Run a scene from Python: `for frame in run` takes the steps from one frame to the next.
 
     The steps are those of `warp-lcp run`, and with a `folder` so are log, frames and checkpoints, bit for bit. Once the loop is left, with
-    `break` or by an error in it, the run ends as one that was stopped, with a checkpoint that `Run.resume` goes on from.
+    `break`, by an error in it or by Ctrl-C, the run ends as one that was stopped, with a checkpoint that `Run.resume` goes on from. Ctrl-C
+    waits for the end of the step that is being taken, and is then raised as ever; a second one does not wait.
 
     Args:
         scene: a scene file, the name of a built-in scene, its tables as a dict, or a Scene.
@@ -162,7 +176,7 @@ class Run:
         """Have a function called with the run after each step, before the frame and the checkpoint of that time; may decorate it.
 
         It may look (`run.row`, `run.time`, `run.simulation`), `push` a body, change `gravity`, `add` material and `stop` the run. An error
-        that it raises ends the run.
+        that it raises ends the run with a checkpoint of the step; `Run.resume` goes on, first with the frame if the step was to end one.
 
         Raises:
             RunError: it cannot be called.
@@ -179,20 +193,33 @@ class Run:
             OutputError: the folder cannot take the run.
             SceneError: the scene cannot be simulated.
             SimulationFailed: the run has failed; the message is the reason in run.json.
+            KeyboardInterrupt: Ctrl-C was pressed; the run has been stopped, with a checkpoint.
         """
         if self._used:
             raise RunError("this run has been driven already; Run.resume(folder) goes on, another Run begins anew")
         self._used = True
-        running = running_scene(self._request, observer=_Ears(self), stop=lambda: self._stopped)
+        interruption = Interruption(self.notes.append, signals=[signal.SIGINT])
+        running = running_scene(self._request, observer=_Ears(self), stop=lambda: interruption() or self._stopped)
         try:
             self._loop = next(running)
             self.record = self._loop.record
-            for _ in running:
+            while self._goes_on(running, interruption):
                 yield Frame(self._index, self.simulation.time, self.row, self.simulation)
         finally:
             running.close()
+        if interruption.name:
+            signal.raise_signal(signal.SIGINT)
         if self.record.status == "failed":
             raise SimulationFailed(self.record.reason)
+
+    def _goes_on(self, running: Iterator[RunLoop], interruption: Interruption) -> bool:
+        """Take the steps to the next frame; return whether there is one. In the main thread Ctrl-C waits for the step's end."""
+        is_main = threading.current_thread() is threading.main_thread()
+        with interruption if is_main else nullcontext():
+            goes_on = next(running, None) is not None
+            while goes_on and interruption.name:  # the step ended a frame, too; the loop asks whether to stop behind that
+                goes_on = next(running, None) is not None
+            return goes_on
 
     def finish(self) -> RunRecord:
         """Run to the last frame, and return how the run ended.

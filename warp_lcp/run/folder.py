@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.distributed.watchdog import POST
-from warp_lcp.files.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
+from warp_lcp.files.atomic import SPARE, SUFFIX, TEMPORARY, make_folder, reserve, sync_folder, write_text
 from warp_lcp.files.claims import one_line
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
@@ -134,7 +134,8 @@ class RunFolder:
         self.collective, self._shared = collective or Collective.of_one(), collective is not None
         with self.collective.together():
             self.mesh_files = mesh_digests(scene)
-        whole = FrameFolder(path, scene.output.grid_format, surface_ply=scene.output.surface_ply)
+        output = scene.output
+        whole = FrameFolder(path, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
         self.frames = RankFrames(whole, collective) if collective else whole
         self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene), collective)
 
@@ -164,7 +165,7 @@ class RunFolder:
         except FolderBusyError as error:
             raise OutputError(str(error)) from error
         except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
+            raise OutputError(f"{error.filename or self.path}: cannot be written: {error.strerror}") from error
 
     @on_root
     def check_new(self, *, force: bool) -> None:
@@ -280,6 +281,19 @@ class RunFolder:
         logs = {self.log.with_stem(name): columns for name, columns in tables.items()}
         return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
 
+    def lacks(self, index: int, frame: list[Part]) -> bool:
+        """Return whether a file of a frame is missing or cut, given the frame as the run would write it.
+
+        Raises:
+            OSError: a file cannot be read.
+        """
+        return bool(self.collective.share(self._lacks(index, frame)))
+
+    @on_root
+    def _lacks(self, index: int, frame: list[Part]) -> bool:
+        whole = self.frames.whole if isinstance(self.frames, RankFrames) else self.frames
+        return any(index in whole.missing(kind, index + 1) for kind in whole.kinds(frame))
+
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
 
@@ -294,8 +308,8 @@ class RunFolder:
     def _go_on(self, record: RunRecord, step: int) -> None:
         self.write_record(record)
         write_text(self.path / SCENE, dump_scene(self.scene))
-        for file in (path for path, _ in _walk(self.path) if path.name.endswith(SUFFIX) and path.name.startswith(".")):
-            if SPARE not in file.name:
+        for file in (path for path, _ in _walk(self.path) if TEMPORARY.fullmatch(path.name)):
+            if file.name != f".{RECORD}{SPARE}{SUFFIX}":
                 file.unlink()
         self.checkpoints.set_aside(step)
 
@@ -356,6 +370,9 @@ class RunFolder:
         if wrong:
             kind = "is a folder where a run has a file" if wrong[0].is_dir() else "is a file where a run has a folder"
             raise OutputError(f"{wrong[0]}: {kind}; move it away")
+        links = [path for path, pattern in _walk(self.path) if path.is_symlink() and _is_of_run(path, self.path, pattern)]
+        if links:
+            raise OutputError(f"{links[0]}: is a link, which no run makes, and a run writes into its own folder alone; move it away")
 
     def _check_same_scene(self) -> None:
         """Refuse other values of keys that must not change, and mesh files that hold something else."""
@@ -396,8 +413,7 @@ class RunFolder:
         own: list[Path] = []
         foreign: list[Path] = []
         for path, pattern in _walk(self.path):
-            name = path.name.removeprefix(".").removesuffix(SUFFIX) if path.name.endswith(SUFFIX) else path.name
-            is_own = path.is_file() and not path.is_symlink() and pattern.fullmatch(name)
+            is_own = path.is_file() and not path.is_symlink() and pattern.fullmatch(_written_as(path.name))
             (own if is_own else foreign).append(path)
         return own, foreign
 
@@ -454,6 +470,17 @@ def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
                 yield file, OWN_FOLDERS[path.name]
         elif path.name != LOCK:
             yield path, OWN_FILES
+
+
+def _is_of_run(path: Path, folder: Path, pattern: re.Pattern[str]) -> bool:
+    """Return whether a run would write or read what lies in its folder: every file in the folders of its own, known names beside them."""
+    return path.parent != folder or path.name in OWN_FOLDERS or pattern.fullmatch(_written_as(path.name)) is not None
+
+
+def _written_as(name: str) -> str:
+    """Return the name that a temporary file was to get, others as they are."""
+    temporary = TEMPORARY.fullmatch(name)
+    return temporary["name"] if temporary else name
 
 
 def _probe(folder: Path) -> None:

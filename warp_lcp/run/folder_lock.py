@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from warp_lcp.files.atomic import open_in_place
 from warp_lcp.files.claims import one_line
 
 try:
@@ -42,7 +43,7 @@ def locked(folder: Path) -> Iterator[list[str]]:
 
     Raises:
         FolderBusyError: another process holds it.
-        OSError: the file cannot be written.
+        OSError: the file cannot be written, or is a link.
     """
     if fcntl is None:
         yield ["this system has no file locks: see to it that no other run writes into the folder"]
@@ -66,7 +67,7 @@ def locked(folder: Path) -> Iterator[list[str]]:
 def _acquire(path: Path) -> tuple[int, list[str]]:
     """Return a locked descriptor of the file that is at `path` now."""
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        descriptor = open_in_place(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

@@ -16,6 +16,7 @@ from warp_lcp.grid.particles import lattice
 from warp_lcp.material.particle_assembly import inside
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.run.check import check_output
 from warp_lcp.scene.models import predicted_seconds, prices
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, Points, Simulation
@@ -111,7 +112,7 @@ def expected_bytes(scene: ParticleScene, simulation: Simulation, steps: int) -> 
     """Return about how much a run will leave on the disk: frames, of as many particles as there will be, checkpoints and the log."""
     output, wanted = scene.output, {"particles": scene.output.particles, "grid": scene.output.grid}
     frame = [_grown(part, expected_growth(scene)) for part in simulation.frame() if wanted.get(part.name, True)]
-    each = frame_bytes(frame, output.grid_format, surface_ply=output.surface_ply)
+    each = frame_bytes(frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
     state = sum(array.nbytes for array in simulation.state().values())
     log = steps * LOG_BYTES * (len(simulation.columns()) + 5)
     return round(each * (scene.time.frame_count + 1) + output.checkpoints_kept * state + log)
@@ -130,7 +131,11 @@ def _grown(part: Part, factor: float) -> Part:
 
 
 def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
-    """Yield what is allowed and was hardly meant, a line each: frames without end, solids that fill the domain, material inside solids."""
+    """Yield what is allowed and was hardly meant, a line each.
+
+    That is: frames without end, fields that the format of frames does not hold, solids that fill the domain, material inside solids.
+    """
+    yield from check_output(scene)
     frames, rate = scene.time.frame_count, scene.time.frames_per_second
     if frames > MANY_FRAMES:
         yield f"{frames:,} frames: time.duration {scene.time.duration:g} s at time.frames_per_second {rate:g}; were so many meant?"

@@ -10,7 +10,7 @@ from pathlib import Path
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.run.checkpoint import CheckpointError, CheckpointFolder
 from warp_lcp.run.log import rows_until
-from warp_lcp.simulation import Part, Volume
+from warp_lcp.simulation import Part
 
 
 def gaps(
@@ -42,7 +42,7 @@ def gaps(
         first = times[min(min(numbers) for numbers in missing.values())]
         listed = ", ".join(f"{name} {spans(numbers)}" for name, numbers in missing.items())
         lines.append(f"{frames.frames.name}: {listed} are missing or cut; {_again(checkpoints, lambda _, time: time < first)}")
-    lost = [part.name for part in frame if not isinstance(part, Volume) and not (frames.folder / f"{part.name}.pvd").is_file()]
+    lost = [part.name for part in frame if frames.has_collection(part) and not (frames.folder / f"{part.name}.pvd").is_file()]
     return [*lines, *(f"{name}.pvd: is missing; written anew from the frames that are there" for name in lost)]
 
 

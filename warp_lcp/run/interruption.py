@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -25,25 +25,35 @@ class Interruption:
 
     Until it is called first there is nothing to lose, and much to wait for, as kernels are compiled: there a signal raises `Interrupted`.
     Python hands a signal on only once the compiler is back, which may take many seconds, so a thread of its own says at once that it has
-    come, and ends the process if it is not handed on soon. What ignores a signal, as nohup does SIGHUP, goes on ignoring it. A second
-    Ctrl-C does not wait for the step's end.
+    come, and ends the process, if asked to, when it is not handed on soon. What ignores a signal, as nohup does SIGHUP, goes on ignoring
+    it. A second Ctrl-C does not wait for the step's end.
 
     Args:
         say: takes a line for the user.
         at_once: raise before the first step has ended; ranks, which wait for each other, do not.
-        last: called with the signal's name before a process that compiles is ended.
+        last: called with the signal's name before a process that compiles is ended; None: it is not ended.
+        signals: which of them.
     """
 
-    def __init__(self, say: Callable[[str], None], *, at_once: bool = True, last: Callable[[str], None] = lambda name: None) -> None:
-        self._say, self._early, self._last = say, at_once, last
+    name: str  # of the signal that came first; "" if none
+
+    def __init__(
+        self,
+        say: Callable[[str], None],
+        *,
+        at_once: bool = True,
+        last: Callable[[str], None] | None = None,
+        signals: Sequence[signal.Signals] = SIGNALS,
+    ) -> None:
+        self._say, self._early, self._last, self._signals = say, at_once, last, signals
         self._taken = threading.Event()
-        self._name = ""
+        self.name = ""
         self._previous: dict[signal.Signals, Any] = {}
 
     def __call__(self) -> str:
         """Return the name of the signal that came first."""
         self._early = False
-        return self._name
+        return self.name
 
     def __enter__(self) -> Self:
         self._read, self._write = os.pipe()
@@ -52,8 +62,8 @@ class Interruption:
         self._wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
         self._thread = threading.Thread(target=self._announce, name="signals", daemon=True)
         self._thread.start()
-        for number in SIGNALS:
-            if signal.getsignal(number) is not signal.SIG_IGN:
+        for number in self._signals:
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):  # None: a handler that Python has not installed and cannot restore
                 self._previous[number] = signal.signal(number, self._take)
         return self
 
@@ -71,8 +81,8 @@ class Interruption:
         if number == signal.SIGINT:  # SIGTERM may come several times, to the process and to its group
             signal.signal(number, self._previous[number])
         self._taken.set()
-        if not self._name:
-            self._name = number.name
+        if not self.name:
+            self.name = number.name
             if self._early:
                 raise Interrupted(number.name)
 
@@ -85,7 +95,7 @@ class Interruption:
             again = "; press Ctrl-C again to end now" if number == signal.SIGINT else ""
             early = self._early
             self._say(f"{number.name}: stopping {'before the first step has ended' if early else f'after this step{again}'}")
-            if early and not self._taken.wait(GRACE):
+            if early and self._last is not None and not self._taken.wait(GRACE):
                 self._last(number.name)
                 os._exit(FAILED)  # nothing less ends a compiler; no step is lost, and no file that counts is half-written
             while os.read(self._read, 1) != OVER:

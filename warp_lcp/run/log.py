@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from warp_lcp.distributed.collective import Collective, on_root
-from warp_lcp.files.atomic import write_text
+from warp_lcp.files.atomic import open_in_place, write_text
 from warp_lcp.simulation import InputError
 
 Value = float | int | str | None
@@ -49,7 +49,8 @@ class Log:
         header = ",".join(columns)
         lines = [header] if after_step is None else rows_until(path, header, after_step)
         write_text(path, "".join(f"{line}\n" for line in lines))
-        self._file: TextIO = open(path, "a", buffering=1, encoding="utf-8", newline="")  # noqa: SIM115 - `close` closes it
+        opened = open_in_place(path, os.O_WRONLY | os.O_APPEND)
+        self._file: TextIO = open(opened, "a", buffering=1, encoding="utf-8", newline="")  # noqa: SIM115 - `close` closes it
         self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
 
     @on_root

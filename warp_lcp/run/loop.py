@@ -15,7 +15,7 @@ import numpy as np
 
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.frames.frames import FrameWriter, frame_bytes
-from warp_lcp.run.check import check_memory, check_ranks, start
+from warp_lcp.run.check import check_memory, check_output, check_ranks, start
 from warp_lcp.run.checkpoint import PIECES, Checkpoint
 from warp_lcp.run.devices import Engine
 from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
@@ -135,6 +135,7 @@ def running_scene(
     with everyone.together():
         if collective is not None:
             check_ranks(scene)
+        output_notes = check_output(scene) if request.out is not None else []
         if not request.force_memory:
             check_memory(scene, request.device, share=share)
     folder: RunFolder = NoFolder(scene) if request.out is None else RunFolder(request.out, scene, collective)
@@ -142,7 +143,7 @@ def running_scene(
     if collective is not None:
         record.engine, record.ranks = Engine.PETSC.value, collective.ranks.size
     with folder.held(resume=request.resume) as remarks:
-        record.warnings, record.mesh_files = list(remarks), folder.mesh_files
+        record.warnings, record.mesh_files = [*remarks, *output_notes], folder.mesh_files
         continued: Continuation | None = None
         if request.resume:
             continued = folder.resume()
@@ -247,6 +248,7 @@ class RunLoop:
         self._begun = clock.perf_counter()
         self._first_step = 0
         self._below_dt_min = False
+        self._owes = False  # the frame of the time that a resumed run goes on from, which is not there
         self._missed: list[tuple[float, int]] = []  # what solves left that missed their tolerance, and in which step
         self._tolerance = scene.solver.tolerance
         self._tables: dict[str, Log] = {}  # beside the log
@@ -262,7 +264,7 @@ class RunLoop:
         try:
             with self.folder.collective.together(), ExitStack() as stack:  # what is caught here was raised on all ranks
                 stack.enter_context(self.writer)
-                log = stack.enter_context(closing(self._resume(start) if resumed else self._start(last, start)))
+                log = stack.enter_context(closing(self._resume(last, start) if resumed else self._start(last, start)))
                 self._open_tables(stack, self._first_step if resumed else None)
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
                 try:
@@ -300,7 +302,8 @@ class RunLoop:
         frames = max(0, last - self._frames_done() + 1)
         state = sum(array.nbytes for array in self.simulation.state().values())
         states = self.output.checkpoints_kept + 1  # the one being written too
-        each = frame_bytes(frame, self.output.grid_format, surface_ply=self.output.surface_ply)
+        output = self.output
+        each = frame_bytes(frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
         self.folder.check_space(int(SPACE_MARGIN * (each * frames + states * state)))
 
     def _start(self, last: int, frame: list[Part]) -> Log:
@@ -313,17 +316,29 @@ class RunLoop:
             stack.pop_all()
         return log
 
-    def _resume(self, frame: list[Part]) -> Log:
-        """Take back what an interrupted run wrote after its checkpoint, and tell what is missing of what it wrote before."""
-        self.record.frames = self._frames_done()
+    def _resume(self, last: int, frame: list[Part]) -> Log:
+        """Take back what an interrupted run wrote after its checkpoint, and tell what is missing of what it wrote before.
+
+        A run that failed between a step and the frame at its end, in a callback for instance, still owes that frame: the checkpoint is of
+        its time, so it is written now.
+        """
+        self.record.frames = done = self._frames_done()
         self._first_step = self.simulation.step_count
         self._count()
-        times = [self.time.frame_time(index) for index in range(self.record.frames + 1)]
+        times = [self.time.frame_time(index) for index in range(done + 1)]
+        self._owes = self._is_frame_time(done) and done <= last and self.folder.lacks(done, frame)
+        if self._owes:
+            times.pop()
         for gap in self.folder.gaps({"log": self._columns(), **self._table_columns()}, self._first_step, times, frame):
             self._warn(gap)
         self.folder.go_on(self.record, self._first_step)
         self.folder.frames.resume(times)
-        return self.folder.open_log(self._columns(), after_step=self._first_step)
+        with ExitStack() as stack:
+            log = stack.enter_context(closing(self.folder.open_log(self._columns(), after_step=self._first_step)))
+            if self._owes:
+                self._write_frame(done, last, frame)
+            stack.pop_all()
+        return log
 
     def _open_tables(self, stack: ExitStack, after_step: int | None) -> None:
         """Begin or continue the tables beside the log, to be closed by a stack."""
@@ -339,7 +354,7 @@ class RunLoop:
     def _advance(self, log: Log, last: int, stop: Callable[[], bool | str], *, resumed: bool) -> Generator[RunLoop, None, str]:
         """Step until the last frame is written; return why the run stopped before, "" if it did not."""
         frame = self._frames_done() + 1
-        if not resumed:
+        if not resumed or self._owes:
             yield self
         while frame <= last:
             row = self._step(self.time.frame_time(frame))
@@ -370,8 +385,10 @@ class RunLoop:
         try:
             with self.folder.collective.together():
                 yield
-        except Exception:  # it is raised again
+        except (Exception, KeyboardInterrupt) as error:  # it is raised again
             self._try_to(partial(self._write_checkpoint, log))
+            if isinstance(error, KeyboardInterrupt):
+                self.record.status, self.record.reason = "stopped", f"interrupted after step {self.simulation.step_count}"
             raise
 
     def _interrupted(self, asked: bool | str) -> str:
@@ -397,6 +414,10 @@ class RunLoop:
             "retries": retries,
             "seconds": seconds,
         }
+
+    def _is_frame_time(self, index: int) -> bool:
+        """Return whether the simulation is at the time of a frame, so that it shows what the frame does."""
+        return abs(self.simulation.time - self.time.frame_time(index)) <= SAME_TIME / self.time.frames_per_second
 
     def _frames_done(self) -> int:
         """Return the number of the newest frame whose time is reached; it follows from the time alone."""

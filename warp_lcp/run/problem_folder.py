@@ -48,6 +48,6 @@ class ProblemFolder:
             OSError: the file cannot be written; the earlier ones are intact.
         """
         path = self.folder / f"problem_{int(problem['step']):06d}.npz"
-        with replacing(path) as temporary, open(temporary, "wb") as file:
+        with replacing(path) as file:
             np.savez_compressed(file, **problem)  # type: ignore[arg-type]
         return path

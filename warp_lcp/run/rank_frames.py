@@ -46,7 +46,7 @@ class RankFrames:
         Raises:
             OSError: a file cannot be written; the earlier ones are intact.
         """
-        make_folder(self.pieces)
+        make_folder(self.pieces, within=self.whole.folder)
         folders = [self.frames if isinstance(part, Volume) else self.pieces for part in frame]
         return [self.whole.write_part(folder / f"{part.name}_{index:06d}", part) for folder, part in zip(folders, frame, strict=True)]
 

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from warp_lcp.frames.meshio_format import FrameFormat
 from warp_lcp.grid.sides import SIDES
 from warp_lcp.grid.voxelize import STRAY
 from warp_lcp.problem.solve import PrecisionName
@@ -170,8 +171,11 @@ class Output(Table):
         default=1.5, ge=0.5, le=10, description="how far the surface smooths over the particles [their distances]"
     )
     surface_ply: bool = Field(default=False, description="write surfaces as PLY files too, for modelers such as Blender")
+    format: FrameFormat = Field(
+        default="vtu", description="of the files of particles, cells, surfaces and bodies: vtu, or what meshio writes and reads back"
+    )
     grid_format: Literal["vtu", "vti"] = Field(
-        default="vtu", description="of the cells' files: vtu, which meshio reads too, or vti, smaller and faster where cells are many"
+        default="vtu", description="of the cells' files: vtu, as the others, or vti, smaller and faster where cells are many"
     )
     volume: bool = Field(default=False, description="write level set and density as NanoVDB files, of 3-D scenes")
     diagnostics: bool = Field(

@@ -1,0 +1,314 @@
+"""Frames as meshio has them: its meshes, and every file format that it writes and reads back."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import struct
+import tempfile
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import numpy as np
+
+from warp_lcp.files.atomic import replacing_by_name
+from warp_lcp.frames.vtu import Mesh, mesh_of, vtu_bytes
+from warp_lcp.simulation import Cells, Points, Surface, Volume
+
+FrameFormat = Literal[  # those that meshio reads back as they were
+    "vtu", "xdmf", "vtk", "gmsh", "med", "exodus", "ply", "stl", "obj", "off", "abaqus", "avsucd", "dolfin-xml", "flac3d", "h5m", "hmf",
+    "mdpa", "medit", "netgen", "permas", "su2", "tecplot",
+]  # fmt: skip
+SUFFIXES = {  # of meshio's formats, by its names; of several the first without compression
+    "xdmf": "xdmf", "vtk": "vtk", "gmsh": "msh", "med": "med", "exodus": "e", "ply": "ply", "stl": "stl", "obj": "obj", "off": "off",
+    "abaqus": "inp", "avsucd": "avs", "dolfin-xml": "xml", "flac3d": "f3grid", "h5m": "h5m", "hmf": "hmf", "mdpa": "mdpa", "medit": "mesh",
+    "netgen": "vol", "permas": "dato", "su2": "su2", "tecplot": "dat",
+}  # fmt: skip
+WRITTEN_ONLY = {"mdpa", "tecplot"}  # meshio's readers of these do not end where a file was cut
+FORMAT_OF = {suffix: name for name, suffix in SUFFIXES.items()}
+MODULES = {"dolfin-xml": "dolfin"}  # of meshio, where they have other names than the format
+OPTIONS: dict[str, dict[str, Any]] = {
+    "xdmf": {"data_format": "XML"},  # one file; HDF would be a second one, which needs h5py
+    "stl": {"binary": True},
+}
+CELL_KINDS = {1: "vertex", 2: "line", 3: "triangle", 4: "quad", 8: "hexahedron"}  # by their corners
+CORNERS = {kind: corners for corners, kind in CELL_KINDS.items()}
+ADDED = re.compile(":|^GLOBAL_ID$")  # in names that meshio's readers add, such as gmsh:dim_tags
+AXES = re.compile(r"(?P<name>.+)_(?P<axis>[xyz])")
+SAMPLE = 1000  # about as many cells has what a format is tried with
+FAULTS = (  # what meshio's readers and writers raise where a format does not hold a mesh, or a file is damaged
+    OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, NameError, RuntimeError, EOFError,
+    ImportError, StopIteration, MemoryError, struct.error, zlib.error, ElementTree.ParseError,
+)  # fmt: skip
+
+
+class Dress(IntEnum):
+    """What is done to a mesh so that a format holds it, from nothing to much."""
+
+    AS_IS = 0
+    PLAIN_NUMBERS = 1  # points float64, whole numbers int32
+    SCALARS = 2  # vectors as three fields besides, named for the axes
+    BARE = 3  # without fields
+
+
+@dataclass(frozen=True)
+class Holds:
+    """How a format holds the parts of a kind.
+
+    Args:
+        dress: the least that is done to them; None: it does not hold them.
+        empty: whether it holds one without points.
+        size: of a file, in those of a VTU file.
+        why: it does not.
+    """
+
+    dress: Dress | None
+    empty: bool = False
+    size: float = 1.0
+    why: str = ""
+
+
+def to_meshio(part: Points | Cells | Surface | Volume) -> Any:
+    """Return a part of a frame as a `meshio.Mesh`: points [m], cells, and its fields as point data or cell data.
+
+    Points become vertices, surfaces triangles or lines, cells quadrilaterals or hexahedra that share their corners. Of a volume the voxels
+    become hexahedra that a NanoVDB file would hold as active: those nearer to the surface than its band, or where the density is not 0.
+
+    >>> import numpy as np
+    >>> from warp_lcp.simulation import Points
+    >>> mesh = to_meshio(Points("drops", np.zeros((2, 3), dtype=np.float32), {"speed": np.ones(2)}))
+    >>> mesh.cells[0].type, mesh.points.shape, sorted(mesh.point_data)
+    ('vertex', (2, 3), ['speed'])
+    """
+    return meshio_of(mesh_of(_active(part) if isinstance(part, Volume) else part))
+
+
+def from_meshio(mesh: Any) -> Mesh:
+    """Return what a `meshio.Mesh` of one kind of cells holds; vectors that were taken apart are put together again.
+
+    Raises:
+        ValueError: it has cells of several kinds, or of others than frames have.
+    """
+    points = np.asarray(mesh.points)
+    points = np.zeros((0, 3)) if not points.size else np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+    filled = [block for block in mesh.cells if len(block.data)]
+    kinds = {block.type for block in filled}
+    if len(kinds) > 1 or not kinds <= CORNERS.keys():
+        raise ValueError(f"its cells are of the kinds {', '.join(sorted(kinds))}; those of a frame are all {', '.join(CORNERS)}")
+    each = CORNERS[kinds.pop()] if kinds else 1
+    corners = np.concatenate([np.asarray(block.data) for block in filled]) if filled else np.zeros((0, each), dtype=np.int32)
+    if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
+        raise ValueError(f"a cell names a point that does not exist (there are {len(points)})")
+    at_points = {name: np.asarray(values) for name, values in mesh.point_data.items() if not ADDED.search(name)}
+    in_cells = {name: parts for name, parts in mesh.cell_data.items() if not ADDED.search(name)}
+    on_cells = not at_points and bool(in_cells)
+    used = [number for number, block in enumerate(mesh.cells) if len(block.data)]
+    fields = at_points
+    if on_cells:
+        fields = {name: np.concatenate([np.asarray(parts[number]) for number in used]) for name, parts in in_cells.items() if used}
+    if any(len(values) != len(corners if on_cells else points) for values in fields.values()):
+        raise ValueError("a field has not as many values as there are points or cells")
+    return Mesh(points, corners, _joined(fields), on_cells)
+
+
+def write_meshio(path: Path, part: Points | Cells | Surface, name: str) -> None:
+    """Write a part of a frame in a format of meshio's, atomically. One without points that the format does not hold is refused.
+
+    Args:
+        path: the file.
+        part: that the format holds, see `holds`.
+        name: of the format.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: the format does not hold it.
+    """
+    dress = holds(name, *kind_of(part)).dress
+    if dress is None:
+        raise ValueError(f"{path}: {name} does not hold {part.name}")
+    mesh = _dressed(mesh_of(part), dress)
+    with replacing_by_name(path) as temporary:
+        try:
+            _write(temporary, mesh, name)
+        except OSError:
+            raise
+        except _faults() as error:
+            raise ValueError(f"{path}: cannot be written as {name}: {str(error) or type(error).__name__}") from error
+
+
+def read_meshio(path: Path, name: str) -> Mesh:
+    """Return what a file of `write_meshio` holds.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is damaged, or of another format.
+    """
+    path.stat()  # whose error is the system's
+    if name in WRITTEN_ONLY:
+        raise ValueError(f"{path}: is not a readable frame: {name} files are for other programs, meshio's reader may not end")
+    try:
+        return from_meshio(_module(name).read(str(path)))
+    except _faults() as error:
+        raise ValueError(f"{path}: is not a readable frame: {str(error) or type(error).__name__}") from error
+
+
+def meshio_bytes(part: Points | Cells | Surface, name: str) -> int:
+    """Return about how many bytes the file of a part takes, as a sample's did."""
+    return int(vtu_bytes(part) * holds(name, *kind_of(part)).size)
+
+
+def kind_of(part: Points | Cells | Surface) -> tuple[type, int]:
+    """Return the type of a part and how many dimensions its cells have."""
+    if isinstance(part, Points):
+        return Points, 3
+    return type(part), part.dimension if isinstance(part, Cells) else part.corners.shape[1]
+
+
+@cache
+def holds(name: str, kind: type, dimension: int) -> Holds:
+    """Return how a format holds the parts of a kind: a sample is written, read back and compared.
+
+    Args:
+        name: of the format.
+        kind: of the parts.
+        dimension: of their cells.
+    """
+    sample, none = _sample(kind, dimension, round(SAMPLE ** (1.0 / dimension))), _sample(kind, dimension, 0)
+    found, why, said = None, "", io.StringIO()
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        path = Path(folder) / f"sample.{SUFFIXES[name]}"
+        for dress in Dress:
+            if found and dress is Dress.BARE:
+                break
+            said.truncate(said.seek(0))
+            try:
+                if not _comes_back(path, sample, name, dress):
+                    why = why or said.getvalue()
+                    continue
+                warns, size = bool(said.getvalue()), path.stat().st_size / vtu_bytes(sample)
+            except _faults() as error:
+                why = why or (f"needs {error.name}" if isinstance(error, ModuleNotFoundError) else str(error))
+                continue
+            empty = False
+            with contextlib.suppress(*_faults()):
+                empty = _comes_back(path, none, name, dress)
+            found = found or Holds(dress, empty, size)
+            if not warns:  # else meshio would warn at every frame, if there is another way
+                return Holds(dress, empty, size)
+    return found or Holds(None, why=why)
+
+
+def _comes_back(path: Path, part: Points | Cells | Surface, name: str, dress: Dress) -> bool:
+    """Return whether a part that is written in a format is read back: its points to float32, its cells, and its fields unless bare."""
+    expected = mesh_of(part)
+    _write(path, _dressed(expected, dress), name)
+    found = from_meshio(_module(name).read(str(path)))
+    points = np.asarray(found.points, dtype=np.float64)
+    if expected.points.shape != points.shape or not np.allclose(points, expected.points, rtol=1e-6, atol=1e-7):
+        return False
+    if expected.corners.size and not np.array_equal(found.corners, expected.corners):
+        return False
+    return (
+        dress is Dress.BARE
+        or not len(points)
+        or all(
+            key in found.fields and found.fields[key].shape == values.shape and np.allclose(found.fields[key], values, rtol=1e-6)
+            for key, values in expected.fields.items()
+        )
+    )
+
+
+def _dressed(mesh: Mesh, dress: Dress) -> Mesh:
+    """Return a mesh as a format takes it."""
+    if dress is Dress.AS_IS:
+        return mesh
+    fields = {} if dress is Dress.BARE else mesh.fields
+    fields = {name: values.astype(np.int32) if values.dtype.kind in "biu" else values for name, values in fields.items()}
+    if dress is Dress.SCALARS:
+        flat: dict[str, np.ndarray] = {}
+        for name, values in fields.items():
+            flat |= (
+                {name: values} if values.ndim == 1 else {f"{name}_{axis}": values[:, number].copy() for number, axis in enumerate("xyz")}
+            )
+        fields = flat
+    return Mesh(mesh.points.astype(np.float64), mesh.corners, fields, mesh.on_cells)
+
+
+def _joined(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return fields in which `velocity_x`, `_y` and `_z` are one again."""
+    found: dict[str, np.ndarray] = {}
+    for key, values in fields.items():
+        match = AXES.fullmatch(key)
+        names = [f"{match['name']}_{axis}" for axis in "xyz"] if match else []
+        if not match or not all(name in fields and fields[name].ndim == 1 for name in names):
+            found[key] = values
+        elif match["axis"] == "x":
+            found[match["name"]] = np.stack([fields[name] for name in names], axis=-1)
+    return found
+
+
+def meshio_of(mesh: Mesh) -> Any:
+    """Return a mesh as a `meshio.Mesh`."""
+    import meshio
+
+    kind = CELL_KINDS[mesh.corners.shape[1]]
+    if mesh.on_cells:
+        return meshio.Mesh(mesh.points, [(kind, mesh.corners)], cell_data={name: [values] for name, values in mesh.fields.items()})
+    return meshio.Mesh(mesh.points, [(kind, mesh.corners)], point_data=dict(mesh.fields))
+
+
+def _write(path: Path, mesh: Mesh, name: str) -> None:
+    with np.errstate(divide="ignore", invalid="ignore"):  # normals of triangles without an area
+        _module(name).write(str(path), meshio_of(mesh), **OPTIONS.get(name, {}))
+
+
+def _module(name: str) -> Any:
+    """Return meshio's module of a format; its own `read` ends the process where a file is damaged."""
+    import meshio
+
+    return getattr(meshio, MODULES.get(name, name))
+
+
+def _faults() -> tuple[type[Exception], ...]:
+    import meshio
+
+    return (*FAULTS, meshio.ReadError, meshio.WriteError)
+
+
+def _active(volume: Volume) -> Cells:
+    """Return the voxels of a volume that a NanoVDB file holds as active."""
+    active = np.abs(volume.values) < volume.band if volume.band is not None else volume.values != 0.0
+    index = np.argwhere(active)[:, ::-1] + np.array(volume.origin)
+    return Cells(volume.name, index, volume.spacing, 3, {volume.name: volume.values[active]})
+
+
+def _sample(kind: type, dimension: int, side: int) -> Points | Cells | Surface:
+    """Return a part with the kinds of fields that frames have, of a lattice of points or cells."""
+    counts = [side] * dimension + [1] * (3 - dimension)
+    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    index[:, :dimension] -= 2  # numbers below 0, too, and with exponents
+    count = len(index)
+    numbers = np.linspace(-1.7, 3.1, count)
+    fields: dict[str, np.ndarray] = {
+        "velocity": np.stack([numbers, numbers**2, np.sin(numbers)], axis=-1).astype(np.float32),
+        "pressure": (1e4 * numbers).astype(np.float32),
+        "wall": (numbers > 0.0).astype(np.uint8),
+        "body": np.arange(count, dtype=np.int32),
+    }
+    points = ((index + 0.3 * np.sin(np.arange(3 * count).reshape(-1, 3))) * 0.137).astype(np.float32)
+    if kind is Cells:
+        return Cells("grid", index, 0.137, dimension, fields)
+    if kind is Points:
+        return Points("particles", points, fields)
+    if dimension < 3:
+        points[:, 2] = 0.0
+    corners = (
+        np.stack([np.arange(count - dimension + 1) + number for number in range(dimension)], axis=-1) if count else np.zeros((0, dimension))
+    )
+    return Surface("surface", points, corners.astype(np.int32), fields)

@@ -1,0 +1,62 @@
+"""Read a frame of a run back, whatever its format, in one piece or in those of ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from warp_lcp.frames.frames import FRAME_FILE
+from warp_lcp.frames.meshio_format import FORMAT_OF, WRITTEN_ONLY, meshio_of, read_meshio, to_meshio
+from warp_lcp.frames.pieces import one_grid, one_mesh, piece_files
+from warp_lcp.frames.vti import read_vti
+from warp_lcp.frames.vtu import Mesh, read_vtu
+from warp_lcp.simulation import Cells
+
+READERS: dict[str, tuple[Callable[[Path], Any], Callable[[list[Any]], Any]]] = {"vtu": (read_vtu, one_mesh), "vti": (read_vti, one_grid)}
+MESHIO_READS = (suffix for suffix, name in FORMAT_OF.items() if name not in WRITTEN_ONLY)
+READABLE = ("vti", "pvti", "pvtu", "vtu", *MESHIO_READS)  # suffixes of a part's file, the one that counts first
+
+
+def read_part(file: Path) -> Mesh | Cells:
+    """Return what is in a frame's file, or in the pieces that it names.
+
+    Raises:
+        OSError: a file cannot be read.
+        ValueError: it is no frame, or damaged.
+    """
+    match = FRAME_FILE.fullmatch(file.name)
+    if match is None or match["format"] not in READABLE:
+        raise ValueError(
+            f"{file}: is not a readable frame: its name must be like particles_000012.vtu, and its format one of {', '.join(READABLE)}"
+        )
+    kind = match["format"]
+    if kind in FORMAT_OF:
+        return read_meshio(file, FORMAT_OF[kind])
+    read, joined = READERS[kind.removeprefix("p")]
+    if not kind.startswith("p"):
+        return read(file)
+    if pieces := piece_files(file):
+        return joined([read(piece) for piece in pieces])
+    raise ValueError(f"{file}: is not a readable frame: names no pieces")
+
+
+def read_frame(file: str | PathLike[str]) -> Any:
+    """Read a file of a run's `frames` as a `meshio.Mesh`.
+
+    meshio itself reads neither VTU files without cells, as frames before the first drop are, nor VTI files, nor files that name the pieces
+    of ranks; all of these are read here, and other formats of `output.format`. Volumes are not meshes: see `wp.Volume.load_from_nvdb`.
+
+    Args:
+        file: such as `out/frames/particles_000012.vtu`.
+
+    Returns:
+        A `meshio.Mesh`: points [m], cells, and the fields as point data or cell data.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no frame, or damaged; the message names it.
+    """
+    found = read_part(Path(file))
+    return to_meshio(found) if isinstance(found, Cells) else meshio_of(found)
