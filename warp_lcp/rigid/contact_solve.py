@@ -21,6 +21,7 @@ RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
 BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
 EXACT = StoppingCriteria(rtol=1e-7, max_iterations=600)  # a stack then drifts by 1e-7 of its size in a second
+UNSOLVED = 1e-5  # residual of sweeps from which on Newton's methods are worth their time
 ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)  # for overlaps, which take several steps anyway
 ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
@@ -95,7 +96,7 @@ class ContactSolve:
         b[:, 0] -= contacts.target
         start = self.memory.recall(contacts, self.bodies) if start is None else start
         problem = self._problem(contacts, b, contacts.friction)
-        impulses, self.residual = problem.solve(EXACT, start)
+        impulses, self.residual = problem.solve(EXACT, start, UNSOLVED)
         for body, impulse in zip(self.bodies, contacts.on_bodies(impulses, len(self.bodies)), strict=True):
             body.push(impulse)
         return impulses
