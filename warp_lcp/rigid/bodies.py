@@ -29,6 +29,7 @@ class _Begun:
         free: momenta without contacts, shape (n, 6).
         contacts: where bodies touch.
         impulses: of the contacts if no material pushes; once `settled` with what it gave.
+        detour: of the bodies in the step, where they bounce.
         settled: whether contacts have been solved for with what the material gave.
     """
 
@@ -36,6 +37,7 @@ class _Begun:
     free: np.ndarray
     contacts: Contacts
     impulses: np.ndarray
+    detour: np.ndarray | None
     settled: bool = False
 
 
@@ -105,14 +107,16 @@ class RigidBodies:
             body.time = time
         states = self._states()
         contacts = self._solve.find(time, dt, gravity)
+        approach = self._solve.approach(contacts)
         for body in self.bodies:
             body.release()
             body.accelerate(gravity, kick_dt)
+        before = self._solve.bounce(contacts, approach, dt, kick_dt, gravity)
         free = self._momenta()
         impulses = self._solve.push_apart(contacts)
         self._solve.hold(contacts, impulses)
         self.contact_residual = self._solve.residual
-        self._begun = _Begun(states, free, contacts, impulses)
+        self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses))
 
     def solve_contacts(self) -> None:
         """Solve for the contacts with what the material gave.
@@ -146,12 +150,13 @@ class RigidBodies:
         begun = self._begun
         self._solve.memory.keep(begun.contacts, begun.impulses, self.bodies)
         self.contacts = len(begun.contacts)
-        ways = self._solve.separation(begun.contacts, dt)
+        ways = self._solve.separation(begun.contacts, dt, begun.detour)
         for number, body in enumerate(self.bodies):
             body.release()
             body.advance(dt)
-            if ways is not None and ways[number].any():
-                body.shift(ways[number])
+            for way in (begun.detour, ways):
+                if way is not None and way[number].any():
+                    body.shift(way[number])
         self._begun = None
 
     def restore_step(self) -> None:

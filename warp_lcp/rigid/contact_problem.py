@@ -84,9 +84,7 @@ class ContactProblem:
         fields = (self.one[contacts], self.other[contacts], self.b[contacts], self.friction[contacts])
         return ContactProblem(number[first], number[second], *fields, len(bodies))
 
-    def solve(
-        self, stopping: StoppingCriteria, start: np.ndarray | None = None, unsolved: float = np.inf
-    ) -> tuple[np.ndarray, float]:
+    def solve(self, stopping: StoppingCriteria, start: np.ndarray | None = None, unsolved: float = np.inf) -> tuple[np.ndarray, float]:
         """Return impulses, shape (k, rows), and the largest residual of an island, relative to that of no impulses.
 
         An island that does not reach the tolerance is taken at its least residual, which says so.
