@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -133,7 +134,7 @@ class ContactSolve:
         met &= (after > 0.0) & (after + 0.5 * a * rest >= 0.0)  # and apart at the end of the step: smaller bounces are none
         contacts.target[met] = (after + a * (0.5 * dt - t))[met]
         order, starts = problem.islands()
-        for begin, end in zip(starts[:-1], starts[1:], strict=True):  # what bears an impact does so when it happens
+        for begin, end in pairwise(starts):  # what bears an impact does so when it happens
             mine = order[begin:end]
             if met[mine].any():
                 contacts.when[mine] = np.where(met[mine], t[mine], t[mine][met[mine]].mean())
