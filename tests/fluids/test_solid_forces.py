@@ -159,7 +159,9 @@ def test_a_body_is_told_what_it_got(dimension: int) -> None:
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(dimension: int, viscosity: float) -> None:
     """Each step: pressure, viscous stresses and weight add up to the change of momentum, whatever the solves left."""
-    rod = ball(dimension, density=7800.0, velocity=[0.4, -1.0, 0.2][:dimension], angular_velocity=300.0 if dimension == 2 else [0.0, 90.0, 200.0])
+    rod = ball(
+        dimension, density=7800.0, velocity=[0.4, -1.0, 0.2][:dimension], angular_velocity=300.0 if dimension == 2 else [0.0, 90.0, 200.0]
+    )
     simulation = tank(dimension, viscosity={"value": viscosity}, solid=[rod])
     assert simulation.bodies is not None
     body = simulation.bodies.bodies[0]

@@ -24,6 +24,7 @@ STARTS = (1e4, 1e2)  # times the largest velocity: where the interior point star
 MOST_SETS = 20  # steps of the active set: near its solution it needs 1 to 10
 MOST_STEPS = 80  # of the interior point: it needs 10 to 60
 JAMMED = 20  # steps without a smaller residual
+SMALL = 150  # rows of a system that LAPACK solves sooner than SuperLU
 TO_BOUNDARY = 0.995  # part of the way to the first bound that a step goes
 
 
@@ -78,6 +79,7 @@ class ContactNewton:
     def __init__(self, problem: ContactProblem, x: np.ndarray) -> None:
         k, rows, _ = problem.one.shape
         self._J = jacobian(problem.first, problem.second, problem.one, problem.other, problem.bodies)
+        self._small = self._J.toarray() if sum(self._J.shape) <= SMALL else None
         self._diagonal, self._yields = problem.yields()
         self._b, self._reference = problem.b.ravel(), float(np.linalg.norm(np.minimum(problem.b[:, 0], 0.0)))
         self._normals = rows * np.arange(k)
@@ -103,11 +105,12 @@ class ContactNewton:
             at_low, at_up = wanted <= low, wanted >= up
             free = ~(at_low | at_up)
             # free: J w + (yields + SHIFT d) x = -b + SHIFT d x_before; at a bound: d (x -+ mu x_n) = 0
-            C = self._matrix(
+            found = self._solved(
+                free.astype(float),
                 np.where(free, SHIFT * d + self._yields, d),
                 d[self._tangents] * self._friction * (at_low[self._tangents].astype(float) - at_up[self._tangents]),
+                np.where(free, SHIFT * d * x - self._b, 0.0),
             )
-            found = self._solved(free.astype(float), C, np.where(free, SHIFT * d * x - self._b, 0.0))
             if found is None:
                 return
             x = found
@@ -170,7 +173,7 @@ class ContactNewton:
         right = np.zeros(len(now.x))
         right[normals] = to_normal / x_n - gap_normal
         right[tangents] = to_low / now.below - stiff_low * gap_below - to_up / now.above + stiff_up * gap_above - gap_slip
-        x = self._solved(np.ones(len(now.x)), self._matrix(diagonal, mu * (stiff_low - stiff_up)), right)
+        x = self._solved(np.ones(len(now.x)), diagonal, mu * (stiff_low - stiff_up), right)
         if x is None:
             return None
         below, above = mu * x[own] + x[tangents] + gap_below, mu * x[own] - x[tangents] + gap_above
@@ -179,22 +182,30 @@ class ContactNewton:
             (to_up - now.up * above) / now.above, below, above,
         )  # fmt: skip
 
-    def _matrix(self, diagonal: np.ndarray, coupling: np.ndarray) -> sparse.csr_array:
-        """Return C: a diagonal, and in the rows of tangents an entry at their normals."""
-        n = len(diagonal)
-        values, rows = np.concatenate([diagonal, coupling]), np.concatenate([np.arange(n), self._tangents])
-        return sparse.csr_array((values, (rows, np.concatenate([np.arange(n), self._own]))), shape=(n, n))
+    def _solved(self, weights: np.ndarray, diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+        """Return x of [I, -J'; W J, C] [w; x] = [0; right]; None where the matrix is singular.
 
-    def _solved(self, weights: np.ndarray, C: sparse.csr_array, right: np.ndarray) -> np.ndarray | None:
-        """Return x of [I, -J'; W J, C] [w; x] = [0; right], W = diag(weights); None where the matrix is singular."""
-        bodies = self._J.shape[1]
-        blocks = [[sparse.eye_array(bodies), -self._J.T], [sparse.diags_array(weights) @ self._J, C]]
-        scale = sparse.diags_array(self._scale)
+        Args:
+            weights: the diagonal of W, shape (k rows,).
+            diagonal: that of C.
+            coupling: entries of C in the rows of tangents, at their normals.
+            right: of the equation.
+        """
+        bodies, n, scale = self._J.shape[1], len(diagonal), self._scale
+        J = self._small if self._small is not None else self._J
+        values, rows = np.concatenate([diagonal, coupling]), np.concatenate([np.arange(n), self._tangents])
+        C = sparse.csr_array((values, (rows, np.concatenate([np.arange(n), self._own]))), shape=(n, n))
+        sides = scale * np.concatenate([np.zeros(bodies), right])
         try:
-            factors = splu((scale @ sparse.block_array(blocks) @ scale).tocsc())
-        except RuntimeError:  # SuperLU: exactly singular
+            if self._small is not None:
+                K = np.block([[np.eye(bodies), -J.T], [weights[:, None] * J, C.toarray()]])
+                found = scale * np.linalg.solve(scale[:, None] * K * scale, sides)
+            else:
+                blocks = [[sparse.eye_array(bodies), -J.T], [sparse.diags_array(weights) @ J, C]]
+                scaling = sparse.diags_array(scale)
+                found = scale * splu((scaling @ sparse.block_array(blocks) @ scaling).tocsc()).solve(sides)
+        except (RuntimeError, np.linalg.LinAlgError):  # SuperLU: exactly singular; LAPACK
             return None
-        found = self._scale * factors.solve(self._scale * np.concatenate([np.zeros(bodies), right]))
         return found[bodies:] if np.isfinite(found).all() else None
 
     def _y(self, x: np.ndarray) -> np.ndarray:
