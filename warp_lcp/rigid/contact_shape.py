@@ -100,7 +100,7 @@ class ContactShape:
         return cls(points=corners, radius=0.0, distance=nearest, size=max(part.size for part in parts), boxes=made)
 
     def nearest_on(self, edges: np.ndarray, margin: float) -> np.ndarray:
-        """Return the point of each edge that is nearest to this shape, or deepest in it, of those that may be within a margin, shape (n, 3).
+        """Return the point of each edge that is nearest to this shape, or deepest in it, if that may be within a margin, shape (n, 3).
 
         The distance to a convex shape has one minimum along a segment; near others it is the one beside the nearest of nine points.
 
