@@ -142,7 +142,7 @@ class LiquidSimulation(ParticleSimulation):
         The pressure is solved before any particle moves, so that a failed solve leaves the state as it was, but for the particles' order.
 
         Raises:
-            StepFailed: the solve missed its criteria; a smaller dt may be tried.
+            StepFailed: a solve missed its criteria; a smaller dt may be tried.
             SimulationFailed: something is not finite, a particle has left the domain, or enclosed liquid would have to change its volume.
             ValueError: dt is not positive.
         """
@@ -161,6 +161,7 @@ class LiquidSimulation(ParticleSimulation):
                 if self.tension is not None:
                     self.tension.measure(window, self.projection.kind)
         walls = self._meet_walls(window, dt)
+        self.solve_contacts()
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)

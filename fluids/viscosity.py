@@ -216,7 +216,10 @@ class Viscosity:
             turn, shift = self.boundary.cut.turn.numpy(), self.boundary.cut.shift.numpy()
             spins = np.stack((turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]), axis=-1)
             six = np.concatenate((np.einsum("sij,sj->si", turn, points) + shift, spins), axis=1)
-            pulled -= np.einsum("sij,sj->si", drags, six if self.grid.dimension == 3 else six[:, PLANAR])
+            motions = six if self.grid.dimension == 3 else six[:, PLANAR]
+            if self._bodies is not None:  # which are unknowns of the step, too
+                motions[self._bodies.bodies.numbers] = self._bodies.velocities()
+            pulled -= np.einsum("sij,sj->si", drags, motions)
         impulses = np.zeros((len(points), 6))
         impulses[:, slice(None) if self.grid.dimension == 3 else PLANAR] = self._density * self.grid.cell_volume * pulled
         return impulses

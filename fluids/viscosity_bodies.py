@@ -195,6 +195,11 @@ class BodyDrag:
         launch(weigh_kernel, self.columns.rank, [self._response, self.columns.sums, self._factors], device=self.grid.device)
         self.columns.scatter(self._factors, q, q, sign=-1.0, launch=launch)
 
+    def velocities(self) -> np.ndarray:
+        """Return the bodies' velocities that the step has found, before the bodies get them, shape (bodies, width) [m/s, 1/s]."""
+        before = np.array([body.velocities(self.grid.dimension) for body in self.bodies.bodies])
+        return before + self.change.reshape(before.shape)
+
     def push(self, change: wp.array) -> None:
         """Give the bodies the impulses of a step that changed the liquid's velocity by so much."""
         moved = self.change.reshape(self._pulled.shape)

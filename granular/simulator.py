@@ -38,7 +38,7 @@ from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
+from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, missed_by_far
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
@@ -312,6 +312,11 @@ class SandSimulation(ParticleSimulation):
         with self.watch.stage("projection", *self.velocity):
             self.outcome.take(self.velocity)
             self._push_bodies(dt)
+        try:
+            self.solve_contacts()
+        except StepFailed:
+            stress.take_back()
+            raise
         return {
             "solver": scene.solver.method,
             "solve_status": solved.status.name,

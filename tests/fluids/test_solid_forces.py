@@ -155,6 +155,40 @@ def test_a_body_is_told_what_it_got(dimension: int) -> None:
     assert np.abs(given).max() > 0.0
 
 
+@pytest.mark.parametrize("viscosity", [0.05, 20.0])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_in_thick_liquid_forces_and_weight_are_what_moves_a_body(dimension: int, viscosity: float) -> None:
+    """Each step: pressure, viscous stresses and weight add up to the change of momentum, whatever the solves left."""
+    rod = ball(
+        dimension, density=7800.0, velocity=[0.4, -1.0, 0.2][:dimension], angular_velocity=300.0 if dimension == 2 else [0.0, 90.0, 200.0]
+    )
+    simulation = tank(dimension, viscosity={"value": viscosity}, solid=[rod])
+    assert simulation.bodies is not None
+    body = simulation.bodies.bodies[0]
+    weight = body.properties.mass * GRAVITY
+    for dt in (0.004, 0.01, 0.002, 0.007):
+        before = np.concatenate([body.momentum, body.angular_momentum])
+        simulation.step(dt)
+        gained = (np.concatenate([body.momentum, body.angular_momentum]) - before) / simulation.kick_dt
+        gained[1] += weight
+        told = forces(simulation, 0.0)["solid0"]
+        np.testing.assert_allclose(told, gained if dimension == 3 else gained[[0, 1, 5]], rtol=1e-4, atol=1e-5 * weight)
+    assert np.abs(told[:2]).max() > 0.02 * weight
+
+
+def test_a_rod_that_sinks_through_honey_evenly_is_borne_by_it() -> None:
+    """The mean force is the weight; at first there is none."""
+    rod = {"shape": "sphere", "center": [0.02, 0.055], "radius": 0.005, "density": 7800.0}
+    tables = {"size": [0.04, 0.08], "resolution": 32, "output": FORCES, "viscosity": {"value": 10.0}, "solid": [rod]}
+    simulation = create(scene(liquid=[box([0.0, 0.0], [0.04, 0.075])], **tables))
+    assert simulation.bodies is not None
+    weight, told = simulation.bodies.bodies[0].properties.mass * GRAVITY, []
+    for _ in range(30):
+        simulation.step(min(simulation.stable_dt(), 0.01))
+        told.append(forces(simulation, 0.0)["solid0"][1])
+    assert np.mean(told[10:]) == pytest.approx(weight, rel=0.02)
+
+
 @pytest.mark.parametrize("solids", ["voxel", "cut-cell"])
 def test_an_impact_takes_the_momentum(solids: str) -> None:
     """A block falls into a tilted tub: what particles lose of their momentum, gravity's apart, the walls have got, to a few percent."""

@@ -11,6 +11,7 @@ from warp_lcp.fluids import LiquidScene
 from warp_lcp.frames.frames import write_vtu
 from warp_lcp.granular import SIMULATOR as GRANULAR
 from warp_lcp.granular.scene import SandScene
+from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import StepFailed, Surface
 
 GRAVITY = 9.81
@@ -102,6 +103,37 @@ def test_a_step_that_fails_leaves_the_bodies_as_they_were(monkeypatch: pytest.Mo
     for name, array in simulation.state().items():
         if name in before:
             np.testing.assert_array_equal(array, before[name], err_msg=name)
+
+
+@pytest.mark.parametrize("simulator", ["fluids", "granular"])
+@pytest.mark.parametrize("when", ["begin_step", "solve_contacts"])
+def test_contacts_that_are_not_solved_fail_the_step(simulator: str, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before or after the material's solve: the message has the residual, a shorter step may follow, and the state is as it was."""
+    simulation, twin = (make({**BLOCK, "translate": [0.0, -0.6]}, simulator=simulator) for _ in range(2))
+    simulation.step(0.004)
+    twin.step(0.004)
+    kept = getattr(RigidBodies, when)
+
+    def missing(self: RigidBodies, *arguments: Any) -> None:
+        kept(self, *arguments)
+        self.contact_residual = 0.83
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RigidBodies, when, missing)
+        with pytest.raises(StepFailed, match=r"contacts.* relative residual of 8.30e-01"):
+            simulation.step(0.01)
+    row, expected = simulation.step(0.005), twin.step(0.005)
+    for name in expected:  # the pressure starts from the one that the failed step has found
+        if name.startswith(("body", "contacts", "center")):
+            assert row[name] == pytest.approx(expected[name], rel=1e-4, abs=1e-9), name
+
+
+@pytest.mark.parametrize("simulator", ["fluids", "granular"])
+def test_the_log_says_how_well_contacts_are_solved(simulator: str) -> None:
+    simulation = make({**BLOCK, "translate": [0.2, -0.6]}, {**BLOCK, "translate": [0.2, -0.5], "density": 4e4}, simulator=simulator)
+    assert "contact_residual" in simulation.columns()
+    rows = [simulation.step(0.004) for _ in range(3)]
+    assert all(0.0 < row["contact_residual"] <= 1e-5 for row in rows)
 
 
 def test_frames_show_the_outlines(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 
 
 class SharedBodies(RigidBodies):
-    """Rigid bodies that every rank knows, wherever they are; `begin_step` and `end_step` are collective.
+    """Rigid bodies that every rank knows, wherever they are; `begin_step`, `solve_contacts` and `end_step` are collective.
 
     All ranks take the same steps from the same numbers, contacts included: what the material gives a body has been added up over the ranks.
     The root rank's numbers then become those of all, as processors of another kind may round otherwise, and ranks that disagree by a bit
@@ -31,8 +31,13 @@ class SharedBodies(RigidBodies):
         super().begin_step(time, dt, gravity, kick_dt)
         self._take_root()
 
+    def solve_contacts(self) -> None:
+        """Solve for the contacts with what the material gave; ranks agree on how well."""
+        super().solve_contacts()
+        self.contact_residual = self._ranks.share(self.contact_residual)
+
     def end_step(self, dt: float) -> None:
-        """Solve for the contacts with what the material gave, then move and turn the bodies."""
+        """Move and turn the bodies."""
         super().end_step(dt)
         self._take_root()
 

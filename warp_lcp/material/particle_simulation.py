@@ -27,7 +27,9 @@ from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.material.spray import Spray
 from warp_lcp.material.wall import Join
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.simulation import NoStopwatch, SimulationFailed, Stopwatch
+from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
+
+CONTACTS_MISSED = 1e-2  # relative residual of bodies' contacts: what gravity makes in a step is wrong by a hundredth, and bodies creep
 
 
 class ParticleSimulation(ParticleCheckpoints):
@@ -42,7 +44,7 @@ class ParticleSimulation(ParticleCheckpoints):
     particles' order, so that a solve may fail.
 
     Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
-    of its solve, or calls `restore_bodies` if it fails.
+    of its solve and calls `solve_contacts`, or calls `restore_bodies` if it fails.
 
     With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's clock, time
     step, checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
@@ -210,6 +212,7 @@ class ParticleSimulation(ParticleCheckpoints):
             dt: time step [s].
 
         Raises:
+            StepFailed: the bodies' contacts are far from solved.
             SimulationFailed: something is not finite, or a particle has left the domain.
             ValueError: dt is not positive.
         """
@@ -227,7 +230,29 @@ class ParticleSimulation(ParticleCheckpoints):
         if self.bodies is not None:
             with self.watch.stage("bodies"):
                 self.bodies.begin_step(self.time, dt, self.gravity, self.kick_dt)
+                self._check_contacts()
         return totals
+
+    def solve_contacts(self) -> None:
+        """Solve for the rigid bodies' contacts with what the material has given them, before anything moves.
+
+        Raises:
+            StepFailed: they are far from solved; the bodies are where they were before the step.
+        """
+        if self.bodies is not None:
+            with self.watch.stage("bodies"):
+                self.bodies.solve_contacts()
+                self._check_contacts()
+
+    def _check_contacts(self) -> None:
+        assert self.bodies is not None
+        residual = self.bodies.contact_residual
+        if residual > CONTACTS_MISSED:
+            self.restore_bodies()
+            raise StepFailed(
+                f"the rigid bodies' contacts are solved to a relative residual of {residual:.2e} only (allowed: {CONTACTS_MISSED}): "
+                "bodies of very different masses press on each other"
+            )
 
     def restore_bodies(self) -> None:
         """Put the rigid bodies back to where they were before `begin_step`, as a solve has failed."""

@@ -104,6 +104,9 @@ class WorldBodies(RigidBodies):
                 body.accelerate(gravity, kick_dt)
                 body.push(kick_dt * force)
 
+    def solve_contacts(self) -> None:
+        """Do nothing: contacts are the world's."""
+
     def end_step(self, dt: float) -> None:
         """Move and turn the bodies."""
         self._before = None

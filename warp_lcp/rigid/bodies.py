@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,13 +28,17 @@ class _Begun:
         states: of the bodies before it.
         free: momenta without contacts, shape (n, 6).
         contacts: where bodies touch.
-        impulses: of the contacts if no material pushes.
+        impulses: of the contacts if no material pushes; once `settled` with what it gave.
+        detour: of the bodies in the step, where they bounce.
+        settled: whether contacts have been solved for with what the material gave.
     """
 
     states: np.ndarray
     free: np.ndarray
     contacts: Contacts
     impulses: np.ndarray
+    detour: np.ndarray | None
+    settled: bool = False
 
 
 class RigidBodies:
@@ -55,7 +59,7 @@ class RigidBodies:
         motions: a `BodyMotion` of each, for the solids.
         time: of the state [s].
         contacts: points where bodies touched in the last step.
-        contact_residual: of their problem, relative to that of no impulses.
+        contact_residual: of the last problem of contacts, relative to that of no impulses.
 
     Raises:
         ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
@@ -89,7 +93,7 @@ class RigidBodies:
         """Let gravity act, and contacts; hold bodies that rest against walls and solids that the scene moves or that stand.
 
         Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it meets a body on the floor as it meets the
-        floor. `end_step` decides anew whether contacts bear.
+        floor. `solve_contacts` decides anew whether contacts bear.
 
         Args:
             time: of the state [s].
@@ -103,16 +107,36 @@ class RigidBodies:
             body.time = time
         states = self._states()
         contacts = self._solve.find(time, dt, gravity)
+        approach = self._solve.approach(contacts)
         for body in self.bodies:
             body.release()
             body.accelerate(gravity, kick_dt)
+        before = self._solve.bounce(contacts, approach, dt, kick_dt, gravity)
         free = self._momenta()
         impulses = self._solve.push_apart(contacts)
         self._solve.hold(contacts, impulses)
-        self._begun = _Begun(states, free, contacts, impulses)
+        self.contact_residual = self._solve.residual
+        self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses))
+
+    def solve_contacts(self) -> None:
+        """Solve for the contacts with what the material gave.
+
+        Raises:
+            RuntimeError: there was no `begin_step`.
+        """
+        begun = self._begun
+        if begun is None:
+            raise RuntimeError("solve_contacts: there was no begin_step")
+        impulses = begun.impulses
+        if any(body.given.any() for body in self.bodies):
+            for body, momenta in zip(self.bodies, begun.free, strict=True):
+                body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
+            impulses = self._solve.push_apart(begun.contacts, begun.impulses)
+            self.contact_residual = self._solve.residual
+        self._begun = replace(begun, impulses=impulses, settled=True)
 
     def end_step(self, dt: float) -> None:
-        """Solve for the contacts with what the material gave, then move and turn the bodies.
+        """Move and turn the bodies, after `solve_contacts` if that has not been called.
 
         Args:
             dt: of `begin_step` [s].
@@ -120,22 +144,19 @@ class RigidBodies:
         Raises:
             RuntimeError: there was no `begin_step`.
         """
+        if self._begun is None or not self._begun.settled:
+            self.solve_contacts()
+        assert self._begun is not None
         begun = self._begun
-        if begun is None:
-            raise RuntimeError("end_step: there was no begin_step")
-        impulses = begun.impulses
-        if any(body.given.any() for body in self.bodies):
-            for body, momenta in zip(self.bodies, begun.free, strict=True):
-                body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
-            impulses = self._solve.push_apart(begun.contacts, begun.impulses)
-        self._solve.memory.keep(begun.contacts, impulses, self.bodies)
-        self.contacts, self.contact_residual = len(begun.contacts), self._solve.residual
-        ways = self._solve.separation(begun.contacts, dt)
+        self._solve.memory.keep(begun.contacts, begun.impulses, self.bodies)
+        self.contacts = len(begun.contacts)
+        ways = self._solve.separation(begun.contacts, dt, begun.detour)
         for number, body in enumerate(self.bodies):
             body.release()
             body.advance(dt)
-            if ways is not None and ways[number].any():
-                body.shift(ways[number])
+            for way in (begun.detour, ways):
+                if way is not None and way[number].any():
+                    body.shift(way[number])
         self._begun = None
 
     def restore_step(self) -> None:
@@ -203,10 +224,11 @@ class RigidBodies:
         """Return the names of the log's columns: place, velocity and turn of each body, numbered from 0.
 
         x, y, z: the center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, how far it has turned [degrees] and how fast
-        it turns [degrees/s]; 3-D: wx, wy, wz, the angular velocity [degrees/s]. contacts: points where bodies touch or nearly do.
+        it turns [degrees/s]; 3-D: wx, wy, wz, the angular velocity [degrees/s]. contacts: points where bodies touch or nearly do;
+        contact_residual: how well the problem of their impulses was solved, relative to that of no impulses.
         """
         names = IN_PLANE if self.dimension == 2 else IN_SPACE
-        return (*(f"body{number}_{name}" for number in range(len(self.bodies)) for name in names), "contacts")
+        return (*(f"body{number}_{name}" for number in range(len(self.bodies)) for name in names), "contacts", "contact_residual")
 
     def row(self) -> dict[str, float | int]:
         """Return the entries of the columns."""
@@ -218,7 +240,7 @@ class RigidBodies:
             else:
                 values += [*body.position, *body.velocity, *spin]
         numbers = [float(value) for value in values]
-        return dict(zip(self.columns(), [*numbers, self.contacts], strict=True))
+        return dict(zip(self.columns(), [*numbers, self.contacts, float(self.contact_residual)], strict=True))
 
     def surfaces(self) -> BodySurface:
         """Return the surfaces of all bodies as they are, for a frame; fields: `body`, counted from 0, and `velocity` [m/s]."""

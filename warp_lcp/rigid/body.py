@@ -136,7 +136,7 @@ class RigidBody:
         """Move by a small way (m, rad), shape (k,), without a velocity."""
         six = in_space(way)
         self.position = self.position + six[:3]
-        self.rotation = _turn(six[3:]) @ self.rotation
+        self.rotation = rotation_by(six[3:]) @ self.rotation
         self.angle += float(six[5])
 
     def after(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -149,10 +149,10 @@ class RigidBody:
         half = 0.5 * dt * self.angular_velocity
         for _ in range(MOST_ROUNDS):
             before = half
-            half = 0.5 * dt * self._spin(_turn(half) @ self.rotation)
+            half = 0.5 * dt * self._spin(rotation_by(half) @ self.rotation)
             if np.abs(half - before).max() <= SAME_TURN:
                 break
-        u, _, vt = np.linalg.svd(_turn(2.0 * half) @ self.rotation)  # the nearest rotation: rounding does not pile up
+        u, _, vt = np.linalg.svd(rotation_by(2.0 * half) @ self.rotation)  # the nearest rotation: rounding does not pile up
         return self.position + dt * self.velocity, u @ vt
 
     def state(self) -> np.ndarray:
@@ -221,7 +221,7 @@ def in_space(values: np.ndarray) -> np.ndarray:
     return six
 
 
-def _turn(vector: np.ndarray) -> np.ndarray:
+def rotation_by(vector: np.ndarray) -> np.ndarray:
     """Return the matrix of a turn by |vector| [rad] about it: SciPy's `Rotation.from_rotvec`, whose last bits runs would show."""
     x, y, z = vector.tolist()
     angle = math.sqrt(x * x + y * y + z * z)

@@ -88,7 +88,8 @@ def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal:
 def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> ContactPoints:
     """Return where two shapes touch, normals from the other to the one.
 
-    Boxes by the axis along which they overlap least; others by points of either surface and the distance to the other one.
+    Boxes by the axis along which they overlap least; others by points of either surface, and in space those of either's edges that are
+    nearest to the other, and the distance to the other one.
 
     Args:
         one: a shape, as placed.
@@ -103,15 +104,29 @@ def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pos
     single = [len(shape.points) == 1 for shape in (one, other)]  # the center of a ball says all
     found = []
     if not single[1] or single[0]:
-        found.append(_points_of(one, at, other, there, margin))
+        found.append(_points_of(one, at, other, there, margin, one.points))
     if not single[0] and len(other.points):
-        found.append(_points_of(other, there, one, at, margin).turned())
+        found.append(_points_of(other, there, one, at, margin, other.points).turned())
+    if dimension == 3:
+        found.append(_points_of(one, at, other, there, margin, _nearest_of(one, at, other, there, margin)))
+        found.append(_points_of(other, there, one, at, margin, _nearest_of(other, there, one, at, margin)).turned())
     return ContactPoints.joined(found)
 
 
-def _points_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> ContactPoints:
-    """Return the points of one shape that are near the other."""
-    centers = at.apply(one.points)
+def _nearest_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> np.ndarray:
+    """Return the points of one shape's edges that are nearest to the other, where that has a surface between its own points."""
+    if not len(one.edges) or len(other.points) == 1:
+        return np.zeros((0, 3))
+    ends = (at.apply(one.edges.reshape(-1, 3)) - there.translation) @ there.rotation
+    points = other.nearest_on(ends.reshape(-1, 2, 3), margin + one.radius)
+    return np.asarray((there.apply(points) - at.translation) @ at.rotation)
+
+
+def _points_of(
+    one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, points: np.ndarray
+) -> ContactPoints:
+    """Return which of some points of one shape, in the axes in which it is placed, are near the other."""
+    centers = at.apply(points)
     local = (centers - there.translation) @ there.rotation
     if other.closed and len(local) > 1:  # most points are far away
         reach = margin + one.radius

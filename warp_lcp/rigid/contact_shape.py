@@ -17,6 +17,8 @@ Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # of points [m
 
 ALONG = np.linspace(0.0, 1.0, 9)  # points along an edge of a box or the axis of a capsule
 MOST_POINTS = 1500  # of a mesh
+LONG = 0.1  # of a mesh's size: shorter edges have corners close enough
+ROUNDS = 12  # of the search along an edge, each of which leaves a quarter of it
 DIFFERENCE = 2e-3  # of a mesh's size: for its direction; its distance is a float32
 ON_SURFACE = 1e-9  # of a shape's size, within which the way to the nearest point has no direction
 THICK = 1.0  # half the thickness of a 2-D box in the plane's contacts, of its sides
@@ -33,6 +35,8 @@ class ContactShape:
         boxes: what the shape consists of if that is boxes; in 2-D a thick one.
         size: about half its extent [m].
         closed: whether the inside has an end; contacts with others than such need points of theirs.
+        signed: the signed distance alone, where that takes less time.
+        edges: in space, segments that may be nearer to another surface between their ends than at `points`: shape (m, 2, 3) [m].
 
     Attributes:
         low, high: bounds of the closed ones [m], shape (3,).
@@ -44,6 +48,8 @@ class ContactShape:
     size: float
     boxes: tuple[OrientedBox, ...] = ()
     closed: bool = True
+    signed: Callable[[np.ndarray], np.ndarray] | None = None
+    edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
     low: np.ndarray = field(init=False)
     high: np.ndarray = field(init=False)
 
@@ -93,6 +99,27 @@ class ContactShape:
         corners = np.concatenate([box.corners() for box in made])
         return cls(points=corners, radius=0.0, distance=nearest, size=max(part.size for part in parts), boxes=made)
 
+    def nearest_on(self, edges: np.ndarray, margin: float) -> np.ndarray:
+        """Return the point of each edge that is nearest to this shape, or deepest in it, if that may be within a margin, shape (n, 3).
+
+        The distance to a convex shape has one minimum along a segment; near others it is the one beside the nearest of nine points.
+
+        Args:
+            edges: in the axes in which this shape is placed, shape (m, 2, 3) [m].
+            margin: [m].
+        """
+        signed = self.signed or (lambda points: self.distance(points)[0])
+        start, way = edges[:, 0], edges[:, 1] - edges[:, 0]
+        near = signed(start + 0.5 * way) - 0.5 * np.linalg.norm(way, axis=1) <= margin
+        start, way = start[near], way[near]
+        low, high, each = np.zeros(len(start)), np.ones(len(start)), np.arange(len(start))
+        for _ in range(ROUNDS if len(start) else 0):
+            shares = low[:, None] + (high - low)[:, None] * ALONG
+            points = start[:, None] + shares[..., None] * way[:, None]
+            k = signed(points.reshape(-1, 3)).reshape(shares.shape).argmin(axis=1)
+            low, high = shares[each, np.maximum(k - 1, 0)], shares[each, np.minimum(k + 1, len(ALONG) - 1)]
+        return np.asarray(start + (0.5 * (low + high))[:, None] * way)
+
     def reach(self, center: np.ndarray) -> float:
         """Return the largest distance of a point of the shape from a center [m]."""
         return float(np.linalg.norm(self.points - center, axis=1).max(initial=0.0)) + self.radius
@@ -105,10 +132,11 @@ def _box(shape: Box, dimension: int) -> ContactShape:
     R = place.rotation
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in ((-1, 1) if dimension == 3 else (0,))], dtype=np.float64)
     corners = signs * half
-    points = [corners]
+    points, edges = [corners], []
     if dimension == 3:
         for a in range(3):  # edges along each axis
             low = corners[signs[:, a] < 0]
+            edges.append(np.stack([low, low + 2.0 * half * np.eye(3)[a]], axis=1))
             points += [low + share * 2.0 * half * np.eye(3)[a] for share in ALONG[1:-1]]
     flat = half[:dimension]
 
@@ -128,6 +156,7 @@ def _box(shape: Box, dimension: int) -> ContactShape:
     return ContactShape(
         points=center + np.concatenate(points) @ R.T, radius=0.0, distance=distance, size=float(flat.max()),
         boxes=(OrientedBox(center, R.copy(), thick),),
+        edges=center + np.concatenate(edges) @ R.T if edges else np.zeros((0, 2, 3)),
     )  # fmt: skip
 
 
@@ -155,8 +184,9 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
         direction = np.where(middle[:, None], other / np.linalg.norm(other), way / np.where(middle, 1.0, length)[:, None])
         return length - radius, direction
 
+    edges = np.stack([start, end], axis=1) if square and len(along) > 1 else np.zeros((0, 2, 3))
     return ContactShape(
-        points=start + along[:, None] * axis, radius=radius, distance=distance, size=radius + 0.5 * float(np.sqrt(square))
+        points=start + along[:, None] * axis, radius=radius, distance=distance, size=radius + 0.5 * float(np.sqrt(square)), edges=edges,
     )  # fmt: skip
 
 
@@ -195,19 +225,32 @@ def _surface(shape: TriangleMesh) -> ContactShape:
     size = 0.5 * float(np.ptp(vertices, axis=0).max())
     step = DIFFERENCE * size
 
+    def signed(points: np.ndarray) -> np.ndarray:
+        if not len(points):
+            return np.zeros(0)
+        asked = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
+        out = wp.empty(len(asked), dtype=wp.float32, device="cpu")
+        shape.signed_distance(asked, out)
+        return np.asarray(out.numpy().astype(np.float64))
+
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if not len(points):
             return np.zeros(0), np.zeros((0, 3))
         around = points[None] + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
-        asked = wp.array(around.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device="cpu")
-        out = wp.empty(len(asked), dtype=wp.float32, device="cpu")
-        shape.signed_distance(asked, out)
-        values = out.numpy().astype(np.float64).reshape(7, -1)
+        values = signed(around.reshape(-1, 3)).reshape(7, -1)
         slope = (values[1:4] - values[4:]).T
         length = np.linalg.norm(slope, axis=1)
         return values[0], slope / np.where(length > 0.0, length, 1.0)[:, None]
 
-    return ContactShape(points=_spread(vertices, triangles), radius=0.0, distance=distance, size=size)
+    ends = vertices[_edges_of(triangles)]
+    long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > LONG * size
+    return ContactShape(points=_spread(vertices, triangles), radius=0.0, distance=distance, size=size, signed=signed, edges=ends[long])
+
+
+def _edges_of(triangles: np.ndarray) -> np.ndarray:
+    """Return the corners of the edges of triangles, once each, shape (m, 2)."""
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    return np.asarray(np.unique(np.sort(sides, axis=1), axis=0))
 
 
 def _spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -215,7 +258,7 @@ def _spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     hull = ConvexHull(vertices).vertices
     rest = np.setdiff1d(np.arange(len(vertices)), hull)
     points = np.concatenate([vertices[hull], vertices[rest]])
-    edges = np.unique(np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1), axis=0)
+    edges = _edges_of(triangles)
     if len(points) > MOST_POINTS:
         kept = min(len(hull), MOST_POINTS // 2)
         others = points[len(hull) :]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rigid.body import AXES, PLANAR
-from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints
+from warp_lcp.rigid.body import AXES, PLANAR, in_space, rotation_by
+from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints, Place, between
 from warp_lcp.rigid.contact_problem import ContactProblem
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
@@ -20,7 +21,10 @@ SLOP = 1e-5  # of a body's size: overlap that is left alone
 RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
 BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
+FALL = 1.5  # times gravity: what falls beside what rests is not faster, and more is another impact's
 EXACT = StoppingCriteria(rtol=1e-7, max_iterations=600)  # a stack then drifts by 1e-7 of its size in a second
+UNSOLVED = 1e-5  # residual of sweeps from which on Newton's methods are worth their time
+TINY = 1e-6  # of a step: what is left of it after an impact at its end
 ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)  # for overlaps, which take several steps anyway
 ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
@@ -81,6 +85,105 @@ class ContactSolve:
         found = self.detection.find(time, ways, near + np.array(brought), near)
         return self.assembled(found, time, dt, gravity)
 
+    def approach(self, contacts: Contacts) -> np.ndarray:
+        """Return normal velocities at contacts [m/s], negative where they close, shape (k,)."""
+        return contacts.velocities(self._velocities())[:, 0] if len(contacts) else np.zeros(0)
+
+    def bounce(self, contacts: Contacts, approach: np.ndarray, dt: float, kick_dt: float, gravity: np.ndarray) -> np.ndarray:
+        """Give impacts the velocity with which they bounce, and the time within the step at which they do (updates the contacts).
+
+        The bodies' velocities are those after gravity has acted on them for `kick_dt`, which are of the middle of the step. A gap closes by
+        v t + a t^2 / 2 with v at the step's beginning; where it is 0, at t = `when`, the speed v_i = v + a t becomes -e v_i. At the end
+        of the step it is -e v_i + a (dt - t), so in the middle of a step without an impact -e v_i + a (dt / 2 - t): the target. Bodies have
+        gone by then as before the impact until t, and as after it later, see `detour`.
+
+        Args:
+            contacts: those of the step.
+            approach: normal velocities before gravity acted [m/s], shape (k,).
+            dt: time step [s].
+            kick_dt: how long gravity has acted [s].
+            gravity: [m/s^2], shape (3,).
+
+        Returns:
+            Impulses of the other contacts before the impacts [N s], shape (k, dimension).
+        """
+        before = np.zeros((len(contacts), self.dimension))
+        g, gap, e = float(np.linalg.norm(gravity)), contacts.gap, contacts.restitution
+        may = (e > 0.0) & (approach < -BOUNCE * g * dt) & (gap + dt * (approach - FALL * g * kick_dt) < 0.0)
+        if not may.any():
+            return before
+        b = contacts.velocities(self._velocities())
+        free = b[:, 0].copy()
+        b[:, 0] -= contacts.target
+        problem, others, V = self._problem(contacts, b, contacts.friction), np.flatnonzero(~may), self._velocities()
+        if len(others):  # what rests on them does not fall
+            before[others] = problem.part(others).solve(EXACT)[0]
+            V = V + self._answer(contacts.on_bodies(before, len(self.bodies)))
+            free = contacts.velocities(V)[:, 0]
+        a = np.clip((free - approach) / kick_dt, -FALL * g, FALL * g)
+        v = approach + a * (kick_dt - 0.5 * dt)
+        gap = np.maximum(gap, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of those that do not meet
+            t = 2.0 * gap / (np.sqrt(np.maximum(v**2 - 2.0 * a * gap, 0.0)) - v)
+        met = may & (t >= 0.0) & (t <= dt)
+        t = np.where(met, t, 0.0)
+        for k in np.flatnonzero(met & (contacts.second < len(self.bodies))).tolist():
+            self._meet(contacts, k, float(t[k]), V)
+        free[met] = contacts.velocities(V)[met, 0]
+        after, rest = -e * (free + a * (t - 0.5 * dt)), dt - t
+        met &= (after > 0.0) & (after + 0.5 * a * rest >= 0.0)  # and apart at the end of the step: smaller bounces are none
+        contacts.target[met] = (after + a * (0.5 * dt - t))[met]
+        order, starts = problem.islands()
+        for begin, end in pairwise(starts):  # what bears an impact does so when it happens
+            mine = order[begin:end]
+            if met[mine].any():
+                contacts.when[mine] = np.where(met[mine], t[mine], t[mine][met[mine]].mean())
+        along = ~met & (contacts.when > 0.0)  # what an impact elsewhere moves: gaps close from then on
+        left = np.maximum(contacts.gap + contacts.when * free, 0.0)[along] / np.maximum(dt - contacts.when[along], TINY * dt)
+        # and what parts before does not part less after, or r (u before + u after) / 2 would be energy gained
+        contacts.target[along] = np.where(free[along] > 0.0, np.minimum(-left, -free[along]), -left)
+        return before
+
+    def _meet(self, contacts: Contacts, k: int, t: float, V: np.ndarray) -> None:
+        """Let contact k of two bodies act where they meet at time t of the step, at velocities V, shape (n, q) (updates its rows).
+
+        Both get the impulse at one point, so that angular momentum is kept: points of either that meet then are apart now.
+        """
+        pair = [int(contacts.first[k]), int(contacts.second[k])]
+        bodies, shapes = [self.bodies[number] for number in pair], [self.detection.shapes[number] for number in pair]
+        six, now = np.array([in_space(V[number]) for number in pair]), np.array([body.position for body in bodies])
+        at = now + t * six[:, :3]
+        places = []
+        for body, velocity, position in zip(bodies, six, at, strict=True):
+            R = rotation_by(t * velocity[3:]) @ body.rotation
+            places.append(Place(R, position - R @ body.properties.center))
+        margin = abs(float(contacts.gap[k])) + NEAR * float(contacts.size[k])
+        found = between(shapes[0], places[0], shapes[1], places[1], margin, self.dimension)
+        point, normal = contacts.point[k] + (at - now).mean(axis=0), contacts.frames[k, 0]
+        if len(found):
+            nearest = int(np.linalg.norm(found.point - point, axis=1).argmin())
+            point, normal = found.point[nearest], found.normal[nearest]
+        arms = point - at
+        speeds = six[:, :3] + np.cross(six[:, 3:], arms)
+        frames = contact_frames(normal[None], self.dimension, ((speeds[:1] - speeds[1:], 0.0),))
+        contacts.frames[k], contacts.one[k] = frames[0], _rows(arms[:1], frames, self.dimension)[0]
+        contacts.other[k] = -_rows(arms[1:], frames, self.dimension)[0]
+
+    def detour(self, contacts: Contacts, before: np.ndarray, impulses: np.ndarray) -> np.ndarray | None:
+        """Return how far bodies are from where their velocities after impacts bring them in the step (m, rad), shape (n, q); None: nowhere.
+
+        An impact at time t of the step has changed velocities by M^-1 J' r, and bodies have gone without it until then. With the target of
+        `bounce` that is exact for what flies along parabolas before and after.
+
+        Args:
+            contacts: those of the step.
+            before: impulses without the impacts, see `bounce` [N s], shape (k, dimension).
+            impulses: with them.
+        """
+        if not contacts.when.any():
+            return None
+        return -self._answer(contacts.on_bodies(contacts.when[:, None] * (impulses - before), len(self.bodies)))
+
     def push_apart(self, contacts: Contacts, start: np.ndarray | None = None) -> np.ndarray:
         """Solve for the impulses of contacts and give them to the bodies; return them [N s], shape (k, dimension).
 
@@ -95,28 +198,32 @@ class ContactSolve:
         b[:, 0] -= contacts.target
         start = self.memory.recall(contacts, self.bodies) if start is None else start
         problem = self._problem(contacts, b, contacts.friction)
-        impulses, self.residual = problem.solve(EXACT, start)
+        impulses, self.residual = problem.solve(EXACT, start, UNSOLVED)
         for body, impulse in zip(self.bodies, contacts.on_bodies(impulses, len(self.bodies)), strict=True):
             body.push(impulse)
         return impulses
 
-    def separation(self, contacts: Contacts, dt: float) -> np.ndarray | None:
+    def separation(self, contacts: Contacts, dt: float, detour: np.ndarray | None = None) -> np.ndarray | None:
         """Return the smallest ways (m, rad) of the bodies, in the metric of their masses, that reduce overlaps at the end of a step.
 
         They give no velocity, so no energy of motion; a frictionless problem like that of the impulses. Shape (n, q); None: no ways.
+
+        Args:
+            contacts: those of the step.
+            dt: time step [s].
+            detour: of the bodies in the step.
         """
         if not len(contacts):
             return None
-        gap = contacts.gap + dt * contacts.velocities(self._velocities())[:, 0]
+        velocities = self._velocities() if detour is None else self._velocities() + detour / dt
+        gap = contacts.gap + dt * contacts.velocities(velocities)[:, 0]
         deep = gap < -SLOP * contacts.size
         if not deep.any():
             return None
         b = np.where(deep, RATE * gap, np.maximum(gap, 0.0))
         problem = self._problem(contacts, b[:, None], np.zeros(len(b)))
         x, _ = problem.solve(ROUGH)
-        pushes = contacts.on_bodies(x, len(self.bodies))
-        roots = self._roots()
-        return np.asarray((roots @ (roots.swapaxes(1, 2) @ pushes[:, :, None]))[:, :, 0])
+        return self._answer(contacts.on_bodies(x, len(self.bodies)))
 
     def hold(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Let contacts that bear against walls and other solids take what impulses would move into them, for each body by itself.
@@ -165,13 +272,8 @@ class ContactSolve:
         partner = np.where(standing, first, second)
         size, bounce = (pick(values[first], values[partner]) for pick, values in ((np.minimum, self._size), (np.maximum, self._bounce)))
         friction = np.sqrt(self._friction[first] * self._friction[partner])
-        target = np.zeros(len(gap))
-        contacts = Contacts(first, second, point, frames, gap, size, friction, one, other, wall, target)
-        approach = contacts.velocities(self._velocities())[:, 0]
-        target -= np.maximum(gap, 0.0) / dt
-        hits = (approach < -BOUNCE * falls) & (gap + dt * approach < 0.0) & (bounce > 0.0)
-        target[hits] = np.maximum(target, -bounce * approach)[hits]
-        return contacts
+        target = -np.maximum(gap, 0.0) / dt
+        return Contacts(first, second, point, frames, gap, size, friction, one, other, wall, target, bounce, np.zeros(len(gap)))
 
     def _obstacle_way(self, motion: Motion | None, time: float, dt: float) -> float:
         """Return how far points near the bodies go with an obstacle in a step [m]."""
@@ -179,6 +281,11 @@ class ContactSolve:
             return 0.0
         places = np.array([body.position for body in self.bodies])
         return dt * float(np.linalg.norm(_carried(motion, places, time, dt), axis=1).max())
+
+    def _answer(self, pushes: np.ndarray) -> np.ndarray:
+        """Return M^-1 times what acts on the bodies, shape (n, q) both."""
+        roots = self._roots()
+        return np.asarray((roots @ (roots.swapaxes(1, 2) @ pushes[:, :, None]))[:, :, 0])
 
     def _roots(self) -> np.ndarray:
         """Return G with G G' the inverse mass of each body, shape (n, q, q)."""

@@ -30,6 +30,9 @@ class Contacts:
         other: of the second's, 0 where that is none.
         wall: what surroundings that move add to them [m/s], shape (k, dimension).
         target: normal velocity that is the least [m/s]: what closes the gap, or bounces, shape (k,).
+        restitution: the part of the speed of an impact that comes back, shape (k,).
+        when: time from the step's beginning to the impact that bounces, there or elsewhere among bodies that touch [s], shape (k,);
+            0: none does.
     """
 
     first: np.ndarray
@@ -43,6 +46,8 @@ class Contacts:
     other: np.ndarray
     wall: np.ndarray
     target: np.ndarray
+    restitution: np.ndarray
+    when: np.ndarray
 
     def __len__(self) -> int:
         """Return the number of contacts."""

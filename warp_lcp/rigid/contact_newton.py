@@ -1,0 +1,227 @@
+"""Newton's methods for contacts that sweeps leave unsolved: few costly steps, whatever the ratio of masses and the height of a stack.
+
+Both solve systems of bodies and contacts together, [I, -J'; W J, C], which are sparse and well scaled where B = J J' is full and is not:
+a light body between two heavy ones makes eigenvalues of B as far apart as the masses. The package's `PrimalDualActiveSet` and
+`InteriorPoint` take neither bounds that depend on x nor J.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
+
+from warp_lcp.rigid.contacts import jacobian
+
+if TYPE_CHECKING:
+    from warp_lcp.rigid.contact_problem import ContactProblem
+
+SHIFT = 1e-11  # of B's diagonal, added in a step's matrix: four corners of a box bear its weight in many ways, and B is singular
+STARTS = (1e4, 1e2)  # times the largest velocity: where the interior point starts, and again where it jams, as friction is not monotone
+MOST_SETS = 20  # steps of the active set: near its solution it needs 1 to 10
+MOST_STEPS = 80  # of the interior point: it needs 10 to 60
+JAMMED = 20  # steps without a smaller residual
+SMALL = 150  # rows of a system that LAPACK solves sooner than SuperLU
+TO_BOUNDARY = 0.995  # part of the way to the first bound that a step goes
+
+
+@dataclass(eq=False)
+class _Pairs:
+    """The complementary pairs of the interior point, all > 0; unknowns as of `ContactNewton`.
+
+    Args:
+        x: impulses, whose normal ones are the first of pairs with `normal`.
+        normal: velocities along normals.
+        low: parts of slip against which x is at its lower bound.
+        up: at its upper one.
+        below: how far x is above its lower bound, mu x_n + x_t.
+        above: below its upper one, mu x_n - x_t.
+    """
+
+    x: np.ndarray
+    normal: np.ndarray
+    low: np.ndarray
+    up: np.ndarray
+    below: np.ndarray
+    above: np.ndarray
+
+    def moved(self, step: _Pairs, length: float) -> _Pairs:
+        """Return the pairs after a part of a step."""
+        return _Pairs(*(getattr(self, name) + length * getattr(step, name) for name in vars(self)))
+
+    def products(self, normals: np.ndarray) -> list[np.ndarray]:
+        """Return the products of pairs."""
+        return [self.x[normals] * self.normal, self.low * self.below, self.up * self.above]
+
+    def length(self, step: _Pairs, normals: np.ndarray) -> float:
+        """Return the part of a step, at most 1, after which something is 0."""
+        mine = np.concatenate([self.x[normals], self.normal, self.low, self.up, self.below, self.above])
+        change = np.concatenate([step.x[normals], step.normal, step.low, step.up, step.below, step.above])
+        falls = change < 0.0
+        return float(min(1.0, (-mine[falls] / change[falls]).min(initial=np.inf)))
+
+
+class ContactNewton:
+    """Solve a `ContactProblem` to its last digits.
+
+    Args:
+        problem: with a contact that approaches.
+        x: impulses to start from, shape (k, rows).
+
+    Attributes:
+        x: impulses of the least residual so far, shape (k rows,).
+        residual: theirs, relative to that of no impulses.
+    """
+
+    def __init__(self, problem: ContactProblem, x: np.ndarray) -> None:
+        k, rows, _ = problem.one.shape
+        self._J = jacobian(problem.first, problem.second, problem.one, problem.other, problem.bodies)
+        self._small = self._J.toarray() if sum(self._J.shape) <= SMALL else None
+        self._diagonal, self._yields = problem.yields()
+        self._b, self._reference = problem.b.ravel(), float(np.linalg.norm(np.minimum(problem.b[:, 0], 0.0)))
+        self._normals = rows * np.arange(k)
+        self._tangents = (self._normals[:, None] + np.arange(1, rows)).ravel()
+        self._own = np.repeat(self._normals, rows - 1)  # the normal of each tangent
+        self._friction = np.repeat(problem.friction, rows - 1)
+        self._scale = np.concatenate([np.ones(self._J.shape[1]), 1.0 / np.sqrt(self._diagonal)])
+        self.x, self.residual = x.ravel(), np.inf
+        self.take(self.x)
+
+    def active_set(self, rtol: float) -> None:
+        """Newton's method on the natural residual from x: solve y = 0 on the free unknowns, x = bound on the others, until these stay.
+
+        Args:
+            rtol: residual to reach, relative to that of no impulses.
+        """
+        x, d = self.x, self._diagonal
+        for _ in range(MOST_SETS):
+            if self.residual <= rtol:
+                return
+            low, up = self._bounds(x)
+            wanted = x - self._y(x) / d
+            at_low, at_up = wanted <= low, wanted >= up
+            free = ~(at_low | at_up)
+            # free: J w + (yields + SHIFT d) x = -b + SHIFT d x_before; at a bound: d (x -+ mu x_n) = 0
+            found = self._solved(
+                free.astype(float),
+                np.where(free, SHIFT * d + self._yields, d),
+                d[self._tangents] * self._friction * (at_low[self._tangents].astype(float) - at_up[self._tangents]),
+                np.where(free, SHIFT * d * x - self._b, 0.0),
+            )
+            if found is None:
+                return
+            x = found
+            self.take(x)
+
+    def interior_point(self, rtol: float) -> None:
+        """Follow the central path from several starts, until a residual is reached.
+
+        Args:
+            rtol: residual to reach, relative to that of no impulses.
+        """
+        for start in STARTS:
+            if self.residual > rtol:
+                self._interior_point(rtol, start)
+
+    def _interior_point(self, rtol: float, start: float) -> None:
+        """Mehrotra's predictor and corrector on x_n u_n = 0, low (mu x_n + x_t) = 0, up (mu x_n - x_t) = 0 with u_t = low - up.
+
+        Args:
+            rtol: residual to reach.
+            start: size of the velocities to start from, times the largest of b.
+        """
+        least, since = np.inf, 0
+        speed = start * max(float(np.abs(self._b).max()), np.finfo(float).tiny)
+        x = np.zeros(len(self._b))
+        x[self._normals] = speed / self._diagonal[self._normals]
+        slip = np.full(len(self._tangents), speed)
+        room = np.maximum(self._friction * x[self._own], slip / self._diagonal[self._tangents])
+        now = _Pairs(x, np.full(len(self._normals), speed), slip, slip.copy(), room, room.copy())
+        for _ in range(MOST_STEPS):
+            residual = self.take(now.x)
+            least, since = (residual, 0) if residual < least else (least, since + 1)
+            if self.residual <= rtol or since == JAMMED:
+                return
+            products = now.products(self._normals)
+            step = self._direction(now, [-product for product in products])  # predictor: to the bounds
+            if step is None:
+                return
+            after = now.moved(step, now.length(step, self._normals)).products(self._normals)
+            mean, reached = (float(np.concatenate(values).mean()) for values in (products, after))
+            center = (reached / mean) ** 3 * mean
+            second = step.products(self._normals)
+            step = self._direction(now, [center - p - s for p, s in zip(products, second, strict=True)])
+            if step is None:
+                return
+            now = now.moved(step, TO_BOUNDARY * now.length(step, self._normals))
+
+    def _direction(self, now: _Pairs, targets: list[np.ndarray]) -> _Pairs | None:
+        """Return the step that changes the products of pairs by targets to first order, and closes the gaps of the equations."""
+        normals, tangents, own, mu = self._normals, self._tangents, self._own, self._friction
+        to_normal, to_low, to_up = targets
+        y = self._y(now.x)
+        gap_normal, gap_slip = y[normals] - now.normal, y[tangents] - (now.low - now.up)
+        gap_below = mu * now.x[own] + now.x[tangents] - now.below
+        gap_above = mu * now.x[own] - now.x[tangents] - now.above
+        stiff_low, stiff_up, x_n = now.low / now.below, now.up / now.above, now.x[normals]
+        diagonal = SHIFT * self._diagonal + self._yields
+        diagonal[normals] += now.normal / x_n
+        diagonal[tangents] += stiff_low + stiff_up
+        right = np.zeros(len(now.x))
+        right[normals] = to_normal / x_n - gap_normal
+        right[tangents] = to_low / now.below - stiff_low * gap_below - to_up / now.above + stiff_up * gap_above - gap_slip
+        x = self._solved(np.ones(len(now.x)), diagonal, mu * (stiff_low - stiff_up), right)
+        if x is None:
+            return None
+        below, above = mu * x[own] + x[tangents] + gap_below, mu * x[own] - x[tangents] + gap_above
+        return _Pairs(
+            x, (to_normal - now.normal * x[normals]) / x_n, (to_low - now.low * below) / now.below,
+            (to_up - now.up * above) / now.above, below, above,
+        )  # fmt: skip
+
+    def _solved(self, weights: np.ndarray, diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+        """Return x of [I, -J'; W J, C] [w; x] = [0; right]; None where the matrix is singular.
+
+        Args:
+            weights: the diagonal of W, shape (k rows,).
+            diagonal: that of C.
+            coupling: entries of C in the rows of tangents, at their normals.
+            right: of the equation.
+        """
+        bodies, n, scale = self._J.shape[1], len(diagonal), self._scale
+        J = self._small if self._small is not None else self._J
+        values, rows = np.concatenate([diagonal, coupling]), np.concatenate([np.arange(n), self._tangents])
+        C = sparse.csr_array((values, (rows, np.concatenate([np.arange(n), self._own]))), shape=(n, n))
+        sides = scale * np.concatenate([np.zeros(bodies), right])
+        try:
+            if self._small is not None:
+                K = np.block([[np.eye(bodies), -J.T], [weights[:, None] * J, C.toarray()]])
+                found = scale * np.linalg.solve(scale[:, None] * K * scale, sides)
+            else:
+                blocks = [[sparse.eye_array(bodies), -J.T], [sparse.diags_array(weights) @ J, C]]
+                scaling = sparse.diags_array(scale)
+                found = scale * splu((scaling @ sparse.block_array(blocks) @ scaling).tocsc()).solve(sides)
+        except (RuntimeError, np.linalg.LinAlgError):  # SuperLU: exactly singular; LAPACK
+            return None
+        return found[bodies:] if np.isfinite(found).all() else None
+
+    def _y(self, x: np.ndarray) -> np.ndarray:
+        return np.asarray(self._J @ (self._J.T @ x) + self._yields * x + self._b)
+
+    def _bounds(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        low, up = np.zeros_like(x), np.full_like(x, np.inf)
+        up[self._tangents] = self._friction * np.maximum(x[self._own], 0.0)
+        low[self._tangents] = -up[self._tangents]
+        return low, up
+
+    def take(self, x: np.ndarray) -> float:
+        """Return the relative residual of x within its bounds, and keep x if it is the least."""
+        x = np.clip(x, *self._bounds(x))
+        d = self._diagonal
+        found = float(np.linalg.norm(d * (x - np.clip(x - self._y(x) / d, *self._bounds(x))))) / self._reference
+        if found < self.residual:
+            self.x, self.residual = x, found
+        return found
