@@ -145,12 +145,11 @@ def check_shapes(scene: Scene, source: str) -> None:
         SceneError: a mesh cannot be read or does not enclose a volume.
     """
     problems = []
-    for table, entries in scene:
-        for index, shape in enumerate(entries if isinstance(entries, list) else ()):
-            try:
-                shape.to_geometry(Path.cwd(), scene.dimension)
-            except ValueError as error:
-                problems.append(KeyFault(f"{table}[{index}]", str(error)))
+    for place, shape in scene.shapes():
+        try:
+            shape.to_geometry(Path.cwd(), scene.dimension)
+        except ValueError as error:
+            problems.append(KeyFault(place, str(error)))
     if problems:
         raise SceneError(source, problems)
 
