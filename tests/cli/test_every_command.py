@@ -58,7 +58,8 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
     assert "3 frames" in done("export", out, "--out", tmp_path / "run.usda")
     done("serve", out, "--port", 0)
     if recorded:
-        done("solve", max(problems.glob("problem_*.npz")))
+        for problem in sorted(problems.glob("problem_*.npz"))[-1:]:  # a thread thinner than a cell has none
+            done("solve", problem)
         done("run", scene, "--out", tmp_path / "profiled", "--device", "cpu", "--frames", 0, "--profile", *sets)
     if (out / "probes.csv").exists():
         with open(out / "probes.csv", newline="") as table:
