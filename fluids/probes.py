@@ -1,5 +1,6 @@
 """Probes: pressure, velocity and the surface's height at points of the scene, a row a step of `probes.csv`."""
 
+import math
 import typing
 from collections.abc import Sequence
 
@@ -143,7 +144,7 @@ class Probes:
 
     def __init__(self, probes: Sequence[Probe], gravity: np.ndarray, dimension: int) -> None:
         self.probes, self.gravity, self.dimension = tuple(probes), gravity, dimension
-        size = float(np.linalg.norm(gravity))
+        size = math.hypot(*gravity)  # not 0 where the squares are
         self._up = -gravity / size if size > 0.0 else np.zeros(3)
         self._points = np.array([[*probe.position, 0.0][:3] for probe in probes])
 
@@ -161,7 +162,9 @@ class Probes:
         return row
 
     def _reach(self, grid: StaggeredGrid) -> np.ndarray:
-        """Return between which distances from each probe the surface is looked for [cells], shape (probes, 2)."""
+        """Return between which distances from each probe the surface is looked for [cells], shape (probes, 2); 0 and 0: nowhere."""
+        if not self._up.any():  # no direction is up, and no probe asks for a level: nothing would end the search
+            return np.zeros((len(self.probes), 2))
         cells = grid.to_grid(self._points)[:, : grid.dimension] - grid.origin[: grid.dimension]
         inside = np.all((cells >= 1.0) & (cells <= np.array(grid.counts[: grid.dimension]) + 1.0), axis=1, keepdims=True)
         return np.where(inside, [0.0, FAR], 0.0)

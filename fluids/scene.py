@@ -13,6 +13,7 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
 from warp_lcp.scene.shapes import MaterialProperties, SourceProperties
+from warp_lcp.scene.unusual import LIQUID_DENSITY, Usual
 from warp_lcp.settings import Positive
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
@@ -25,6 +26,10 @@ UNILATERAL_BYTES = 1
 VISCOUS_BYTES = {2: 140, 3: 220}  # its fields, those of coarse levels, and the velocity before the pressure
 SHORT_STEPS = 0.5  # Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at 1/8 on 20
 BODY_BYTES, POTENTIAL_BYTES = 8, 4  # of a right-hand side that bodies change, and a motion of a body, if it is light
+VISCOSITY = Usual(1e-4, 1e7, "Pa s", "0.001 (water), 10 (honey), 10,000 (tar)", "m^2/s of a liquid as heavy as water", 1e3)
+TENSION = Usual(1e-4, 3.0, "N/m", "0.02 to 0.5, 0.072 for water,", "mN/m", 1e-3)
+DRAG = Usual(0.0, 1.0, "", "about 0.005")
+LIQUID_CFL = Usual(0.0, 10.0, "", "1 to 4")
 COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")  # for A + U W U', see `fluids.coupling`
 
 
@@ -109,6 +114,28 @@ class LiquidScene(ParticleScene):
             message = 'needs pressure.model = "incompressible": a pressure that never pulls keeps no surface together'
             found.append(Complaint(("surface_tension",), None, message))
         return [*found, *self._viscosity_complaints(), *probe_complaints(self.probe, self.domain.size, self.physics.gravity)]
+
+    def notes(self) -> list[str]:
+        """Return settings that look like mistakes."""
+        found, tension = [*super().notes(), *LIQUID_DENSITY.notes("physics.density", self.physics.density)], self.surface_tension
+        given = [("viscosity.value", self.viscosity.value if self.viscosity else None)]
+        given += [(f"{place}.viscosity", getattr(shape, "viscosity", None)) for place, shape in self.shapes()]
+        for place, value in given:
+            found += VISCOSITY.notes(place, value)
+        found += LIQUID_CFL.notes("time.cfl", self.time.cfl)
+        if tension is not None:
+            found += TENSION.notes("surface_tension.coefficient", tension.coefficient)
+            if 0.0 < tension.contact_angle <= math.pi + 0.01:
+                degrees = math.degrees(tension.contact_angle)
+                found.append(
+                    f"surface_tension.contact_angle = {tension.contact_angle:g} is in degrees; if radians were meant, it is {degrees:.3g}"
+                )
+        drags = (
+            [("wall_drag.coefficient", self.wall_drag.coefficient), ("wall_drag.domain", self.wall_drag.domain)] if self.wall_drag else []
+        )
+        for place, value in [*drags, *((f"solid[{n}].drag", solid.drag) for n, solid in enumerate(self.solid))]:
+            found += DRAG.notes(place, value)
+        return found
 
     def _viscosity_complaints(self) -> list[Complaint]:
         """Return what needs viscosity, and what viscosity does not go with."""

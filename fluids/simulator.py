@@ -86,7 +86,12 @@ class LiquidSimulation(ParticleSimulation):
         self.reach = max(self.layers, 2 * scene.pressure.smoothing, 0 if self.tension is None else REACH)
         self.measured: dict[str, Row] = {}
         if self.tension is not None:
-            self._notes.append(f"surface tension: steps of at most {self.tension.longest_step():.3g} s")
+            longest = self.tension.longest_step()
+            self._notes.append(f"surface tension: steps of at most {longest:.3g} s")
+            if scene.time.dt_min > longest:
+                self._notes.append(
+                    f"time.dt_min = {scene.time.dt_min:g} s is longer than that, and steps would not be stable: take {0.1 * longest:.1g}"
+                )
         self.mark()
 
     def lay(self, grid: StaggeredGrid, parts: Parts) -> None:

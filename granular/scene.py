@@ -29,12 +29,16 @@ from warp_lcp.scene.shapes import (
     SphereTable,
     WallFriction,
 )
+from warp_lcp.scene.unusual import GRAIN_DENSITY, Usual
 from warp_lcp.settings import NonNegative, Positive, Share
 
 STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
 CUT_STRESS_BYTES = {2: 48, 3: 76}  # and where solids cut cells
 STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}  # slope of a cone from which on it holds stresses with tension
 STEEPEST_ANGLE = {"repose": {2: 45.0, 3: 40.8}, "triaxial-compression": {3: 36.8}}  # degrees
+FRICTION_ANGLE = Usual(6.0, 60.0, "degrees", "25 to 45", "radians", math.degrees(1.0))
+COHESION = Usual(0.0, 1e6, "Pa", "100 to 5,000 (damp sand), 1e4 to 1e5 (clay)")
+SAND_CFL = Usual(0.0, 4.0, "", "0.5 to 1")
 GLASS = 0.279  # inertial number at which half of the growth of glass beads' friction is there [Jop, Forterre & Pouliquen 2006]
 
 Angle = Annotated[float, Field(gt=0, lt=60)]
@@ -307,6 +311,28 @@ class SandScene(ParticleScene):
                     message = f"must be {first:g} as in the other [[sand]]: a scene has one material"
                     found.append(Complaint(("sand", number, key), value, message))
         return found + self._strength_complaints() + self._rate_complaints() + self._domain_complaints()
+
+    def notes(self) -> list[str]:
+        """Return settings that look like mistakes."""
+        found = [
+            *super().notes(),
+            *GRAIN_DENSITY.notes("physics.density", self.physics.density),
+            *SAND_CFL.notes("time.cfl", self.time.cfl),
+        ]
+        angles = [("material.friction_angle", self.material.friction_angle), ("friction.dynamic_angle", self.friction.dynamic_angle)]
+        angles += [(f"sand[{number}].friction_angle", sand.friction_angle) for number, sand in enumerate(self.sand)]
+        for place, angle in angles:
+            found += FRICTION_ANGLE.notes(place, angle)
+        cohesions = [("material.cohesion", self.material.cohesion)]
+        cohesions += [(f"sand[{number}].cohesion", sand.cohesion) for number, sand in enumerate(self.sand) if sand.cohesion is not None]
+        for place, cohesion in cohesions:
+            found += COHESION.notes(place, cohesion)
+        grains = self.friction.grain_size
+        if grains is not None and grains > self.spacing:
+            found.append(
+                f"friction.grain_size = {grains:g} is in m: more than a cell of {self.spacing:.4g} m; of mm it is {1e-3 * grains:g}"
+            )
+        return found
 
     def _strength_complaints(self) -> list[Complaint]:
         material, most = self.material, self.cohesion / math.tan(math.radians(self.friction_angle))

@@ -8,6 +8,7 @@ import warp as wp
 from hypothesis import HealthCheck, settings
 
 from dots import dots, scene_file  # noqa: F401  # fixtures of whatever runs scenes
+from warp_lcp.rows.kernel_messages import start_warp
 
 collect_ignore = ["emulated_cuda.py"]  # a plugin, which changes all that is imported after it
 wp.config.log_level = wp.LOG_ERROR
@@ -25,6 +26,7 @@ settings.load_profile("few")
 
 def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.name.startswith("test_kernels_compile_for_cuda"), reverse=True)  # the longest: others run beside it
+    start_warp()
     if not wp.is_cuda_available():
         skip = pytest.mark.skip(reason="no CUDA device on this machine")
         for item in items:

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import itertools
 import re
 import tomllib
 from pathlib import Path
@@ -12,6 +13,7 @@ import typer
 import warp_lcp as wl
 from code_blocks import anchors, links, prose
 from warp_lcp import distributed, gallery
+from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -72,6 +74,32 @@ def test_the_page_of_the_architecture_has_every_room_in_the_contract_s_order():
     layer = {name.strip().removeprefix("warp_lcp."): place for place, names in enumerate(contract) for name in names.split("|")}
     places = [layer[room] for room in table if room in layer]
     assert places == sorted(places)
+
+
+def test_the_search_works_from_the_disk():
+    """The plug-in `offline` puts the index into a script, but loads another, for browsers that allow no workers there, from the network."""
+    assert re.search(r"^  - search\n  - offline\b", SITE, flags=re.M)
+    spec = importlib.util.spec_from_file_location("site_pages", DOCS / "generate" / "site_pages.py")
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    page = f'<script src="{pages.SHIM}"></script>'
+    assert pages.own_shim(page, "index.html") == '<script src="iframe-worker.js"></script>'
+    assert pages.own_shim(page, "benchmarks/results/peers.html") == '<script src="../../iframe-worker.js"></script>'
+    shim = (DOCS / pages.OWN_SHIM).read_text()
+    assert "Permission is hereby granted" in shim
+    assert 'location.protocol==="file:"&&(window.Worker=' in shim
+
+
+def test_commands_of_pages_take_their_scenes_with_what_they_set():
+    """A resolution that does not divide a domain's sides was refused."""
+    tried = 0
+    for page in PAGES:
+        for line in re.findall(r"^(?:\.venv/bin/)?warp-lcp (?:run|check|tune) (.*)", page.read_text(), flags=re.M):
+            words = line.partition("#")[0].split()
+            if words[0] in built_in_scenes():
+                load_scene(words[0], [word.strip("'\"") for flag, word in itertools.pairwise(words) if flag == "--set"])
+                tried += 1
+    assert tried > 10
 
 
 def test_pages_name_no_place_of_a_machine():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from enum import StrEnum
@@ -152,7 +153,8 @@ def adapter(annotation: Any) -> Any:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return `did you mean ...?` for a word that is near a known one, and the list of known ones otherwise."""
+    """Return `did you mean ...?` for a word that is near a known one, or its initials, and the list of known ones otherwise."""
     known = sorted(known)
-    match = get_close_matches(word, known, n=1, cutoff=0.6)
+    initials = {"".join(part[:1] for part in re.split("[_-]", name)): name for name in known}
+    match = [initials[word]] if len(word) > 1 and word in initials else get_close_matches(word, known, n=1, cutoff=0.6)
     return f"did you mean {match[0]!r}?" if match else f"choose from {', '.join(known)}"

@@ -15,6 +15,7 @@ from typing import Any
 
 NOTEBOOK = re.compile(r"\]\(([\w-]+)\.ipynb\)")  # a link to one
 FONT = "STIXTwoMath-Regular.ttf"  # of ziamath; docs/site.css names it
+SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "iframe-worker.js"  # what the plug-in `offline` loads for the search, and our copy
 OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")  # a link from a page right under docs to a file of the repository
 # What pymdownx.arithmatex makes of $...$ and $$...$$.
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[([](.*?)\\[])]</\1>', flags=re.S)
@@ -94,3 +95,18 @@ def on_page_content(content: str, **_: Any) -> str:
     parts = LITERAL.split(FORMULA.sub(formula, content))
     parts[::3] = map(typeset, parts[::3])
     return "".join(part for place, part in enumerate(parts) if place % 3 < 2)
+
+
+def own_shim(output: str, path: str) -> str:
+    """Return a page, whose path in the site is given, that takes the search's script from the site and fetches nothing from elsewhere."""
+    return output.replace(SHIM, "../" * path.count("/") + OWN_SHIM)
+
+
+def on_post_page(output: str, page: Any, **_: Any) -> str:
+    """Let the search work from the disk, without a network."""
+    return own_shim(output, page.url)
+
+
+def on_post_template(output: str, template_name: str, **_: Any) -> str:
+    """Let the search work from the disk in what is no page."""
+    return own_shim(output, template_name)

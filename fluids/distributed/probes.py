@@ -30,6 +30,8 @@ class SharedProbes(Probes):
 
     def _reach(self, grid: StaggeredGrid) -> np.ndarray:
         """Return between which distances the way up from each probe leads through this rank's box, by whole steps of the search."""
+        if not self._up.any():
+            return super()._reach(grid)
         axes = slice(grid.dimension)
         start, up = grid.to_grid(self._points)[:, axes], self._up[axes]
         low, high = np.array(self.part.box.low)[axes] + 1.0, np.array(self.part.box.high)[axes] + 1.0

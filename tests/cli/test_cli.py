@@ -1,6 +1,7 @@
 """The command line: exit codes, messages, Ctrl-C."""
 
 import json
+import re
 import signal
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from warp_lcp.cli import commands as cli
+from warp_lcp.cli.suites import benchmarks, suite_names
 from warp_lcp.scene import simulator
 from warp_lcp.simulation import SimulationFailed
 
@@ -93,6 +95,59 @@ def test_existing_output_is_kept_without_force(scene_file, out):
     assert call(*run, "--resume", "--frames", 2).exit_code == 0
     assert call(*run, "--force", "--frames", 0).exit_code == 0
     assert [path.name for path in out.glob("frames/particles*")] == ["particles_000000.vtu"]
+
+
+def test_a_finished_run_that_is_resumed_says_so(scene_file, out):
+    assert call("run", scene_file, "--out", out, "--device", "cpu").stdout.startswith("finished: frame ")
+    again = call("run", "--resume", "--out", out, "--device", "cpu")
+    assert again.exit_code == 0
+    assert again.stdout.startswith("finished before, nothing was left to do: frame 10 of 10 reached; ")
+    more = call("run", "--resume", "--out", out, "--device", "cpu", "--set", "time.duration=0.6")
+    assert more.stdout.startswith("finished: frame 12 of 12 reached")
+
+
+def test_files_nearby_are_named_where_one_is_not_there(scene_file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("my-scene.toml", "other.toml"):
+        (tmp_path / name).write_text(scene_file.read_text())
+    assert call("check", "my-scen.toml").stderr == "my-scen.toml: there is no such file; did you mean 'my-scene.toml'?\n"
+    assert "did you mean 'my-scene.toml'?" in call("check", "my-scene").stderr
+    assert "did you mean 'dam-break'?" in call("check", "dam-brek").stderr
+    assert call("check", "nothing-like-it.toml").stderr == "nothing-like-it.toml: there is no such file\n"
+    assert f"did you mean '{tmp_path / 'other.toml'}'?" in call("check", tmp_path / "othr.toml").stderr
+
+
+def test_initials_of_a_key_are_understood(scene_file):
+    said = call("check", scene_file, "--set", "time.fps=24").stderr
+    assert "time.fps: unknown key; did you mean 'frames_per_second'?" in said
+
+
+def test_the_help_of_bench_names_every_suite():
+    shown = call("bench", "--help").stdout
+    assert {"domains", "tank", *benchmarks()} == {name for name in suite_names() if re.search(rf"\b{name}\b", shown)}
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("run dam", ["dam-break", "dam-break-2d"]),
+        ("check my", ["my-scene.toml"]),
+        ("check sub", ["sub/"]),
+        ("tune wave", ["wave-maker"]),
+        ("bench t", ["tank", "threads", "tradeoff"]),
+        ("bench tradeoff wave", ["wave-maker"]),
+        ("solve --method primal", ["primal-dual-active-set"]),
+    ],
+)
+def test_the_shell_completes_scenes_suites_and_methods(words, expected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my-scene.toml").write_text("")
+    (tmp_path / "my-notes.txt").write_text("")
+    (tmp_path / "sub").mkdir()
+    typed = f"warp-lcp {words}"
+    asked = {"_WARP_LCP_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1)}
+    result = CliRunner().invoke(cli.app, [], prog_name="warp-lcp", env=asked)
+    assert result.stdout.split() == expected
 
 
 def test_a_failed_run_exits_with_1_and_names_the_checkpoint(dots, scene_file, out):

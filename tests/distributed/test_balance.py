@@ -3,10 +3,12 @@
 import itertools
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from warp_lcp.distributed import balance
 from warp_lcp.distributed.balance import Load, edge_of_blocks
 from warp_lcp.distributed.decomposition import OPEN, balanced_processes, parts, pool, seen_by
 
@@ -65,6 +67,20 @@ def busiest(load, cut):
     boxes = itertools.product(*(list(itertools.pairwise(end)) for end in ends))
     full = [load.material[tuple(slice(a, b) for a, b in box)].sum() for box in boxes]
     return (np.array(full) + OPEN * seen_by(load.counts, cut, load.layers).ravel()).max()
+
+
+@pytest.mark.parametrize(("least", "pays"), [(560.0, True), (780.0, False)])
+def test_boxes_are_cut_anew_only_if_the_whole_step_gets_a_quarter_shorter(least, pays, monkeypatch):
+    """What a step takes besides, as much as all work of the busiest rank, gets no shorter: 2000 is 1.28 times 1560 and 1.12 times 1780."""
+    cuts = [[3, 5], [8], [8]]
+    now = SimpleNamespace(counts=(8, 8, 8), parts=[[4, 4], [8], [8]], cut_anew=lambda cut: cut)
+    ranks = SimpleNamespace(size=2, rank=0, collect=lambda mine: [mine, None])
+    part = SimpleNamespace(decomposition=now, layers=3, ranks=ranks)
+    monkeypatch.setattr(balance, "seen_by", lambda counts, parts, layers: np.zeros((2, 1, 1)))
+    monkeypatch.setattr(balance, "blocks", lambda part, particles, edge: np.zeros(1))
+    monkeypatch.setattr(balance, "Load", lambda *given: SimpleNamespace(best=lambda *asked, rank: (least, cuts)))
+    found = balance.Balance(fixed=1000.0).better(part, SimpleNamespace(counts=[1000, 100]), 1)
+    assert found == (cuts if pays else None)
 
 
 def every_cut(blocks, p, least):

@@ -84,6 +84,21 @@ def test_liquid_in_flight_has_its_velocity_and_no_pressure(dimension: int) -> No
     assert abs(row["a_pressure"]) < 1e-3 * WATER * DX
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("gravity", [0.0, -1e-6, -1e-170])
+def test_without_gravity_liquid_keeps_its_velocity_and_has_no_pressure(dimension: int, gravity: float) -> None:
+    """No direction is up, or hardly one, whose square is 0: the search for the surface ends all the same."""
+    velocity, middle = [0.3, -0.2, 0.1][:dimension], [0.4, 0.45, 0.2][:dimension]
+    liquid = [box([0.2, 0.2, 0.1][:dimension], [0.6, 0.7, 0.3][:dimension], velocity=velocity)]
+    probes = [probe("a", middle, quantity) for quantity in (("pressure", "velocity", "level") if gravity else ("pressure", "velocity"))]
+    physics = {"gravity": [0.0, gravity, 0.0][:dimension]}
+    row = last(create(scene(size=[0.8, 0.8, 0.4][:dimension], resolution=20, liquid=liquid, probe=probes, physics=physics)), 0.05)
+    assert np.abs([row[f"a_{c}"] for c in ("vx", "vy", "vz")[:dimension]] - np.array(velocity)).max() < 1e-4
+    assert abs(row["a_pressure"]) < 1e-3 * WATER * DX
+    if gravity:
+        assert row["a_level"] == pytest.approx(0.25, abs=0.5 * DX)
+
+
 def test_a_container_that_moves() -> None:
     """A tank whose walls move at a steady speed carries its liquid past a probe that stays; walls are a solid, the domain is wider."""
     walls = [

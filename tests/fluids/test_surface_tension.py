@@ -11,6 +11,7 @@ from scipy.optimize import curve_fit
 import warp_lcp as wl
 from small_liquids import advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.fluids import surface_tension_kernels as kernels
 from warp_lcp.fluids.surface_tension import MOST_PASSES, SurfaceTension, wall_cells
 
 SIGMA, RHO, RADIUS = 0.072, 1000.0, 0.01  # of water [N/m, kg/m^3], and of drops [m]
@@ -64,6 +65,29 @@ def test_the_curvature_of_a_sphere(dimension: int, radius: float, sign: float) -
         found = curvatures(simulation, distance) * radius / (dimension - 1)
         assert found.mean() == pytest.approx(sign, abs=0.05 if radius < 10 else 0.015)
         assert found.std() < 0.03
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("at", [1, 5])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_surface_is_looked_for_nearby_and_inside_the_grid(dimension: int, at: int, sign: float) -> None:
+    """Where the distance hardly changes, its slope says 15 cells, of which 1.5 slopes are gone; ghost cells count for nothing."""
+    simulation = create(scene(size=[1.0] * dimension, resolution=10, liquid=[box([0.0] * dimension, [0.5] * dimension)]))
+    grid, field = simulation.grid, simulation.grid.field
+    once, twice, bend, jump = (field() for _ in range(4))
+    i = np.broadcast_to(np.arange(once.shape[2], dtype=np.float32), once.shape)
+    once.assign(0.5 - sign * (0.3 + 0.02 * (i - at)))
+    twice.assign(once.numpy())
+    bent = i.copy()
+    bent[..., 0] = 1000.0
+    bend.assign(bent)
+    kind = grid.field(wp.int8)
+    kind.assign(np.where(i <= at, wl.FLUID, wl.AIR).astype(np.int8))
+    numbers = {"planes": grid.planes, "linear": 1.0, "cubic": 0.0, "scale": 2.0}
+    grid.everywhere.run(kernels.JUMP, once=once, twice=twice, bend=bend, jump=jump, kind=kind, **numbers)
+    found = jump.numpy()[1:-1, 1:-1, 1:-1] if dimension == 3 else jump.numpy()[1, 1:-1, 1:-1]
+    expected = 2.0 * np.maximum(np.array([at, at + 1]) - 1.5 * 0.02, 1.0)
+    np.testing.assert_allclose(found[..., at - 1 : at + 1], np.broadcast_to(expected, (*found.shape[:-1], 2)), rtol=1e-4)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -1,15 +1,18 @@
 """Drag along walls: the law of a sheet, areas of slanted walls, momentum, moving walls, and what it must leave alone."""
 
 import math
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import pytest
+import warp as wp
 from pydantic import ValidationError
 
 import small_sands
 from small_liquids import GRAVITY, advance, box, create, random_tank, scene
 from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.fluids.wall_drag_kernels import Drag, fill
+from warp_lcp.operators.grid_poisson import AIR, FLUID
 
 DX = 0.05
 FORCES = {"forces": True}
@@ -46,6 +49,27 @@ def test_a_sheet_slows_down_by_its_law(dimension: int, c: float, floor: float, t
     advance(simulation, 0.3)
     assert lost(simulation, 1.0, c) == pytest.approx(1.0, abs=bound)
     assert middle(sheet(1.0, 0.0, dimension, **tables)) == 1.0
+
+
+@wp.kernel(enable_backward=False, module="tests.wall_drag")
+@no_type_check
+def fill_kernel(D: Drag, out: wp.array3d(dtype=float)):
+    k, j, i = wp.tid()
+    out[k, j, i] = fill(D, k, j, i)
+
+
+@pytest.mark.parametrize("surface", [True, False])
+def test_cells_of_liquid_are_half_full_at_least_and_those_of_air_at_most(surface: bool) -> None:
+    """Cells without neighbors in liquid, and slivers, are FLUID though their centers lie outside the surface."""
+    phi = [-2.0, -0.3, 0.2, 0.5, 2.0]
+    D = Drag()
+    D.kind = wp.array([[[FLUID] * 5 + [AIR] * 5]], dtype=wp.int8, device="cpu")
+    if surface:
+        D.phi = wp.array([[phi + phi]], dtype=wp.float32, device="cpu")
+    out = wp.zeros((1, 1, 10), dtype=float, device="cpu")
+    wp.launch(fill_kernel, out.shape, [D, out], device="cpu")
+    expected = [1.0, 0.8, 0.5, 0.5, 0.5, 0.5, 0.5, 0.3, 0.0, 0.0] if surface else [1.0] * 5 + [0.0] * 5
+    np.testing.assert_allclose(out.numpy().ravel(), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("tables", [{}, {"pressure": {"model": "unilateral"}}, {"particles": {"narrow_band": {}}}, {"cfl": 0.4}])

@@ -315,6 +315,17 @@ def test_bounds_that_are_equal_move_x_with_them():
     assert found.lower.numpy()[3] + found.upper.numpy()[3] == pytest.approx(expected, rel=1e-6)
 
 
+def test_of_two_bounds_that_are_equal_the_one_holds_that_y_pushes_against():
+    """Nothing is free, so that the derivative of g.x by a bound is g's entry; at y = 0 it is the lower bound's."""
+    A = np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 2.0]])
+    x = np.array([0.2, -0.1, 0.3])
+    result = solved(lambda **d: wl.LCP(A, **d), {"b": np.array([5.0, -7.0, 0.0]) - A @ x, "lower": x, "upper": x.copy()})
+    found = wl.vjp(result, np.array([1.0, 2.0, 4.0]))
+    assert (found.free, found.degenerate) == (0, 0)
+    assert found.lower.numpy().tolist() == [1.0, 0.0, 4.0]
+    assert found.upper.numpy().tolist() == [0.0, 2.0, 0.0]
+
+
 def test_degenerate_unknowns_are_counted_and_held():
     """b = 0: every unknown is at its bound with y = 0. Held, they follow their bound; b moves nothing."""
     A = np.array([[2.0, -1.0], [-1.0, 2.0]])

@@ -180,6 +180,23 @@ def test_matrices_that_hardly_coarsen(matrix, device):
     assert np.linalg.norm(matrix @ krylov.x.numpy() - b) <= 2e-9 * np.linalg.norm(b)
 
 
+@pytest.mark.parametrize("pairs", [1, 2, 3])
+def test_a_coarsest_level_too_large_to_invert_is_swept_forth_and_back(pairs, device):
+    """Each pair of sweeps goes on from the one before; the first alone starts from zero."""
+    settings = AlgebraicSettings(strength=0.9, coarsest_cpu=0, coarsest_cuda=0, last_sweeps=pairs)  # so strong that nothing aggregates
+    H = hierarchy(poisson(5, 6), np.ones(30, dtype=bool), None, device, settings=settings)
+    (level,) = H.levels
+    M, inverse, b = stored(level.A), level.inverse.numpy(), np.random.default_rng(19).standard_normal(30)
+    first, second = settings.weights
+    expected = np.zeros(30)
+    for pair in range(pairs):
+        for omega in (first, second) if pair % 2 == 0 else (second, first):
+            expected += omega * inverse * (b - M @ expected)
+    H.r.assign(b)
+    H.apply()
+    np.testing.assert_allclose(H.z.numpy(), expected, rtol=1e-12)
+
+
 def test_two_hierarchies_of_one_matrix_are_the_same(device):
     matrix = poisson(20, 21)
     first, second = (hierarchy(matrix, np.ones(420, dtype=bool), None, device) for _ in range(2))

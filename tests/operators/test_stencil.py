@@ -109,6 +109,21 @@ def test_other_cells_may_make_a_stencil_unsymmetric(device):
     np.testing.assert_array_equal(grid_matrix(A).toarray(), [[6, -1, 0], [-1, 6, -2], [0, -1, 6]])
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("periodic", [False, True])
+def test_sides_across_a_periodic_end_count_for_symmetry(axis, periodic, device):
+    """The coefficient of the first cell toward the last is not the last one's toward the first."""
+    shape, step = ((3, 2), (2, 3))[axis], ((1, 0), (0, 1))[axis]
+    lower = np.full(shape, -1.0)
+    lower[(0, slice(None)) if axis == 0 else (slice(None), 0)] = -2.0
+    given = {(0, 0): 6.0, step: np.full(shape, -1.0), (-step[0], -step[1]): lower}
+    wraps = (periodic and axis == 1, periodic and axis == 0)
+    A = wl.Stencil(np.ones(shape, dtype=int), given, periodic=wraps, outside=wl.AIR, device=device, dtype=wp.float64)
+    matrix = grid_matrix(A).toarray()
+    assert A.symmetric == (not periodic) == np.array_equal(matrix, matrix.T)
+    assert np.count_nonzero(matrix == -2.0) == 2 * periodic
+
+
 def test_the_five_point_stencil_is_grid_poisson(device):
     cells = np.random.default_rng(17).choice([wl.AIR, wl.FLUID, wl.FLUID, wl.SOLID], (9, 14))
     five = {(0, 0): 4.0, (0, 1): -1.0, (0, -1): -1.0, (1, 0): -1.0, (-1, 0): -1.0}

@@ -9,13 +9,15 @@ import pytest
 import warp as wp
 from typer.testing import CliRunner, Result
 
+from small_runs import ball
 from warp_lcp.cli import commands as cli
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.render.actors import shaded
+from warp_lcp.render.live import Live
 from warp_lcp.render.page import Page
 from warp_lcp.render.picture import Picture
-from warp_lcp.render.recording import Color, Recording, RenderError, Scale, _round_up, spread
-from warp_lcp.render.render import INSTALL, Looks, parse_size, render_run
+from warp_lcp.render.recording import Color, Recording, RenderError, Scale, Show, _round_up, spread
+from warp_lcp.render.render import INSTALL, Looks, expected_seconds, parse_size, render_run
 from warp_lcp.render.solid_meshes import Outline
 from warp_lcp.scene.camera import MARGIN
 from warp_lcp.scene.scene_file import dump_scene, load_scene
@@ -146,6 +148,38 @@ def test_the_command_writes_the_frames_asked_for(pyvista, make_run, tmp_path):
     assert pixels(folder / "images" / "frame_000001.png").shape == (240, 320, 3)
     assert call(folder, "--out", tmp_path / "elsewhere", "--size", "320x240").exit_code == 0
     assert len(list((tmp_path / "elsewhere").glob("frame_*.png"))) == 4
+
+
+def test_how_long_drawing_takes_is_told_before_it_begins(pyvista, make_run):
+    folder, said = make_run([drops(5) for _ in range(4)]), []
+    looks, frames = Looks(size=(320, 240)), [0, 1, 2]
+    drawn = render_run(folder, frames=frames, looks=looks, estimated=said.append, told=lambda done, of: said.append(done))
+    next(drawn)
+    drawn.close()
+    assert said == [expected_seconds(Recording(folder), frames, looks), 0, 1]
+    more = [expected_seconds(Recording(folder), frames * 2, looks), expected_seconds(Recording(folder), frames, Looks(size=(640, 480)))]
+    assert more[0] == 2 * said[0]
+    assert more[1] > said[0] > 0.0
+    result = call(folder, "--size", "320x240")
+    assert result.stderr.startswith("drawing takes about 0:00:01 of a core")
+    assert "takes about" not in call(folder, "--size", "320x240", "--frame", 0).stderr
+
+
+@pytest.mark.parametrize(("simulator", "key", "expected"), [("fluids", "liquid", Show.SURFACE), ("granular", "sand", Show.PARTICLES)])
+def test_sand_is_drawn_as_grains_and_liquid_as_its_surface_unless_told(simulator, key, expected, tmp_path):
+    """A heap's surface is lace where it is a grain thin, and a pillar of clay where it is thick."""
+    material = {key: [{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.5]}]}
+    tables = {"scene": {"simulator": simulator}, "time": {"duration": 1.0}, "domain": {"size": [1.0, 1.0], "resolution": 10}}
+    (tmp_path / "scene.toml").write_text(dump_scene(load_scene({**tables, **material, "output": {"surface": True}})))
+    points, velocity = drops(5)
+    FrameFolder(tmp_path).write(0, 0.0, [Points("particles", points.astype(np.float32), {"velocity": velocity}), ball([0.5, 0.5], 0.1)])
+    assert Recording(tmp_path).show is Live(tmp_path)._recording.show is expected
+    assert Recording(tmp_path, show=Show.SURFACE).show is Show.SURFACE
+    assert Recording(tmp_path, Color.SPEED).show is Show.PARTICLES
+    (tmp_path / "particles.pvd").unlink()
+    for file in (tmp_path / "frames").glob("particles*"):
+        file.unlink()
+    assert Recording(tmp_path).show is Show.SURFACE, "where there is nothing else"
 
 
 def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):

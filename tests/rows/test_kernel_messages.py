@@ -47,9 +47,24 @@ def test_a_script_hears_of_its_kernels_once_and_its_compiler_warns_of_none(tmp_p
             [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False, env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
         )
         assert done.stdout == "CONVERGED\n", done.stderr
-        said = [line for line in done.stderr.splitlines() if not line.startswith("Warp CUDA warning")]
+        said = done.stderr.splitlines()
         assert len(said) == compiles, done.stderr
         assert all(line.startswith("compiling kernels for cpu") and str(tmp_path) in line for line in said)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        "wl.DenseOperator(np.eye(2), device='cpu')",
+        "wl.GridPoisson(np.ones((2, 2), dtype=int), device='cpu')",
+        "wl.linear_complementarity(np.eye(2), np.ones(2))",
+    ],
+)
+@pytest.mark.parametrize("stream", ["open", "closed"])
+def test_nothing_is_said_of_a_driver_that_is_not_there(made: str, stream: str) -> None:
+    script = f"import os, numpy as np, warp_lcp as wl; {'os.close(2); ' * (stream == 'closed')}{made}"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == done.stderr == ""
 
 
 def test_one_line_a_device_and_only_for_what_is_compiled() -> None:

@@ -19,6 +19,16 @@ from warp_lcp.run.interruption import SIGNALS, Interruption
 EACH = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 
 
+@pytest.fixture(autouse=True)
+def nothing_is_ignored():
+    """As in a terminal, whatever started the tests: nohup ignores SIGHUP, shells ignore SIGINT and SIGQUIT of what is in the background."""
+    fresh = {number: signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL for number in SIGNALS}
+    before = {number: signal.signal(number, handler) for number, handler in fresh.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture
 def run(scene_file, tmp_path):
     def call(*more: object) -> Result:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import math
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +17,7 @@ from warp_lcp.cli.ending import FAILED, WRONG_INPUT, end, wrong_input
 from warp_lcp.cli.shown import export, looked_on, render, serve, view
 from warp_lcp.cli.solve_file import Outcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
-from warp_lcp.cli.suites import benchmarks
+from warp_lcp.cli.suites import benchmarks, suite_names
 from warp_lcp.distributed.watchdog import LIMIT
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.render.viewer import check_window
@@ -37,6 +39,7 @@ from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, load_scene
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
+from warp_lcp.solvers.registry import METHODS
 
 RANKED_SUITE = "scaling"  # what `bench --engine petsc` measures
 
@@ -48,8 +51,31 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+
+def _begin_alike(word: str, names: Iterable[str]) -> list[str]:
+    return sorted(name for name in names if name.startswith(word))
+
+
+def _scenes_alike(incomplete: str) -> list[str]:
+    """Return the built-in scenes, scene files and folders that begin as the word does, for the shell."""
+    near = sorted(Path().glob(f"{glob.escape(incomplete)}*")) if not Path(incomplete).is_absolute() else []
+    folders, scene_files = [f"{path}/" for path in near if path.is_dir()], [str(path) for path in near if path.suffix == ".toml"]
+    return [*_begin_alike(incomplete, built_in_scenes()), *scene_files, *folders]
+
+
+def _suites_alike(incomplete: str) -> list[str]:
+    return _begin_alike(incomplete, suite_names())
+
+
+def _methods_alike(incomplete: str) -> list[str]:
+    return _begin_alike(incomplete, METHODS)
+
+
 SceneArgument = Annotated[
-    str, typer.Argument(metavar="SCENE", help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`).")
+    str,
+    typer.Argument(
+        metavar="SCENE", help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`).", autocompletion=_scenes_alike
+    ),
 ]
 EngineOption = Annotated[
     Engine, typer.Option(help="single: this process; petsc: the ranks that `mpiexec -n N warp-lcp ...` starts (needs petsc4py and mpi4py).")
@@ -100,6 +126,7 @@ def run(
             metavar="SCENE",
             help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`); --resume --out DIR does without.",
             show_default=False,
+            autocompletion=_scenes_alike,
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="The run's folder; out/NAME unless given.", show_default=False)] = None,
@@ -250,7 +277,9 @@ def solve(
     upper: Annotated[
         str | None, typer.Option(metavar="NUMBER|FILE", help="Upper bounds of x; inf unless given.", show_default=False)
     ] = None,
-    method: Annotated[str | None, typer.Option(metavar="NAME", help="The fastest for A unless given.", show_default=False)] = None,
+    method: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The fastest for A unless given.", show_default=False, autocompletion=_methods_alike)
+    ] = None,
     tolerance: Annotated[float, typer.Option(metavar="T", help="Of the residual, relative to the one at clip(0, lower, upper).")] = 1e-6,
     max_iterations: Annotated[int, typer.Option(metavar="N", help="The most steps.")] = 1000,
     max_seconds: Annotated[
@@ -296,14 +325,12 @@ def solve(
 
 @app.command()
 def bench(
-    suite: Annotated[
-        str,
-        typer.Argument(
-            metavar="SUITE", help="kernels, solvers, scaling, threads, peers, run, sand, contacts, models, tradeoff, validation, extremes."
-        ),
-    ],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help=f"{', '.join(suite_names())}.", autocompletion=_suites_alike)],
     scene: Annotated[
-        str | None, typer.Argument(metavar="[SCENE]", help="The scene of tradeoff; its own unless given.", show_default=False)
+        str | None,
+        typer.Argument(
+            metavar="[SCENE]", help="The scene of tradeoff; its own unless given.", show_default=False, autocompletion=_scenes_alike
+        ),
     ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
@@ -389,6 +416,9 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
 def _report(record: RunRecord, folder: Path) -> None:
     """Say how a run ended."""
     taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
+    if record.status == "finished" and record.steps and record.resumed_from_step == record.steps:
+        tell(f"finished before, nothing was left to do: {record.reason}; {record.steps} steps, {record.time:.6g} s simulated, in {folder}")
+        return
     if record.status == "finished":
         tell(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")
         return

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -20,11 +22,11 @@ from warp_lcp.render.usd import export_run
 from warp_lcp.render.viewer import view_run
 from warp_lcp.run.devices import devices
 from warp_lcp.run.progress import Count, Observer
-from warp_lcp.run.terminal import Terminal, tell
+from warp_lcp.run.terminal import Terminal, say, tell
 
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]
 ShowOption = Annotated[
-    Show | None, typer.Option(help="What is shown; the surface where the run wrote one, else particles.", show_default=False)
+    Show | None, typer.Option(help="What is shown; the surface where a run of liquid wrote one, else particles.", show_default=False)
 ]
 ColorOption = Annotated[
     Color | None, typer.Option(help="What colors the particles, on one scale for the whole run; speed unless given.", show_default=False)
@@ -56,17 +58,22 @@ def render(
 ) -> None:
     """Draw a run's frames as PNG images or as a film (needs the extra `render`)."""
     devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
-    with wrong_input(), Count(Terminal(stderr=True), "drawing", "images") as told:
+    console = Terminal(stderr=True)
+
+    def estimated(seconds: float) -> None:
+        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))} of a core")
+
+    with wrong_input(), Count(console, "drawing", "images") as told:
         looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
         if film is not None:
             if frame or sheet or out:
                 raise RenderError("--film: shows all frames in one file; leave out --frame, --sheet and --out")
-            count = len(list(film_run(folder, film, looks=looks, rate=check_rate(fps), told=told)))
+            count = len(list(film_run(folder, film, looks=looks, rate=check_rate(fps), told=told, estimated=estimated)))
             tell(f"{film}: {count} frames")
             return
         if fps is not None:
             raise RenderError("--fps: is of a film; give --film")
-        images = list(render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet, told=told))
+        images = list(render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet, told=told, estimated=estimated))
     tell(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
 
 

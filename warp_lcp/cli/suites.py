@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from warp_lcp.scene.simulator import plug_ins
+
+GROUP = "warp_lcp.benchmarks"
 
 
 @runtime_checkable
@@ -55,4 +58,9 @@ class Benchmark(Protocol):
 
 def benchmarks() -> dict[str, Benchmark]:
     """Return the installed suites by name."""
-    return plug_ins("warp_lcp.benchmarks", Benchmark, "a suite of benchmarks")
+    return plug_ins(GROUP, Benchmark, "a suite of benchmarks")
+
+
+def suite_names() -> list[str]:
+    """Return the names of the installed suites, which are not loaded."""
+    return sorted({entry.name for entry in entry_points(group=GROUP)})

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import zeros
+from warp_lcp.rows.fields import checked_device, zeros
 from warp_lcp.rows.layout import grain
 from warp_lcp.rows.program import Launch, launch_ranges
 
@@ -282,7 +282,7 @@ class StaggeredGrid:
             raise ValueError(f"counts = {self.counts}: must be at least 1 cell (nx, ny, nz), and nz = 1 in 2-D")
         if not (np.isfinite(self.spacing) and self.spacing > 0):
             raise ValueError(f"spacing = {self.spacing}: must be a positive length [m]")
-        object.__setattr__(self, "device", wp.get_device(self.device))
+        object.__setattr__(self, "device", checked_device(self.device))
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -18,6 +18,7 @@ from warp_lcp.scene.presets import preset_values
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source, SourceProperties
 from warp_lcp.scene.table import Complaint, Table
+from warp_lcp.scene.unusual import material_notes
 from warp_lcp.settings import Count, CountOrZero, Part, Share
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
@@ -196,6 +197,10 @@ class ParticleScene(Scene):
             if source.viscosity is not None:
                 found.append(Complaint(("source", number, "viscosity"), source.viscosity, "is for liquids only"))
         return super().complaints() + found + self._reseed_complaints()
+
+    def notes(self) -> list[str]:
+        """Return settings that look like mistakes."""
+        return [*super().notes(), *material_notes(self, *self.materials())]
 
     def _reseed_complaints(self) -> list[Complaint]:
         least, most = self.particles.reseed_range(self.dimension)

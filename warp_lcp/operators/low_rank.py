@@ -12,7 +12,7 @@ from warp_lcp.operators.dense import is_rounding
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.protocol import layout_of
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.rows.fields import Layout, check_storable, real_array
+from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Across, Reduction, add_across
 
@@ -170,7 +170,7 @@ class LowRankOperator(Pickled):
         if U.ndim < 2 or U.size == 0:
             raise ValueError(f"columns has shape {U.shape}: expected a field's shape and the number of columns, both positive")
         check_storable(U, dtype, "columns")
-        layout = Layout(U.shape[:-1], wp.get_device(device))
+        layout = Layout(U.shape[:-1], checked_device(device))
         U = U.reshape(layout.size, -1)
         stored = BlockColumns(layout.size, 1, U.shape[1], dtype, layout.device)
         rows = np.flatnonzero(U.any(axis=1))
@@ -319,7 +319,7 @@ class LowRankOperator(Pickled):
 def _of_entries(sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, dtype: Any) -> LowRankOperator:
     """Return an operator from what it was pickled as."""
     shape, blocks, width = sizes
-    layout = Layout(shape, wp.get_device(device))
+    layout = Layout(shape, checked_device(device))
     columns = BlockColumns(layout.size, blocks, width, dtype, layout.device)
     columns.assign(*entries)
     return LowRankOperator._of(layout, columns, weights)

@@ -50,7 +50,8 @@ class Live:
     @cached_property
     def _recording(self) -> Recording:
         recording = Recording(self.folder, show=self.show)
-        late = self.show is None and getattr(recording.scene.output, "surface", False)  # a frame's surface comes after its particles
+        output, liquid = recording.scene.output, recording.scene.palette != "sand"
+        late = self.show is None and liquid and getattr(output, "surface", False)  # a frame's surface comes after its particles
         return Recording(self.folder, show=Show.SURFACE) if late else recording
 
     def state(self) -> dict[str, Any]:

@@ -109,7 +109,7 @@ class Recording:
     Args:
         folder: of the run.
         color: what is to be read besides the positions; speed unless given.
-        show: what is to be read; particles if a color is given, else the surface where there is one, else particles.
+        show: what is to be read; particles if a color is given, of sand, or where there is no surface, else the surface.
         overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
         cells: read the cells too, where the run wrote them; then their pressure is the color unless another is given, or the surface is all
             that there is of the material.
@@ -136,7 +136,8 @@ class Recording:
         surface_alone = bool(self._numbers("surface")) and not self._numbers("particles")
         if cells and color is None and show is not Show.SURFACE and not surface_alone:
             color = Color.PRESSURE if self._numbers("grid") else Color.SPEED
-        self.show = show or (Show.SURFACE if color is None and self._numbers("surface") else Show.PARTICLES)
+        grains = self.scene.palette == "sand" and bool(self._numbers("particles"))  # a heap's surface is lace where it is thin, else clay
+        self.show = show or (Show.SURFACE if color is None and not grains and self._numbers("surface") else Show.PARTICLES)
         if self.show is Show.SURFACE and color not in (None, Color.PLAIN):
             raise RenderError(f"--color {color} is for particles, which --show surface leaves out; choose both or particles")
         self.color = Color.PLAIN if self.show is Show.SURFACE else color or Color.SPEED

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.rows.kernel_messages import start_warp
+
 Array = Any  # a numpy array or a wp.array
 CPU_CHUNK = 8192  # elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
 LARGE = 1 << 20  # elements from which a field of the CPU is looked through for what of it is in use
@@ -25,6 +27,7 @@ def checked_device(device: Any) -> wp.Device:
     Raises:
         ValueError: there is none of that name.
     """
+    start_warp()
     try:
         return wp.get_device(device)
     except (ValueError, RuntimeError) as reason:

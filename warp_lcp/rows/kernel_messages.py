@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TextIO
 
 import warp as wp
@@ -46,6 +50,40 @@ class KernelMessages:
     def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
         """Pass a warning on, at its caller's place."""
         self._logger.warning(message, category, stacklevel=stacklevel + 1)
+
+
+@functools.cache
+def start_warp() -> None:
+    """Start Warp if nothing has, without what its native code writes of a CUDA driver that is not there: no setting of Warp's drops that.
+
+    At `wp.LOG_DEBUG` it is written. What Warp says in Python, its logger drops.
+
+    Raises:
+        OSError: there is no place for compiled kernels.
+    """
+    if wp.config.log_level <= wp.LOG_DEBUG:
+        wp.init()
+        return
+    with _native_messages_dropped():
+        wp.init()
+
+
+@contextmanager
+def _native_messages_dropped() -> Iterator[None]:
+    """Keep what native code writes to the error stream off it, where there is one."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # it is closed: nobody reads
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(nowhere)
+        os.close(kept)
 
 
 def hear_kernels() -> None:

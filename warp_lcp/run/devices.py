@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import platform
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
 
 import warp as wp
 
 from warp_lcp.files.claims import free_host_memory
+from warp_lcp.rows.kernel_messages import start_warp
 from warp_lcp.run.kernel_cache import cache_error, watch_loads
 from warp_lcp.simulation import InputError
 
@@ -38,8 +36,7 @@ def devices() -> dict[str, str]:
         KernelCacheError: there is no place for compiled kernels.
     """
     try:
-        with _native_messages_dropped():
-            wp.init()
+        start_warp()
     except OSError as error:
         raise cache_error(error) from error
     watch_loads()
@@ -75,20 +72,6 @@ def cuda_driver() -> str:
     devices()
     version = wp.get_cuda_driver_version()
     return "none found" if version is None else ".".join(map(str, version))
-
-
-@contextmanager
-def _native_messages_dropped() -> Iterator[None]:
-    """Keep what Warp's native code writes to the error stream (that there is no CUDA driver) off it; no setting of Warp's does."""
-    kept = os.dup(2)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(nowhere)
-        os.close(kept)
 
 
 def _describe(device: wp.Device) -> str:

@@ -1,4 +1,4 @@
-"""What a run will take before it has begun: its steps, seconds and bytes, and what in its scene was hardly meant."""
+"""Estimate steps, time and disk of a run before it begins; find settings that look like mistakes once its material is there."""
 
 from __future__ import annotations
 
@@ -131,10 +131,7 @@ def _grown(part: Part, factor: float) -> Part:
 
 
 def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
-    """Yield what is allowed and was hardly meant, a line each.
-
-    That is: frames without end, fields that the format of frames does not hold, solids that fill the domain, material inside solids.
-    """
+    """Yield settings that look like mistakes, a line each, besides those of `Scene.notes`: of frames, their format, and of what solids fill."""
     yield from check_output(scene)
     frames, rate = scene.time.frame_count, scene.time.frames_per_second
     if frames > MANY_FRAMES:

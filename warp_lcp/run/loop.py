@@ -403,7 +403,7 @@ class RunLoop:
         stable, number = stable_dt(self.simulation), self.simulation.step_count + 1
         if stable < self.time.dt_min and not self._below_dt_min:
             self._below_dt_min = True  # once is enough: the log's column cfl has the rest
-            self._warn(f"step {number}: the CFL number asks for dt = {stable:.3g} s, below time.dt_min; steps are longer than it allows")
+            self._warn(f"step {number}: the longest stable step is {stable:.3g} s, below time.dt_min; steps are longer than is stable")
         dt, retries, values = take_step(self.simulation, stable, end, self.time)
         seconds = clock.perf_counter() - begun
         return {

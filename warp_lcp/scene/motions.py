@@ -111,12 +111,6 @@ class SinusoidMotion(PrescribedMotion):
             angle=self.angle or 0.0, center=self.center or zeros, axis=_or_z(self.axis),
         )  # fmt: skip
 
-    @property
-    def phase_in_degrees(self) -> float | None:
-        """Return the phase [degrees] that was meant, if its number is one that radians have: a multiple of pi / 4, to three digits."""
-        eighths = round(self.phase / (0.25 * np.pi))
-        return 45.0 * eighths if eighths and abs(self.phase - 0.25 * np.pi * eighths) < 1e-3 * abs(self.phase) else None
-
     def _size_complaints(self, dimension: int) -> list[Complaint]:
         found = super()._size_complaints(dimension)
         if self.angle is not None:

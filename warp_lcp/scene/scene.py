@@ -16,10 +16,10 @@ from warp_lcp.grid.sides import SIDES
 from warp_lcp.grid.voxelize import STRAY
 from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.scene.camera import Camera
-from warp_lcp.scene.motions import SinusoidMotion
 from warp_lcp.scene.presets import PresetName, fill_in, preset_line
 from warp_lcp.scene.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.scene.table import Complaint, KeyFault, SceneError, Table, Vector, refuse, validate
+from warp_lcp.scene.unusual import scene_notes
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
 from warp_lcp.solvers.registry import grid_methods
 
@@ -298,7 +298,7 @@ class Scene(Table):
                     yield f"{key}[{index}]", entry
 
     def notes(self) -> list[str]:
-        """Return what is allowed and was hardly meant, a line each, for the start of a run."""
+        """Return settings that look like mistakes, a line each, for the start of a run. Subclasses add those of their tables."""
         found = []
         for place, shape in self.shapes():
             turned = shape.turned_out(self.domain.size)
@@ -308,11 +308,7 @@ class Scene(Table):
                     f"{place} ({shape.shape}): rotate turns it about the origin, {turned[0]:.4g} m out of the domain; about its center it "
                     f"turns with about = {center}"
                 )
-            motion = getattr(shape, "motion", None)
-            if isinstance(motion, SinusoidMotion) and motion.phase_in_degrees is not None:
-                degrees = motion.phase_in_degrees
-                found.append(f"{place}.motion.phase = {motion.phase:g} is in degrees; if radians were meant, it is {degrees:g}")
-        return found
+        return [*found, *scene_notes(self)]
 
     def memory_parts(self) -> dict[str, int]:
         """Return about how much memory each part of a run takes on its device [bytes]. Subclasses that know it say so."""

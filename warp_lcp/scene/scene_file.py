@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -145,12 +145,11 @@ def check_shapes(scene: Scene, source: str) -> None:
         SceneError: a mesh cannot be read or does not enclose a volume.
     """
     problems = []
-    for table, entries in scene:
-        for index, shape in enumerate(entries if isinstance(entries, list) else ()):
-            try:
-                shape.to_geometry(Path.cwd(), scene.dimension)
-            except ValueError as error:
-                problems.append(KeyFault(f"{table}[{index}]", str(error)))
+    for place, shape in scene.shapes():
+        try:
+            shape.to_geometry(Path.cwd(), scene.dimension)
+        except ValueError as error:
+            problems.append(KeyFault(place, str(error)))
     if problems:
         raise SceneError(source, problems)
 
@@ -189,9 +188,23 @@ def _find(text: str) -> Path | Traversable:
         return scenes[text]
     if path.is_file():
         return path
-    if path.suffix == ".toml" or len(path.parts) > 1:
-        raise SceneError(text, [KeyFault("", "is a folder, not a scene file" if path.is_dir() else "there is no such file")])
-    raise SceneError(text, [KeyFault("", f"no such file, and no such built-in scene; {nearest(text, scenes)}")])
+    if path.is_dir():
+        raise SceneError(text, [KeyFault("", "is a folder, not a scene file")])
+    named = path.suffix == ".toml" or len(path.parts) > 1
+    near = _near_file(path, () if named else scenes)
+    if named:
+        raise SceneError(text, [KeyFault("", f"there is no such file{near and f'; {near}'}")])
+    raise SceneError(text, [KeyFault("", f"no such file, and no such built-in scene; {near or nearest(text, scenes)}")])
+
+
+def _near_file(path: Path, others: Iterable[str]) -> str:
+    """Return `did you mean ...?` for a scene file that is not there but nearly, unless another name is nearer; "" where there is none."""
+    try:
+        files = {file.stem: str(path.parent / file.name) for file in path.parent.iterdir() if file.suffix == ".toml" and file.is_file()}
+    except OSError:
+        return ""
+    said = nearest(path.name.removesuffix(".toml"), {*files, *others})
+    return next((f"did you mean {file!r}?" for name, file in files.items() if said == f"did you mean {name!r}?"), "")
 
 
 def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:

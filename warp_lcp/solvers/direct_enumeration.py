@@ -12,7 +12,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.pickling import FieldsOnHost
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step
-from warp_lcp.rows.fields import Array, real_array
+from warp_lcp.rows.fields import Array, checked_device, real_array
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent
 from warp_lcp.solvers.direct_enumeration_kernels import enumeration_kernels
 
@@ -134,7 +134,7 @@ def enumerate_batch(
     dtype = A.dtype if isinstance(A, wp.array) else wp.float64
     if dtype not in ACCEPTED:
         raise ValueError(f"A has type {dtype}: must be wp.float32 or wp.float64")
-    device = A.device if device is None and isinstance(A, wp.array) else wp.get_device(device)
+    device = A.device if device is None and isinstance(A, wp.array) else checked_device(device)
     matrices = _on_device(A, (m, n, n), dtype, device, "A")
     right = _on_device(b, (m, n), dtype, device, "b")
     bounds = [_bounds(value, m, n, dtype, device, name) for value, name in ((lower, "lower"), (upper, "upper"))]

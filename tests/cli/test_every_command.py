@@ -1,0 +1,125 @@
+"""Every command on every scene: on built-in ones, and on drawn ones that have every table, every shape, many sizes."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from typer.testing import CliRunner
+
+from scenes_of_every_table import MOTIONS, SHAPES, SIDES, scene_of_every_table
+from warp_lcp.cli import commands, shown
+from warp_lcp.scene.scene_file import built_in_scenes, load_scene
+from warp_lcp.scene.simulator import simulators
+from warp_lcp.scene.table import Table
+
+CELLS = {
+    "jet": 128,
+    "mesh-obstacle": 15,
+    "pouring-pile": 18,
+    "retracting-wall": 25,
+    "river": 256,
+    "waterfall": 32,
+    "wave-maker": 30,
+}  # along the longest side, where 24 and 12 do not fit
+FEW, MORE = range(20), range(20, 100)  # of ten seeds liquid and sand have each size once, of twenty in 2-D and in 3-D
+
+
+def done(*arguments: object) -> str:
+    """Return what a command says that ends well."""
+    result = CliRunner().invoke(commands.app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, f"{arguments}: {result.stderr}\n{result.exception!r}"
+    return result.stdout
+
+
+def small(name: str) -> str:
+    """Return the override that makes a built-in scene small."""
+    return f"domain.resolution={CELLS.get(name, 12 if load_scene(name).dimension == 3 else 24)}"
+
+
+def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
+    """Try what can be done with a scene, and then with the folder of its run; a window and a page wait for somebody."""
+    out, problems = tmp_path / "out", tmp_path / "problems"
+    sets = [word for override in overrides for word in ("--set", override)]
+    loaded = load_scene(str(scene))
+    alone = loaded.scene.simulator == "fluids" and not any(solid.is_body for solid in loaded.solid)
+    assert "whole run" in done("check", scene, "--device", "cpu", *sets)
+    assert "seconds a step" in done("check", scene, "--device", "cpu", "--calibrate", *sets)
+    recorded = ["--record-problems", problems] if alone else []
+    assert "finished: frame 1 " in done("run", scene, "--device", "cpu", "--out", out, "--frames", 1, *recorded, *sets)
+    assert "finished: frame 2 " in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
+    assert "finished before" in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
+    assert "whole run" in done("check", out / "scene.toml", "--device", "cpu"), "the scene as it ran is one"
+    assert "image" in done("render", out, "--slice", "--size", "320x240")
+    assert "frame_000002.png" in done("render", out, "--frame", 2, "--size", "320x240")
+    assert "3 frames" in done("export", out, "--out", tmp_path / "run.usda")
+    done("serve", out, "--port", 0)
+    if recorded:
+        for problem in sorted(problems.glob("problem_*.npz"))[-1:]:  # a thread thinner than a cell has none
+            done("solve", problem)
+        done("run", scene, "--out", tmp_path / "profiled", "--device", "cpu", "--frames", 0, "--profile", *sets)
+    if (out / "probes.csv").exists():
+        with open(out / "probes.csv", newline="") as table:
+            values = [float(value) for row in csv.DictReader(table) for value in row.values() if value]
+        assert np.isfinite(values).all()
+
+
+@pytest.fixture
+def nobody_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody ends the server of a page at once."""
+
+    def end(server: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shown.live_server.__globals__["LiveServer"], "serve_forever", end)
+
+
+def written(seed: int, tmp_path: Path) -> Path:
+    file = tmp_path / "scene.toml"
+    file.write_bytes(tomli_w.dumps(scene_of_every_table(seed)).encode())
+    return file
+
+
+@pytest.mark.parametrize("name", built_in_scenes())
+def test_every_built_in_scene_is_checked(name: str) -> None:
+    assert "whole run" in done("check", name, "--device", "cpu", "--set", small(name))
+
+
+@pytest.mark.parametrize("seed", [*FEW, *(pytest.param(seed, marks=pytest.mark.slow) for seed in MORE)])
+def test_drawn_scenes_are_checked(seed: int, tmp_path: Path) -> None:
+    assert "whole run" in done("check", written(seed, tmp_path), "--device", "cpu")
+
+
+@pytest.mark.parametrize("seed", [0, 2, 4, 3, 7])
+def test_every_command_on_drawn_scenes(seed: int, tmp_path: Path, nobody_waits: None) -> None:
+    every_command(written(seed, tmp_path), tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100, 160))
+def test_every_command_on_more_drawn_scenes(seed: int, tmp_path: Path, nobody_waits: None) -> None:
+    every_command(written(seed, tmp_path), tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", built_in_scenes())
+def test_every_command_on_every_built_in_scene(name: str, tmp_path: Path, nobody_waits: None) -> None:
+    every_command(name, tmp_path, small(name))
+
+
+def test_drawn_scenes_have_every_table_shape_and_motion() -> None:
+    """A table that scenes get is one that the commands above must meet."""
+    drawn = [scene_of_every_table(seed) for seed in FEW]
+    for simulator in ("fluids", "granular"):
+        mine = [data for data in drawn if data["scene"]["simulator"] == simulator]
+        model: type[Table] = simulators()[simulator].scene_model
+        assert set(model.model_fields) == set().union(*mine)
+        for key in ("liquid" if simulator == "fluids" else "sand", "solid"):
+            assert {shape["shape"] for data in mine for shape in data[key]} == set(SHAPES)
+        assert {solid["motion"]["kind"] for data in mine for solid in data["solid"] if "motion" in solid} == set(MOTIONS)
+        sizes = [data["domain"]["size"] for data in mine]
+        assert {(max(size), len(size)) for size in sizes} == {(side, dimension) for side in SIDES for dimension in (2, 3)}
