@@ -10,7 +10,9 @@ from scipy.linalg import eigvalsh_tridiagonal
 
 from small_liquids import GRAVITY, advance, box, create, scene
 from viscous_scenes import stirred_scene, viscous_scene
+from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.problem.result import SolveStatus
 from warp_lcp.simulation import StepFailed
 
 WEIGHTLESS = {"physics": {"gravity": [0.0, 0.0]}}
@@ -367,8 +369,43 @@ def test_a_step_that_cannot_be_solved_may_be_tried_again(monkeypatch: pytest.Mon
     advance(simulation, 0.05)
     simulation.particles.velocity.assign(np.random.default_rng(0).standard_normal((simulation.particles.count, 3)).astype(np.float32))
     monkeypatch.setattr(simulation.viscosity, "max_iterations", 1)
-    with pytest.raises(StepFailed, match="viscous solve ended"):
+    with pytest.raises(StepFailed, match="viscous solve ended with MAX_ITERATIONS after 1 iterations"):
         simulation.step(0.01)
+
+
+def test_a_solve_that_gets_no_nearer_is_said_to_stagnate() -> None:
+    simulation = blob(2)
+    simulation.viscosity.tolerance = 1e-14  # which float32 cannot reach
+    speed = np.random.default_rng(8).standard_normal(simulation.grid.shape)
+    for field in simulation.velocity:
+        field.assign(speed.astype(np.float32))
+    projection = simulation.projection
+    where = simulation.grid.everywhere, projection.kind, projection.contact
+    assert simulation.viscosity.solve(simulation.velocity, *where, 0.01, 1e-12).status is SolveStatus.STAGNATED
+
+
+def test_a_retry_solves_equations_that_are_less_stiff(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forces act for half of the last step and half of the next: what is left of a long step is solved in parts, of the same sum."""
+    disc = {"shape": "sphere", "center": [0.5, 0.45], "radius": 0.08, "density": 500.0, "velocity": [1.0, 0.0]}
+    spans: list[float] = []
+    solve = Viscosity.solve
+
+    def noting(self, *given, **more):
+        spans.append(given[4])
+        return solve(self, *given, **more)
+
+    monkeypatch.setattr(Viscosity, "solve", noting)
+    simulation = blob(2, viscosity=20.0, solid=[disc])
+    body = simulation.bodies.bodies[0]
+    simulation.step(0.016)
+    before = body.momentum[0]
+    spans.clear()
+    row = simulation.step(0.001)
+    assert len(spans) == 8
+    assert max(spans) < 2.0 * 0.001
+    assert sum(spans) == pytest.approx(0.5 * (0.016 + 0.001))
+    assert body.momentum[0] - before == pytest.approx(-0.308, rel=0.03)  # of one solve of the whole span
+    assert row["viscous_iterations"] >= 8
 
 
 @pytest.mark.parametrize("own", [100.0, 1e4])
