@@ -309,19 +309,40 @@ class LiquidSimulation(ParticleSimulation):
         if self._project(window, dt, speed).result is None:
             return {}
         self.extend(window, projection.known, projection.kind, projection.contact)
-        with self.watch.stage("viscosity", *self.velocity, projection.kind, projection.contact):
-            found = viscosity.solve(self.velocity, window, projection.kind, projection.contact, self.kick_dt, speed)
-        if not found.converged:
-            self.restore_bodies()
-            residual = f"relative residual of {found.relative_residual:.2e} (tolerance {viscosity.tolerance})"
-            raise missed_by_far("viscous", wl.SolveStatus.MAX_ITERATIONS, found.iterations, residual, "a shorter step is less stiff")
-        if self.forces is not None and self.scene.output.forces:
-            self.forces.add(viscosity.impulses(self.velocity, projection.kind, projection.contact, self.forces.references))
+        # A step much shorter than the last one, as a retry is, still has half of that to make up for: equations no stiffer than its own
+        # length asks for are solved several times.
+        parts, total = max(1, int(self.kick_dt / dt)), None
+        for part in range(parts):
+            if part:
+                viscosity.keep_change()
+                momenta = self._move_on(viscosity, momenta, dt)
+            with self.watch.stage("viscosity", *self.velocity, projection.kind, projection.contact):
+                given = self.velocity, window, projection.kind, projection.contact, self.kick_dt / parts, speed
+                found = viscosity.solve(*given, last=part + 1 == parts)
+            if not found.converged:
+                self.restore_bodies()
+                residual = f"relative residual of {found.relative_residual:.2e} (tolerance {viscosity.tolerance})"
+                raise missed_by_far("viscous", found.status, found.iterations, residual, "a shorter step is less stiff")
+            if self.forces is not None and self.scene.output.forces:
+                self.forces.add(viscosity.impulses(self.velocity, projection.kind, projection.contact, self.forces.references))
+            total = found if total is None else found.after(total)
+        assert total is not None
         viscosity.undo(self.velocity)
         for body, values in zip(self.bodies.bodies if self.bodies is not None else (), momenta, strict=True):
             body.restore_momenta(values)
         viscosity.push_bodies()
-        return dict(zip(VISCOUS_COLUMNS, found.row(), strict=True))
+        return dict(zip(VISCOUS_COLUMNS, total.row(), strict=True))
+
+    def _move_on(self, viscosity: Viscosity, momenta: Sequence[tuple[np.ndarray, ...]], dt: float) -> list[tuple[np.ndarray, ...]]:
+        """Give the bodies the impulses of one of several viscous solves of a step; return their momenta before all, with these added."""
+        if self.bodies is None:
+            return []
+        bodies = self.bodies.bodies
+        before = [body.momenta() for body in bodies]
+        viscosity.push_bodies()
+        self.boundary.begin_step(self.time, dt)  # their velocities are others now
+        changes = zip(momenta, before, (body.momenta() for body in bodies), strict=True)
+        return [tuple(kept + now - then for kept, then, now in zip(*of, strict=True)) for of in changes]
 
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
         """Solve for the pressure and project the velocity."""

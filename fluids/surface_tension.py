@@ -41,7 +41,10 @@ class SurfaceTension:
     more where the step asks for it: explicit leapfrog steps are stable while omega dt < 2, and no ripple then has
     omega^2 > STIFFEST sigma / (rho (s dx)^3). So waves that a step cannot follow are pushed less instead of making it shorter.
 
-    In cells of walls, f goes on so that the distance to the surface falls along the wall's normal by the contact angle's cosine.
+    In cells of walls, f goes on so that the surface meets the wall at the contact angle: the distance to it falls along the wall's normal
+    by the angle's cosine there, and by (1 - kappa d) of that on the wall at a distance d from it, where parallel surfaces meet the wall.
+    With the cosine alone the curvature beside the wall would be 0.6 of what it is at an angle of 30 degrees, on any grid. So kappa is found
+    twice in a step, first without itself. Beside walls particles tell of the open part of a cell's kernel alone, see `whole_share`.
 
     Args:
         grid: the grid.
@@ -68,6 +71,7 @@ class SurfaceTension:
         self._passes = kernels.push_pass(bool(boundary.open))
         self._energy = WindowTally(self._passes.energy, grid)
         self._blocked, self._counted = grid.field(wp.int8), grid.domain
+        self._capacity, self._lean = boundary.capacity, grid.field()
         self._find_walls()
 
     def longest_step(self) -> float:
@@ -94,23 +98,36 @@ class SurfaceTension:
         grid, planes = self.grid, self.grid.planes
         if self.boundary.moves:
             self._find_walls()
-        first, *free = self._fields
-        for field in self._fields:  # passes look beyond the window, where an earlier step may have left something
-            field.zero_()
-        window.launch(kernels.share_kernel, [self._phi, self._blocked, first])
         passes = self._passes_for(kick_dt)
-        once = self._smoothed(window, first, free, passes, 0)
-        twice = self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
-        self._shares = {"once": once, "twice": twice, "planes": planes, **_profile(passes)}
-        (bend,) = (field for field in self._fields if field is not once and field is not twice)
-        window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=self._most)
-        self._join(bend)
-        self._continue(bend, 0, 0.0)  # the nearest point of the surface may lie in a wall
+        self._lean.fill_(self._cosine)
+        bend = self._curvature(window, passes)
+        if self._cosine != 0.0:  # how the surface goes on into walls depends on its curvature
+            found = [self._shares[name] for name in ("linear", "cubic", "once", "twice")]
+            inputs = [*self._walls, planes, 1.0 / (grid.dimension - 1), self._cosine, *found, bend, self._lean.flatten()]
+            launch_list(kernels.lean_kernel, len(self._walls[0]), inputs, device=grid.device)
+            self._join(self._lean)
+            bend = self._curvature(window, passes)
         scale = kick_dt * self.coefficient / (self.density * grid.spacing**2)
         window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=scale)
         self._join(self.jump)
         for axis, field in enumerate(velocity):
             window.run(self._passes.push, **self._faces(kind), planes=planes, jump=self.jump, field=field, axis=axis)
+
+    def _curvature(self, window: Window, passes: int) -> wp.array:
+        """Return the curvature [1/cells] in cells near the surface, and continued into walls: its nearest point may lie in one."""
+        first, *free = self._fields
+        for field in self._fields:  # passes look beyond the window, where an earlier step may have left something
+            field.zero_()
+        capacity = self._capacity if self._cosine != 0.0 else None
+        window.launch(kernels.share_kernel, [self._phi, self._blocked, capacity, self._cosine, first])
+        once = self._smoothed(window, first, free, passes, 0)
+        twice = self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
+        self._shares = {"once": once, "twice": twice, "planes": self.grid.planes, **_profile(passes)}
+        (bend,) = (field for field in self._fields if field is not once and field is not twice)
+        window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=self._most)
+        self._join(bend)
+        self._continue(bend, 0, 0.0)
+        return bend
 
     def calm(self, particles: Particles, dt: float) -> None:
         """Take from particles near the surface what ripples shorter than the filter leave in their gradients: nothing pulls these back.
@@ -165,7 +182,7 @@ class SurfaceTension:
     def _continue(self, field: wp.array, passes: int, cosine: float) -> None:
         """Continue a share into walls, after so many passes; with a cosine of 0 whatever a field has."""
         spread = math.sqrt(0.25 + 0.5 * passes)
-        inputs = [*self._walls, cosine, spread, self.grid.planes, self._blocked, field, field.flatten()]
+        inputs = [*self._walls, self._lean.flatten(), cosine, spread, self.grid.planes, self._blocked, field, field.flatten()]
         launch_list(kernels.continue_kernel, len(self._walls[0]), inputs, device=self.grid.device)
 
     def _find_walls(self) -> None:

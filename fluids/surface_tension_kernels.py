@@ -18,6 +18,8 @@ HEADERS = Path(__file__).parent / "headers"
 MODULE = "fluids.surface_tension"
 FLOATS = wp.array(dtype=wp.float32)
 TAIL = wp.constant(1e-4)  # shares nearer to 0 or 1 have no place on the profile
+FURTHER, MOST = wp.constant(2.0), wp.constant(3.0)  # cells, from beside a wall and along it, to where the surface's curvature is asked for
+NEAR = wp.constant(2.0)  # cells from the surface, beyond which parallel surfaces meet a wall as they do there
 BAND = 0.02  # cells whose share is nearer to 0 or 1 are too far from the surface to matter
 HALF = 0.3  # the part of the shares on either side of the surface that its area is found from
 FARTHEST = 1.5  # cells from one beside the surface to the smooth surface
@@ -59,20 +61,129 @@ def filled(s: float):
     return wp.where(s > 0.0, 1.0 - share, share)
 
 
+@wp.func
+def walled(part: float):
+    """Return how far into a wall the mean place of a part of a cell's kernel lies [cells], and its variance, of the part that a wall takes.
+
+    It is what lies c or more from the center: the kernel is (3/2 - t)^2 / 2 there, and 3/4 - t^2 up to t = 1/2.
+    """
+    u = wp.pow(wp.min(6.0 * part, 1.0), 1.0 / 3.0)  # 3/2 - c
+    place = 1.5 - 0.75 * u
+    variance = 0.0375 * u * u
+    if part > 1.0 / 6.0:
+        c = float(0.0)
+        for _step in range(4):  # Newton's, for 1/2 - 3/4 c + c^3 / 3 = part
+            c -= (0.5 - 0.75 * c + c * c * c / 3.0 - part) / (c * c - 0.75)
+        c = wp.max(c, 0.0)
+        place = (0.203125 - 0.375 * c * c + 0.25 * c * c * c * c) / part
+        variance = wp.max((0.125 - 0.25 * c * c * c + 0.2 * c * c * c * c * c) / part - place * place, 0.0)
+    return wp.vec2(place, variance)
+
+
+@wp.func
+def whole_share(open_share: float, capacity: float, cosine: float):
+    """Return the share of a whole kernel of which a wall takes a part, of what liquid fills of the open part.
+
+    Particles know of the open part alone, whose mean place lies off the center: a surface that is inclined to the wall seems to lie lower
+    there, by 0.15 cells times the cosine beside a whole cell's wall. In the wall the surface goes on as in `continue_kernel`. With d its
+    distance from the center the whole share is G(-d), the wall's part of it a normal distribution's, and the difference what is open.
+    """
+    part = wp.min(1.0 - capacity, 0.5)
+    beyond = walled(part)
+    spread = 1.41421356 * wp.sqrt(beyond[1] * cosine * cosine + 0.25 * (1.0 - cosine * cosine))
+    low = float(-1.5)
+    high = float(1.5)
+    for _step in range(12):  # bisection for the distance
+        d = 0.5 * (low + high)
+        wall = 0.5 + 0.5 * wp.erf((beyond[0] * cosine - d) / spread)
+        if filled(-d) - part * wall > capacity * open_share:
+            low = d
+        else:
+            high = d
+    return filled(-0.5 * (low + high))
+
+
 @cell_kernel(MODULE)
-def share_kernel(k, j, i, phi: FIELD, blocked: MARKS, share: FIELD):
-    """Say how full the kernel of each open cell is."""
-    share[k, j, i] = wp.where(blocked[k, j, i] == wp.int8(0), filled(-phi[k, j, i]), 0.0)
+def share_kernel(k, j, i, phi: FIELD, blocked: MARKS, capacity: FIELD, cosine: float, share: FIELD):
+    """Say how full the kernel of each open cell is; with a `capacity` of those of which walls take a part, phi is of the rest alone."""
+    found = float(0.0)
+    if blocked[k, j, i] == wp.int8(0):
+        found = filled(-phi[k, j, i])
+        if capacity:
+            if capacity[k, j, i] < 0.999 and found > TAIL and found < 1.0 - TAIL:
+                found = whole_share(found, capacity[k, j, i], cosine)
+    share[k, j, i] = found
+
+
+@wp.func
+def distance_of(k: int, j: int, i: int, once: FIELD, twice: FIELD, linear: float, cubic: float):
+    """Return the distance to the smooth surface [cells], see smooth_share.h."""
+    within = wp.clamp(0.5 - 2.0 * once[k, j, i] + twice[k, j, i], -0.45, 0.45)
+    return within * (linear + cubic * within * within)
+
+
+@list_kernel(MODULE)
+def lean_kernel(
+    i, cells: INTS, points: POINTS, way: FLOATS, planes: int, part: float, cosine: float, linear: float, cubic: float, once: FIELD,
+    twice: FIELD, bend: FIELD, lean: FLOATS,
+):  # fmt: skip
+    """Find by how much the distance d to the surface falls into a wall's cell, each cell of the way, so that the two meet at their angle.
+
+    Where the surface meets the wall that is the cosine. At d from there, on the wall, parallel surfaces meet it at other angles, of
+    cosine (1 - kappa d), kappa the surface's curvature [1/cells] across the line where they meet: `part` of the whole one. It is taken
+    where the surface is nearest, two cells further from the wall, beside which it is not right before this is known.
+    """
+    p = points[i]
+    low = bend.shape[1] * bend.shape[2]
+    k = cells[i] // low
+    j = (cells[i] - k * low) // bend.shape[2]
+    away = p - wp.vec3(float(cells[i] - k * low - j * bend.shape[2]), float(j), float(k))
+    away = away / wp.max(wp.length(away), 1e-6)
+    a = wp.clamp(int(wp.floor(p[0] + 0.5)), 1, bend.shape[2] - 2)
+    b = wp.clamp(int(wp.floor(p[1] + 0.5)), 1, bend.shape[1] - 2)
+    c = wp.clamp(int(wp.floor(p[2] + 0.5)), 1, bend.shape[0] - 2)
+    d = distance_of(c, b, a, once, twice, linear, cubic)
+    x = 0.5 * (distance_of(c, b, a + 1, once, twice, linear, cubic) - distance_of(c, b, a - 1, once, twice, linear, cubic))
+    y = 0.5 * (distance_of(c, b + 1, a, once, twice, linear, cubic) - distance_of(c, b - 1, a, once, twice, linear, cubic))
+    z = float(0.0)
+    if planes == 2:
+        z = 0.5 * (distance_of(c + 1, b, a, once, twice, linear, cubic) - distance_of(c - 1, b, a, once, twice, linear, cubic))
+    slope = wp.vec3(x, y, z)
+    steep = wp.max(wp.dot(slope, slope), 0.1)
+    q = FURTHER * away - slope * (d / steep)
+    q = wp.vec3(float(a), float(b), float(c)) + q * wp.min(MOST / wp.max(wp.length(q), 1e-6), 1.0)
+    a = wp.clamp(int(wp.floor(q[0])), 1, bend.shape[2] - 2)
+    b = wp.clamp(int(wp.floor(q[1])), 1, bend.shape[1] - 2)
+    c = wp.clamp(int(wp.floor(q[2])), 1, bend.shape[0] - 2)
+    total = float(0.0)
+    weight = float(0.0)
+    for dk in range(planes):
+        for dj in range(2):
+            for di in range(2):
+                value = bend[c + dk, b + dj, a + di]
+                w = wp.where(di == 0, 1.0 - (q[0] - float(a)), q[0] - float(a))
+                w *= wp.where(dj == 0, 1.0 - (q[1] - float(b)), q[1] - float(b))
+                if planes == 2:
+                    w *= wp.where(dk == 0, 1.0 - (q[2] - float(c)), q[2] - float(c))
+                if value != 0.0 and w > 0.0:
+                    total += w * value
+                    weight += w
+    fall = cosine
+    if weight > 0.25:
+        kappa = part * total / weight
+        fall = cosine * (1.0 - kappa * wp.clamp(d - 0.5 * way[i] * cosine, -NEAR, NEAR))
+    lean[cells[i]] = fall
 
 
 @list_kernel(MODULE)
 def continue_kernel(
-    i, cells: INTS, points: POINTS, way: FLOATS, cosine: float, spread: float, planes: int, blocked: MARKS, share: FIELD, flat: FLOATS
-):
+    i, cells: INTS, points: POINTS, way: FLOATS, lean: FLOATS, cosine: float, spread: float, planes: int, blocked: MARKS, share: FIELD,
+    flat: FLOATS,
+):  # fmt: skip
     """Continue the share into a wall's cell from the open cells around a point before the wall, `way` cells nearer to the open.
 
-    Along it the distance to the surface falls by the angle's cosine; a profile of the normal distribution with the spread [cells] turns
-    shares into distances and back. A cell reads open cells and writes none.
+    Along it the distance to the surface falls by `lean`, if the cosine is not 0; a profile of the normal distribution with the spread
+    [cells] turns shares into distances and back. A cell reads open cells and writes none.
     """
     p = points[i]
     a = int(wp.floor(p[0]))
@@ -94,7 +205,7 @@ def continue_kernel(
     if weight > 0.0:
         value = total / weight
         if cosine != 0.0 and value > TAIL and value < 1.0 - TAIL:
-            place = spread * 1.41421356 * wp.erfinv(2.0 * value - 1.0) + way[i] * cosine
+            place = spread * 1.41421356 * wp.erfinv(2.0 * value - 1.0) + way[i] * lean[cells[i]]
             value = 0.5 + 0.5 * wp.erf(place / (1.41421356 * spread))
         flat[cells[i]] = value
 

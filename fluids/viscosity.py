@@ -23,6 +23,7 @@ the wall (Navier). Links to walls that the pressure's complementarity has let go
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,6 +39,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.problem.result import SolveStatus
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.rows.fields import zeros
@@ -57,20 +59,35 @@ class ViscousResult:
     Attributes:
         iterations: of conjugate gradients.
         relative_residual: ||r|| over that of the start, recomputed from the velocities in float64.
-        converged: whether it is at most the tolerance, or at the rounding of the velocities.
+        status: CONVERGED: it is at most the tolerance, or at the rounding of the velocities.
         dissipated: energy that became heat [J; J/m in 2-D].
         given_by_walls: work that moving walls did [J; J/m in 2-D].
     """
 
     iterations: int
     relative_residual: float
-    converged: bool
+    status: SolveStatus
     dissipated: float
     given_by_walls: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether the step may be taken."""
+        return self.status is SolveStatus.CONVERGED
 
     def row(self) -> tuple[int, float, float, float]:
         """Return the entries of `VISCOUS_COLUMNS`."""
         return self.iterations, self.relative_residual, self.dissipated, self.given_by_walls
+
+    def after(self, before: ViscousResult) -> ViscousResult:
+        """Return what this solve and one before it in the same step have done together."""
+        return ViscousResult(
+            before.iterations + self.iterations,
+            max(before.relative_residual, self.relative_residual),
+            self.status,
+            before.dissipated + self.dissipated,
+            before.given_by_walls + self.given_by_walls,
+        )
 
 
 class Viscosity:
@@ -132,7 +149,7 @@ class Viscosity:
         self._trail, self._sums = Trail(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
 
     def solve(
-        self, velocity: Sequence[wp.array], window: Window, kind: wp.array, contact: wp.array, dt: float, speed: float
+        self, velocity: Sequence[wp.array], window: Window, kind: wp.array, contact: wp.array, dt: float, speed: float, *, last: bool = True
     ) -> ViscousResult:
         """Find the change of a velocity in a step; the velocity itself becomes what it was changed to.
 
@@ -143,11 +160,12 @@ class Viscosity:
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
             dt: how long viscosity acts [s].
             speed: scale of the velocities [m/s].
+            last: whether no other solve of the step follows; faces in walls take their velocity in the last one.
         """
         box, inner = self._boxes(window)
         self._change.zero_()
         if inner is None:
-            return ViscousResult(0, 0.0, True, 0.0, 0.0)
+            return ViscousResult(0, 0.0, SolveStatus.CONVERGED, 0.0, 0.0)
         tau = self._viscosity / self._density * dt / self.grid.spacing**2
         self._set_up(box, kind, contact, tau)
         given = {"u": velocity, "kind": kind, "contact": contact}
@@ -172,13 +190,19 @@ class Viscosity:
             norm, lost, driven, _ = self._force(inner, given, changed=True)
             if not norm < 0.5 * before:  # what float32 can tell
                 break
-        for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True)):
+        for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True) if last else ()):
             covered = {"hold": self._fine.hold[axis], "h": self._slip[axis], "own": own, "kind": kind, "base": self.boundary.base}
             inner.run(self._passes.cover, total=total, u=u, axis=axis, **covered)
         self._share(self.change)
         energy = self._density * self.grid.cell_volume
         residual = norm / first if first > 0.0 else 0.0
-        return ViscousResult(iterations, residual, norm <= least, energy * (lost + driven), energy * driven)
+        if norm <= least:
+            status = SolveStatus.CONVERGED
+        elif not math.isfinite(norm):
+            status = SolveStatus.NON_FINITE
+        else:
+            status = SolveStatus.MAX_ITERATIONS if iterations >= self.max_iterations else SolveStatus.STAGNATED
+        return ViscousResult(iterations, residual, status, energy * (lost + driven), energy * driven)
 
     def _multigrid(self) -> VectorMultigrid:
         return VectorMultigrid(self.grid)
@@ -234,6 +258,11 @@ class Viscosity:
         self.multigrid.product(p, q, launch=launch)
         if self._bodies is not None:
             self._bodies.subtract(p, q, launch)
+
+    def keep_change(self) -> None:
+        """Add the last solve's change to `before`: another solve of the same step follows, from the velocity that this one has made."""
+        for kept, more in zip(self.before, self.change, strict=True):
+            self.grid.everywhere.run(self._passes.sum, u=kept, kept=kept, more=more)
 
     def undo(self, velocity: Sequence[wp.array]) -> None:
         """Make a velocity what `before` keeps, but for the last step's change."""

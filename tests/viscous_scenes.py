@@ -58,3 +58,54 @@ def viscous_scene(seed: int) -> LiquidScene:
         tables["source"] = [box(low.tolist(), high.tolist(), velocity=velocity)]
     tables["solid"] = [solid() for _ in range(int(rng.integers(0, 4)))]
     return scene(size=[1.0] * dimension, resolution=resolution, liquid=blocks, cfl=float(rng.uniform(0.5, 4.0)), **tables)
+
+
+def stirred_scene(seed: int) -> LiquidScene:
+    """Return the scene of a seed: a square or cube with liquids of several viscosities, solids that turn or swing, bodies, a source."""
+    rng = np.random.default_rng(seed)
+    dimension = int(rng.choice([2, 2, 3]))
+    resolution = int(rng.integers(16, 41) if dimension == 2 else rng.integers(10, 17))
+
+    def corner(low: float, high: float) -> np.ndarray:
+        return rng.uniform(low, high, dimension)
+
+    def some(share: float) -> bool:
+        return bool(rng.random() < share)
+
+    def slip() -> dict[str, Any]:
+        return {"slip_length": float(10.0 ** rng.uniform(-3.0, 0.0))} if some(0.6) else {}
+
+    def solid(number: int, count: int) -> dict[str, Any]:
+        middle, size = corner(0.25, 0.75), float(rng.uniform(0.1, 0.4)) / (1 + count)
+        middle[0] = (1 + number) / (1 + count)  # apart from each other, however they turn
+        round_one = {"shape": "sphere", "center": middle.tolist(), "radius": size}
+        half = size * corner(0.3, 0.6)
+        found: dict[str, Any] = round_one if some(0.4) else box((middle - half).tolist(), (middle + half).tolist())
+        kind = str(rng.choice(["rotation", "sinusoid", "body", "body"]))
+        if kind == "rotation":
+            axis = {"axis": rng.standard_normal(3).tolist()} if dimension == 3 else {}
+            found["motion"] = {"kind": kind, "center": middle.tolist(), "rate": float(rng.uniform(-600.0, 600.0)), **axis}
+        elif kind == "sinusoid":
+            found["motion"] = {"kind": kind, "period": float(rng.uniform(0.1, 0.5)), "amplitude": (0.05 * corner(-1.0, 1.0)).tolist()}
+        else:
+            turning = float(rng.uniform(-600.0, 600.0))
+            found |= {"density": float(10.0 ** rng.uniform(1.5, 4.0))}
+            found["angular_velocity"] = turning if dimension == 2 else [turning, 0.0, 0.5 * turning]
+        return found | {"wall": str(rng.choice(["sticky", "sticky", "separating"]))} | slip()
+
+    blocks = []
+    for _ in range(int(rng.integers(1, 4))):
+        low = corner(0.0, 0.7)
+        own = {"viscosity": float(10.0 ** rng.uniform(-2.0, 4.0))} if some(0.5) else {}
+        blocks.append(box(low.tolist(), np.minimum(low + corner(0.1, 0.5), 1.0).tolist(), **own))
+    tables: dict[str, Any] = {"wall": str(rng.choice(["sticky", "separating"]))}
+    tables["viscosity"] = {"value": float(10.0 ** rng.uniform(-2.0, 4.0)), **slip()}
+    if some(0.5):
+        low, velocity = corner(0.1, 0.6), [0.0, -float(rng.uniform(0.3, 2.0)), 0.0][:dimension]
+        low[1] = 0.9
+        high = low + corner(0.1, 0.3)
+        high[1] = 1.0
+        tables["source"] = [box(low.tolist(), high.tolist(), velocity=velocity)]
+    count = int(rng.integers(1, 4))
+    tables["solid"] = [solid(number, count) for number in range(count)]
+    return scene(size=[1.0] * dimension, resolution=resolution, liquid=blocks, cfl=float(rng.uniform(0.5, 4.0)), **tables)

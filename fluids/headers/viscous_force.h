@@ -2,20 +2,20 @@
 #include "viscous_walls.h"
 double lost = 0, driven = 0, square = 0, large = 0;
 const auto wall_speed = [&](const float* of, long long i) { return MOVING ? (double)of[MOVING ? i : 0] : 0.0; };
-const auto source = [&](long long q) {
-    return ((kind[q] == SOLID) & (base[q] != SOLID)) | ((kind[q - sa] == SOLID) & (base[q - sa] != SOLID));
+const auto source = [&](long long q, long long s) {  // whether a face is a source's, by the step along its component's axis
+    return ((kind[q] == SOLID) & (base[q] != SOLID)) | ((kind[q - s] == SOLID) & (base[q - s] != SOLID));
 };
-const auto met = [&](int i, long long q, int other, int side) {  // the velocity of the wall where the link from i to q along an axis meets it
-    if (source(q)) return (double)u[q];
+const auto met = [&](int i, long long q, int other, int side) {  // the wall's velocity at the end of the link from i to q along an axis
+    if (source(q, sa)) return (double)u[q];
     if (!MOVING || !turn) return wall_speed(own, q);
     double x[3] = {i + before_x - 0.5, j + before_y - 0.5, planes == 2 ? k + before_z - 0.5 : 0.0};
-    x[axis] -= 0.5; x[other] += side*(double)(d[i]/(d[i] - d[q]));
+    x[axis] -= 0.5; x[other] += side*(double)end_of(i, q);
     const int solid = wall[q] > 0 ? wall[q] : 0;
     const float* row = turn + 9*solid + 3*axis;
     return dx*(row[0]*x[0] + row[1]*x[1] + row[2]*x[2]) + shift[3*solid + axis];
 };
-const auto velocity = [&](const float* u, const float* distance, const float* of, long long i) {
-    return distance[i] <= (float)CLOSE ? wall_speed(of, i) : (double)u[i];
+const auto velocity = [&](const float* u, const float* distance, const float* of, long long i, long long s) {
+    return distance[i] <= (float)CLOSE && !source(i, s) ? wall_speed(of, i) : (double)u[i];
 };
 for (int i = first; i < last; ++i) {
     if (!(diagonal[i] > 0.0f)) { r[i] = 0.0f; continue; }
@@ -25,8 +25,8 @@ for (int i = first; i < last; ++i) {
     const auto link = [&](long long q, long long c, int to) { if (solid(d, q)) pull(q, head_on(i, q, c), axis, to); else force += cell[c]*(u[q] - here); };
     const auto side = [&](long long q, float weight, int other, int to) { if (solid(d, q)) pull(q, beside(i, q, weight), other, to); else force += weight*(u[q] - here); };
     const auto mix = [&](const float* v, const float* distance, const float* of, const float* x, long long s) {
-        force -= (x[i] - mixed[i])*velocity(v, distance, of, i) - (x[i] - mixed[i - sa])*velocity(v, distance, of, i - sa)
-            - (x[i + s] - mixed[i])*velocity(v, distance, of, i + s) + (x[i + s] - mixed[i - sa])*velocity(v, distance, of, i + s - sa);
+        force -= (x[i] - mixed[i])*velocity(v, distance, of, i, s) - (x[i] - mixed[i - sa])*velocity(v, distance, of, i - sa, s)
+            - (x[i + s] - mixed[i])*velocity(v, distance, of, i + s, s) + (x[i + s] - mixed[i - sa])*velocity(v, distance, of, i + s - sa, s);
     };
     link(i + sa, i, 1); link(i - sa, i - sa, -1);
     side(i + sb, xb[i + sb], first_other, 1); side(i - sb, xb[i], first_other, -1);

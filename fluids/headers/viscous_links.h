@@ -32,7 +32,7 @@ for (int i = first; i < last; ++i) {
         const float* across = other == first_other ? xb : xc;
         const double weight = other == axis ? head_on(i, q, to > 0 ? i : i - sa) : beside(i, q, across[to > 0 ? i + step[other] : i]);
         double x[3] = {low[0], low[1], low[2]};
-        x[axis] -= 0.5; x[other] += to*(double)(d[i]/(d[i] - d[q]));
+        x[axis] -= 0.5; x[other] += to*(double)end_of(i, q);
         if (weight > 0.0) enter(i, number, weight, axis, x[0], x[1], x[2]);
     }
     for (int n = 0; n < 4*planes; ++n) {

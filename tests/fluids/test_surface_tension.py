@@ -53,6 +53,35 @@ def curvatures(simulation: LiquidSimulation, distance: np.ndarray) -> np.ndarray
     return np.asarray(jump[jump != 0.0])
 
 
+def measured(simulation: LiquidSimulation, liquid: np.ndarray, open_: np.ndarray, points: int) -> np.ndarray:
+    """Return the distance that evenly spread particles would say.
+
+    Args:
+        simulation: of unit cells.
+        liquid: whether it is at each of `points` an axis and cell, two cells beyond the domain, in the order of the stored cells.
+        open_: whether no solid is there.
+        points: how many.
+    """
+    filled, room = (liquid & open_).astype(np.float64), open_.astype(np.float64)
+    for axis, count in enumerate(simulation.grid.counts[::-1]):
+        if filled.shape[axis] > 1:
+            t = np.abs((np.arange((count + 4) * points) + 0.5) / points - 2.0 - np.arange(count)[:, None] - 0.5)
+            kernel = np.where(t < 0.5, 0.75 - t * t, np.where(t < 1.5, 0.5 * (1.5 - t) ** 2, 0.0)) / points
+            filled, room = (np.moveaxis(np.tensordot(kernel, of, axes=(1, axis)), 0, axis) for of in (filled, room))
+    places = np.linspace(-1.5, 1.5, 3001)
+    shares = np.where(np.abs(places) < 0.5, 0.5 - 0.75 * np.abs(places) + np.abs(places) ** 3 / 3.0, (1.5 - np.abs(places)) ** 3 / 6.0)
+    shares = np.where(places > 0.0, 1.0 - shares, shares)
+    distance = np.full(simulation.grid.shape, 1.5)
+    distance[1:-1, 1:-1, 1:-1] = -np.interp(filled / np.maximum(room, 1e-9), shares, places)
+    return distance
+
+
+def samples(simulation: LiquidSimulation, points: int) -> np.ndarray:
+    """Return the points (x, y, z) of `measured`, in cells."""
+    axes = [(np.arange((n + 4) * points) + 0.5) / points - 2.0 if n > 1 else np.zeros(1) for n in simulation.grid.counts[::-1]]
+    return np.stack(np.meshgrid(*axes, indexing="ij")[::-1], axis=-1)
+
+
 @pytest.mark.parametrize(("dimension", "radius"), [(2, 6.0), (2, 12.0), (3, 7.0)])
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["drop", "bubble"])
 def test_the_curvature_of_a_sphere(dimension: int, radius: float, sign: float) -> None:
@@ -125,14 +154,43 @@ def test_a_plane_at_the_contact_angle_is_straight(angle: float, dimension: int, 
     found = {}
     for given in (angle, angle - 30.0):
         simulation = tank(dimension, cells, angle=given, **wall)
+        at = samples(simulation, 10 if dimension == 2 else 4)
+        open_ = ((at > 0.0) & (at < cells))[..., :dimension].all(axis=-1)
+        if slope:
+            open_ &= (at - [cells / 2, 8.0, 0.0]) @ normal > 0.0
+        liquid = (at - foot) @ (-math.sin(tilt), math.cos(tilt), 0.0) < 0.0
+        tension, _ = take(simulation, measured(simulation, liquid, open_, 10 if dimension == 2 else 4))
         away = (centers(simulation) - foot) * (1.0, 1.0, 0.0)
-        tension, _ = take(simulation, away @ (-math.sin(tilt), math.cos(tilt), 0.0))
         near = np.linalg.norm(away, axis=-1) < 6.0
         if dimension == 3:
             near &= np.abs(centers(simulation)[..., 2] - cells / 2) < 2.0  # the sides have the angle, too
         found[given] = np.abs(tension.jump.numpy()[near]).max() / 1e-3
     assert found[angle] < 0.03
     assert found[angle - 30.0] > 0.06
+
+
+@pytest.mark.parametrize("angle", [30.0, 60.0, 120.0])
+@pytest.mark.parametrize("width", [12, 24])
+def test_a_meniscus_has_the_curvature_of_its_arc(width: int, angle: float) -> None:
+    """Between walls: 2 cos(angle) / width. The mean is what liquid rises by; beside the walls it was 0.6 of that at 30 degrees."""
+    radius, rng, found = 0.5 * width / math.cos(math.radians(angle)), np.random.default_rng(17), []
+    for _ in range(3):
+        height, tension = width + 18, {"coefficient": 1.0, "contact_angle": angle}
+        physics, liquid = {"density": 1.0, "gravity": [0.0, 0.0]}, [box([0.0, 0.0], [float(width), 9.0])]
+        size = [float(width), float(height)]
+        simulation = create(scene(size=size, resolution=height, liquid=liquid, surface_tension=tension, physics=physics))
+        middle = np.array([0.5 * width, 9.0 + rng.uniform(-0.5, 0.5) + radius, 0.0])
+        at = samples(simulation, 12)
+        inside = np.linalg.norm(at - middle, axis=-1) < abs(radius)
+        below = (at[..., 1] < middle[1]) & ~inside if radius > 0.0 else inside | (at[..., 1] < middle[1])
+        distance = measured(simulation, below, (at[..., 0] > 0.0) & (at[..., 0] < width) & (at[..., 1] > 0.0), 12)
+        tension_, _ = take(simulation, distance)
+        jump = tension_.jump.numpy()[1, :, 1:-1] / 1e-3
+        found.append(-radius * jump.sum(axis=0) / np.maximum((jump != 0.0).sum(axis=0), 1))
+    columns = np.mean(found, axis=0)
+    assert columns.mean() == pytest.approx(1.0, abs=0.03)
+    assert columns.min() > 0.75
+    assert columns.max() < 1.1
 
 
 def test_cells_of_walls_mirror_what_is_before_them() -> None:
@@ -371,6 +429,27 @@ def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) ->
         simulation = create(scene(size=[width, 0.012], resolution=36, liquid=liquid, surface_tension=tension, wall=wall))
         fastest[wall] = max(row["max_speed"] for row in advance(simulation, 0.04, 1e-3))
     assert fastest["separating"] < 1.1 * fastest["free-slip"]
+
+
+@pytest.mark.parametrize(("angle", "error"), [(60.0, 0.04), (30.0, 0.09)])
+def test_liquid_rises_between_plates(angle: float, error: float) -> None:
+    """By 2 sigma cos(angle) / (rho g width) over its pressure's level, 12 cells apart and 30, the mean over the width.
+
+    At 30 degrees particles become fewer beside the walls, which takes 5 % of it.
+    """
+    plate, bath = box([0.004, 0.002], [0.006, 0.02]), [box([0.0, 0.0], [0.016, 0.006])]
+    tables = {"solid": [plate], "viscosity": {"value": 0.05, "slip_length": math.inf}, "particles": {"transfer": "pic"}}
+    tension = {"coefficient": SIGMA, "contact_angle": angle}
+    simulation = create(scene(size=[0.016, 0.014], resolution=48, liquid=bath, surface_tension=tension, **tables))
+    rises = []
+    while simulation.time < 0.5:
+        simulation.step(min(simulation.stable_dt(), 0.02))
+        x, y = simulation.particles.position.numpy()[:, :2].T
+        area = simulation.particle_mass / RHO
+        levels = [float(((x > low) & (x < high) & (y > 0.002)).sum()) * area / (high - low) for low, high in ((0.0, 0.004), (0.006, 0.016))]
+        rises += [levels[0] - levels[1]] if simulation.time > 0.3 else []
+    expected = 2.0 * SIGMA * math.cos(math.radians(angle)) / (RHO * 9.81) * (1.0 / 0.004 - 1.0 / 0.01)
+    assert np.mean(rises) == pytest.approx(expected, rel=error)
 
 
 def test_a_full_box_has_no_surface() -> None:

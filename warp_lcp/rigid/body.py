@@ -168,11 +168,11 @@ class RigidBody:
         self.angle, self.time = float(state[18]), float(state[19])
         self.release()
 
-    def momenta(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def momenta(self) -> tuple[np.ndarray, ...]:
         """Return what impulses change, for `restore_momenta`."""
         return self.momentum, self.angular_momentum, self.given
 
-    def restore_momenta(self, kept: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    def restore_momenta(self, kept: tuple[np.ndarray, ...]) -> None:
         """Undo all impulses since `momenta` returned this."""
         self.momentum, self.angular_momentum, self.given = kept
 
