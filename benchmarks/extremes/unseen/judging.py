@@ -24,8 +24,8 @@ OFTEN = (2.0, 6)  # iterations are at most 2 e + 6, e those of the equations,
 OFTEN_SHARE = 0.95  # on this share of the grids,
 ALWAYS = (3.0, 6)  # and never more than 3 e + 6
 WITHOUT_EQUATIONS = 100  # iterations where they have no solution: what a user gets by default
-# iterations on the finest grid that a warm start may take beyond a cold one's c, on OFTEN_SHARE of grids, never more than 2 c + 6; steps are
-# no measure: a cold start that has gone on by Newton's method on the grid's matrix takes fewer and longer ones
+# iterations on the finest grid that a warm start may take beyond a cold one's c, on OFTEN_SHARE of the grids, and never more than 2 c + 6;
+# steps are no measure: a cold start that has gone on by Newton's method on the grid's matrix takes fewer and longer ones
 WARM_MORE = 1
 NO_END = (case.OUT_OF_TIME, "INFEASIBLE", "NON_FINITE")  # of a small problem that has a solution
 GAVE_UP = Promise(Expected.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
