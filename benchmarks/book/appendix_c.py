@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import statistics
 from collections.abc import Sequence
 from dataclasses import replace
@@ -49,7 +48,7 @@ SHARES = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)  # lambda
 FACTORS = (0.6, 0.8, 1.0, 1.2, 1.3, 1.4, 1.5, 1.6, 1.7, 1.8, 1.9)  # omega
 SWEEPS = 2000
 SHOWN = 50  # iterations that figure C.2 shows
-RATES = 5  # last factors of the residual that a rate is the median of
+NEAR = 1e-9  # relative residual at which a rate is measured
 UNIT = "residual / residual at x = 0"
 
 
@@ -116,8 +115,8 @@ def _states(results: Results, problems: dict[str, list[Problem]], options: Optio
         "Book's test: states and iterations by Num4LCP's rules (relative 1e-6, absolute 1e-3, at most 100) on the merit or, for sweeps, "
         "on x'|y|. Residual there: the largest natural residual where that test ended a solve, over the one of x = 0. Solved: natural "
         f"residual below {RTOL:g} of that within 100 steps. Minimum map is called non-descent where its steps lead nowhere, although the "
-        "library's method goes on by others. Rate: the factor by which the residual falls in a step at the end (median of the last five "
-        "above 1e-10). Names with () are the library's methods as they come."
+        "library's method goes on by others. Rate: the factor by which the residual falls in the step that takes it below "
+        f"{NEAR:g}, or in the last one (median). Names with () are the library's methods as they come."
     )
     columns = ["problems", "method", "book's test", "iterations", "residual there", "solved", "steps", "rate", "[Book] C.1, C.2"]
     results.tables.append(Table("Tables C.1 and C.2: final states and iterations", columns, rows, remark))
@@ -125,12 +124,12 @@ def _states(results: Results, problems: dict[str, list[Problem]], options: Optio
 
 
 def _rate(of_method: Outcome) -> float:
-    """Return the median over problems of the factor by which the residual falls a step at the end, above what rounding leaves."""
+    """Return by which factor the residual falls in the step that takes it below NEAR, or in the last one: the median."""
     factors = []
     for trace in of_method.traces:
-        above = [r for r in trace.residuals if r > 1e-10]
-        falls = [a / b for a, b in itertools.pairwise(above)][-RATES:]
-        factors += [statistics.median(falls)] if falls else []
+        last = next((k for k, r in enumerate(trace.residuals) if r <= NEAR), len(trace.residuals) - 1)
+        if last > 0:
+            factors.append(trace.residuals[last - 1] / max(trace.residuals[last], 1e-16))
     return statistics.median(factors) if factors else 1.0
 
 

@@ -17,7 +17,7 @@ COLOR, LIMIT = "#3a6ea5", "#b3432b"
 SHADES = 64  # colors of a picture
 MARKERS = 100  # points of a curve from which on they are not marked
 STYLES = ("-", "--", ":")  # of ten curves each, which have a color of their own
-PANEL = (4.2, 2.8)  # [inch]
+PANEL = (3.5, 2.4)  # [inch]
 CROWDED = 10  # curves from which on their names are beside the axes
 NO_PLOTS = "no plots: Matplotlib is missing (pip install 'warp-lcp[peers]')"
 
@@ -79,7 +79,9 @@ def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
         images.append(out / f"{prefix}-{chart.name}.png")
         with io.BytesIO() as drawn:
             canvas.savefig(drawn)
-            Image.open(drawn).convert("RGB").quantize(SHADES).save(images[-1], optimize=True)  # a third of the bytes
+            Image.open(drawn).convert("RGB").quantize(2 * SHADES if isinstance(chart, Panels) else SHADES).save(
+                images[-1], optimize=True
+            )  # a third of the bytes
     return images
 
 
@@ -118,7 +120,8 @@ def _lines(axes: Axes, chart: Lines, names: Sequence[str] = ()) -> None:
         if label in chart.marked:
             axes.plot(x, y, marker="o", markersize=2 if names else None, linestyle="none", fillstyle="none", color="black", label=label)
             continue
-        color: Any = {"color": f"C{place % 10}"} if names else {}
+        # wider the earlier, so that curves that coincide are all seen
+        color: Any = {"color": f"C{place % 10}", "linewidth": 3 - 2 * place / len(names)} if names else {}
         marker = "." if len(x) < (2 if names else MARKERS) else ""
         axes.plot(x, y, marker=marker, linestyle=STYLES[place // 10 % len(STYLES)], label=label, **color)
     axes.set(**{f"{axis}scale": "log" for axis in chart.log}, xlabel=chart.x_label, ylabel=chart.y_label)
