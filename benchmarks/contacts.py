@@ -13,7 +13,7 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
 from warp_lcp.gallery.contact_stepper import ContactStepper
-from warp_lcp.gallery.rigid_world import World
+from warp_lcp.gallery.rigid_world import Assembly, World
 
 TITLE = "Rigid contacts: the scenes of figures 2.9 and 2.11"
 DT = 0.01  # [s]
@@ -48,7 +48,7 @@ def measure(options: Options, out: Path) -> Results:
     solves: list[Record] = []
     charts: list[Chart] = []
     for name in SCENES:
-        system = _system(name, options.device)
+        system = next_step(name, options.device).system
         options.say(f"{name}: {system.contacts} contacts, {len(system.lower)} joint rows")
         curves = _scene(name, system, options, solves)
         steps, unit = "sweeps, linear iterations, pivots or factorizations", "residual / residual at x = 0"
@@ -57,16 +57,16 @@ def measure(options: Options, out: Path) -> Results:
     return Results([*records, *solves, *equal], [_finding(equal), _equal_table(equal), *_tables(solves)], charts)
 
 
-def _system(name: str, device: str) -> ContactSystem:
-    """Return the problem of a scene's next step, after it has settled where it needs to."""
+def next_step(name: str, device: str) -> Assembly:
+    """Return the velocity problem of a scene's next step, after it has settled where it needs to."""
     world: World = SCENES[name]()
     stepper = ContactStepper(world, wl.NNCG(), dt=DT, device=device)
     for _ in range(SETTLING.get(name, 0)):
         stepper.step()
-    return world.assemble(DT).system
+    return world.assemble(DT)
 
 
-def _stop(most: int, tolerance: float = TOLERANCE) -> wl.StoppingCriteria:
+def unhindered(most: int, tolerance: float = TOLERANCE) -> wl.StoppingCriteria:
     """Return criteria that let a method go on whatever its residual does: spikes are part of the picture."""
     return wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most, divergence=1e30)
 
@@ -87,8 +87,8 @@ def _scene(name: str, system: ContactSystem, options: Options, solves: list[Reco
             method, most = make(system)
             facts = {"model": kind, "scene": name, "method": label}
             try:
-                wl.solve(problem, method, stopping=_stop(1))  # loads kernels
-                result = wl.solve(problem, method, stopping=_stop(most))
+                wl.solve(problem, method, stopping=unhindered(1))  # loads kernels
+                result = wl.solve(problem, method, stopping=unhindered(most))
             except ValueError as error:
                 solves.append(Record(f"{name}: {label}", {}, facts | {"status": f"refused: {error}"}))
                 continue
@@ -115,7 +115,7 @@ def _scene(name: str, system: ContactSystem, options: Options, solves: list[Reco
 
 def _equal(options: Options) -> list[Record]:
     """Return PGS and NNCG after equal sweeps, on the stacks and the heavy box at all mass ratios."""
-    systems = {name: _system(name, options.device) for name in STACKS if name != "heavy-on-light"}
+    systems = {name: next_step(name, options.device).system for name in STACKS if name != "heavy-on-light"}
     systems |= {f"heavy-on-light, ratio {ratio:g}": heavy_on_light(ratio=ratio).assemble(DT).system for ratio in RATIOS}
     frictionless = heavy_on_light(ratio=1000.0)
     frictionless.friction = 0.0
@@ -126,7 +126,7 @@ def _equal(options: Options) -> list[Record]:
         problem = BoxedModel().problem(system).lcp(device=options.device)
         residuals = {}
         for label, method in (("PGS", wl.ProjectedSOR(omega=1.0)), ("NNCG", wl.NNCG())):
-            history = wl.solve(problem, method, stopping=_stop(max(EQUAL))).history
+            history = wl.solve(problem, method, stopping=unhindered(max(EQUAL))).history
             residuals[label] = [history[min(n, len(history) - 1)].residual / history[0].residual for n in EQUAL]
         figures: dict[str, Figure] = {}
         for i, n in enumerate(EQUAL):

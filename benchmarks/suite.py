@@ -124,6 +124,9 @@ SAND = Suite("sand", "sand: the coupled methods at equal residual, the yield set
 CONTACTS = Suite(
     "contacts", "rigid contacts: methods on the scenes of figures 2.9 and 2.11, NNCG against PGS at equal sweeps", "5 minutes", False
 )
+BOOK = Suite(
+    "book", "appendix C of Niebe and Erleben, figures 2.3, 2.10 and 2.12: as the book has them, and as they should be", "8 minutes"
+)
 MODELS = Suite(
     "models", "what each model that a scene can turn on adds to a step and to memory: the prices that `warp-lcp check` tells", "30 minutes"
 )

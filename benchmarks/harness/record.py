@@ -63,7 +63,17 @@ class Lines:
     marked: frozenset[str] = frozenset()
 
 
-Chart = Bars | Lines
+@dataclass(frozen=True)
+class Panels:
+    """Several `Lines` in one picture, `columns` side by side; curves of one name have one color and one entry in the legend."""
+
+    name: str
+    title: str
+    panels: Sequence[Lines]
+    columns: int = 2
+
+
+Chart = Bars | Lines | Panels
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warp_lcp.benchmarks.harness.machine import present
-from warp_lcp.benchmarks.harness.record import MACHINE, Bars, Chart, Lines, Record, Results, Table, write_json
+from warp_lcp.benchmarks.harness.record import MACHINE, Bars, Chart, Lines, Panels, Record, Results, Table, write_json
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,6 +17,7 @@ COLOR, LIMIT = "#3a6ea5", "#b3432b"
 SHADES = 64  # colors of a picture
 MARKERS = 100  # points of a curve from which on they are not marked
 STYLES = ("-", "--", ":")  # of ten curves each, which have a color of their own
+PANEL = (3.5, 2.4)  # [inch]
 CROWDED = 10  # curves from which on their names are beside the axes
 NO_PLOTS = "no plots: Matplotlib is missing (pip install 'warp-lcp[peers]')"
 
@@ -62,17 +63,25 @@ def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
 
     images = []
     for chart in charts:
-        size = (11, max(2.5, 0.18 * len(chart.values)) + 0.8) if isinstance(chart, Bars) else (8, 5.3)
-        canvas: Any = Canvas(figsize=size, dpi=90, layout="constrained")
-        if isinstance(chart, Bars):
+        canvas: Any = Canvas(dpi=90, layout="constrained")
+        if isinstance(chart, Panels):
+            _panels(canvas, chart)
+        elif isinstance(chart, Bars):
+            canvas.set_size_inches(11, max(2.5, 0.18 * len(chart.values)) + 0.8)
             _bars(canvas.add_subplot(), chart)
         else:
-            _lines(canvas.add_subplot(), chart)
+            canvas.set_size_inches(8, 5.3)
+            axes = canvas.add_subplot()
+            _lines(axes, chart)
+            beside = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)} if len(chart.curves) >= CROWDED else {}
+            axes.legend(fontsize=7, **beside)
         canvas.suptitle(chart.title, fontsize=10)
         images.append(out / f"{prefix}-{chart.name}.png")
         with io.BytesIO() as drawn:
             canvas.savefig(drawn)
-            Image.open(drawn).convert("RGB").quantize(SHADES).save(images[-1], optimize=True)  # a third of the bytes
+            Image.open(drawn).convert("RGB").quantize(2 * SHADES if isinstance(chart, Panels) else SHADES).save(
+                images[-1], optimize=True
+            )  # a third of the bytes
     return images
 
 
@@ -88,13 +97,32 @@ def _bars(axes: Axes, chart: Bars) -> None:
     axes.margins(y=0.01)
 
 
-def _lines(axes: Axes, chart: Lines) -> None:
+def _panels(canvas: Any, chart: Panels) -> None:
+    rows = -(-len(chart.panels) // chart.columns)
+    canvas.set_size_inches(PANEL[0] * chart.columns, PANEL[1] * rows + 0.6)
+    names = list(dict.fromkeys(label for panel in chart.panels for label in panel.curves))
+    shown: dict[str, Any] = {}
+    for axes, panel in zip(canvas.subplots(rows, chart.columns, squeeze=False).ravel(), chart.panels, strict=False):
+        _lines(axes, panel, names)
+        axes.set_title(panel.title, fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.xaxis.label.set_size(7)
+        axes.yaxis.label.set_size(7)
+        shown |= {line.get_label(): line for line in axes.lines}
+    if any(names):
+        canvas.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=len(names) if len(names) < 6 else 4, fontsize=7)
+
+
+def _lines(axes: Axes, chart: Lines, names: Sequence[str] = ()) -> None:
+    """Draw the curves, in the colors of their places among `names` if there are any."""
     for number, (label, (x, y)) in enumerate(chart.curves.items()):
+        place = names.index(label) if names else number
         if label in chart.marked:
-            axes.plot(x, y, marker="o", linestyle="none", fillstyle="none", color="black", label=label)
-        else:
-            axes.plot(x, y, marker="." if len(x) < MARKERS else "", linestyle=STYLES[number // 10 % len(STYLES)], label=label)
+            axes.plot(x, y, marker="o", markersize=2 if names else None, linestyle="none", fillstyle="none", color="black", label=label)
+            continue
+        # wider the earlier, so that curves that coincide are all seen
+        color: Any = {"color": f"C{place % 10}", "linewidth": 3 - 2 * place / len(names)} if names else {}
+        marker = "." if len(x) < (2 if names else MARKERS) else ""
+        axes.plot(x, y, marker=marker, linestyle=STYLES[place // 10 % len(STYLES)], label=label, **color)
     axes.set(**{f"{axis}scale": "log" for axis in chart.log}, xlabel=chart.x_label, ylabel=chart.y_label)
     axes.grid(alpha=0.3)
-    beside = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)} if len(chart.curves) >= CROWDED else {}
-    axes.legend(fontsize=7, **beside)

@@ -7,12 +7,13 @@ from collections import Counter
 import numpy as np
 import pytest
 import scipy.sparse
+import warp as wp
 from typer.testing import CliRunner
 
 import warp_lcp as wl
 from oracle import assemble, natural_residual
 from warp_lcp.benchmarks import extremes
-from warp_lcp.benchmarks.extremes import broken, case, matrices, refused, shapes
+from warp_lcp.benchmarks.extremes import bounds, broken, case, matrices, refused, shapes
 from warp_lcp.benchmarks.extremes.case import Attempt, Expected, Promise, RefusalCase, SolveCase, judge, violations
 from warp_lcp.benchmarks.extremes.exact import Exact, norm, stencil
 from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
@@ -152,6 +153,15 @@ def test_values_whose_squares_vanish_are_refused():
         assert wl.solve(wl.LCP(A, np.array([tiny, -abs(tiny)])), stopping=wl.StoppingCriteria(atol=1e-30))
     assert wl.solve(wl.LCP(A, np.zeros(2)))
     assert wl.solve(wl.LCP(A, np.array([-1e-100, 1e-130])))
+
+
+def test_a_tolerance_below_what_float32_holds_costs_few_iterations():
+    """Linear solves that no longer lower the residual end: 3,236 iterations where each runs to its limit."""
+    problem = bounds.pool((96, 96)).lcp("cpu", wp.float32)
+    result = wl.solve(problem, wl.MinimumMapNewton(precision="single"), stopping=wl.StoppingCriteria(rtol=1e-13))
+    assert result.status is wl.SolveStatus.FLOOR
+    assert result.relative_residual < 1e-5
+    assert result.linear_iterations < 1500
 
 
 def test_precisions_are_those_that_a_method_has():

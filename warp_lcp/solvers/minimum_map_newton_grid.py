@@ -12,6 +12,7 @@ from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Step
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 DECREASE = 1e-4  # share of a step by which the residual must fall
+IDLE = StoppingCriteria.patience  # iterations of one linear solve without a smaller residual
 
 
 class MinimumMapResidual(AssessedResidual):
@@ -104,10 +106,14 @@ class GridNewtonWorkspace(MultigridWorkspace):
         if residual.away:
             self._store()
             residual.hold(self.x)
+        least, idle = residual.norm, 0
         while True:
             self.truncated_step()
             iterations += 1
             if residual.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations or time_is_up():
+                break
+            least, idle = (residual.norm, 0) if residual.norm < least else (least, idle + 1)
+            if idle >= IDLE and self._rounded is not None:  # what rounding x to float32 leaves
                 break
         sinks = self.descent.sinks and self._rounded is None  # then the residual may rise
         if sinks or not residual.norm > (1 - DECREASE) * limit or not math.isfinite(residual.norm) or not self.bounded:

@@ -1,0 +1,173 @@
+"""Solves seen iterate by iterate: how the book's tests would have ended them, and when the natural residual was small."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+import warp_lcp as wl
+from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.timing import Figure
+from warp_lcp.gallery import Problem
+
+RTOL = 1e-6  # of the natural residual: what this library calls solved
+DEEP = 1e-12  # tolerance of the solves: far enough to see how fast a method is at its end
+# steps by which MinimumMapNewton goes on where the book's method has ended
+FALLBACKS = frozenset({"regularized", "interior point", "predictor-corrector", "least index", "proximal point"})
+
+
+class Merit(Enum):
+    """What Num4LCP tests: half the squared norm of the Fischer-Burmeister map or of the minimum map, or the product x'|y|."""
+
+    FISCHER = "Fischer"
+    MINIMUM = "minimum map"
+    PRODUCT = "x'|y|"
+
+    def of(self, x: np.ndarray, y: np.ndarray) -> float:
+        """Return it for an iterate, shape (n,) each."""
+        if self is Merit.PRODUCT:
+            return float(x @ np.abs(y))
+        f = np.hypot(x, y) - x - y if self is Merit.FISCHER else np.minimum(x, y)
+        return 0.5 * float(f @ f)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The book's tests: relative change of the merit, its size, and the number of iterations."""
+
+    rtol: float = 1e-6
+    atol: float = 1e-3
+    most: int = 100
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A solve.
+
+    Args:
+        merits: the merit of each iterate, the start's first.
+        residuals: the natural residual of each over the first one's.
+        steps: the method's word for what led to each.
+        status: how the solve ended.
+    """
+
+    merits: Sequence[float]
+    residuals: Sequence[float]
+    steps: Sequence[str]
+    status: wl.SolveStatus
+
+    @property
+    def solved(self) -> int | None:
+        """Steps after which the natural residual was RTOL times the first one, None if never."""
+        return next((k for k, r in enumerate(self.residuals) if r <= RTOL), None)
+
+    def verdict(self, merit: Merit, limits: Limits) -> tuple[str, int, float]:
+        """Return state, iterations and relative residual where Num4LCP's tests would have ended the solve.
+
+        Sweeps are tested after each one; Newton methods before each step, whose first test is iteration 1. A fallback of this library
+        counts as the end of the book's method, which has none.
+        """
+        first = 1 if merit is Merit.PRODUCT else 0
+        before = np.inf
+        for k in range(first, len(self.merits)):
+            iteration, now, relative = k + 1 - first, self.merits[k], self.residuals[k]
+            if self.steps[k] in FALLBACKS and self.steps[1] == "newton":
+                return "non-descent", iteration, relative
+            if np.isfinite(before) and abs(now - before) < limits.rtol * abs(before):
+                return "relative", iteration, relative
+            if now < limits.atol:
+                return "absolute", iteration, relative
+            if iteration >= limits.most:
+                return "max iterations", iteration, relative
+            before = now
+        names = {"max iterations": "MAX_ITERATIONS", "stagnation": "STAGNATED FLOOR", "local minimum": "LOCAL_MINIMUM"}
+        state = next((name for name, statuses in names.items() if self.status.name in statuses.split()), "non-descent")
+        return state, max(1, len(self.merits) - first), self.residuals[-1]
+
+
+def follow(problem: Problem, solver: Any, merit: Merit, device: str, *, most: int = 100, x0: Any = None) -> Trace:
+    """Solve a dense or sparse problem and keep the merit of each iterate."""
+    lcp = problem.lcp(device=device)
+    work = solver.init(lcp)
+    merits: list[float] = []
+
+    def look(record: wl.Record) -> None:
+        x = lcp.layout.unload(work.x).numpy().ravel()
+        merits.append(merit.of(x, problem.A @ x + problem.b))
+
+    stopping = wl.StoppingCriteria(rtol=DEEP, max_iterations=most, patience=max(1, most), divergence=1e30)
+    result = wl.solve(lcp, solver, stopping=stopping, workspace=work, callback=look, x0=x0)
+    first = result.history[0].residual or 1.0
+    return Trace(merits, [r.residual / first for r in result.history], [r.step for r in result.history], result.status)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A method's solves of the problems of a kind, with the book's verdicts."""
+
+    name: str  # of the record
+    traces: Sequence[Trace]
+    verdicts: Sequence[tuple[str, int, float]]
+
+    @property
+    def solved(self) -> list[int]:
+        """Steps to RTOL of those that got there within the limit."""
+        return [n for t in self.traces if (n := t.solved) is not None]
+
+    @property
+    def accepted(self) -> list[int]:
+        """Iterations of those that one of the book's two tests of convergence ended."""
+        return [iterations for state, iterations, _ in self.verdicts if state in ("relative", "absolute")]
+
+    @property
+    def states(self) -> str:
+        """How often each final state came, the most frequent first."""
+        return counted(state for state, _, _ in self.verdicts)
+
+    @property
+    def share(self) -> str:
+        """How many were solved to RTOL, with the mean of their steps."""
+        return f"{len(self.solved)} of {len(self.traces)}" + (f", {statistics.fmean(self.solved):.2f}" if self.solved else "")
+
+    def record(self) -> Record:
+        """Return the figures."""
+        figures: dict[str, float] = {"solved": len(self.solved), "problems": len(self.traces), "accepted": len(self.accepted)}
+        figures["residual"] = max(residual for _, _, residual in self.verdicts)
+        figures |= {"steps": statistics.fmean(self.solved)} if self.solved else {}
+        figures |= {"iterations": statistics.fmean(self.accepted)} if self.accepted else {}
+        facts = {"states": self.states, "statuses": counted(t.status.name for t in self.traces)}
+        return Record(self.name, {name: Figure(value) for name, value in figures.items()}, facts)
+
+    def row(self) -> list[str]:
+        """Return states, iterations and largest residual by the book's tests, then problems solved to RTOL and their steps."""
+        worst = max(residual for _, _, residual in self.verdicts)
+        return [self.states, spread(self.accepted), f"{worst:.1e}", f"{len(self.solved)} of {len(self.traces)}", spread(self.solved)]
+
+
+def outcome(
+    name: str, problems: Sequence[Problem], solver: Any, merit: Merit, device: str, *, limits: Limits | None = None,
+    starts: Sequence[Any] | None = None,
+) -> Outcome:  # fmt: skip
+    """Solve all problems by a method, from x = 0 or the starts."""
+    limits = limits or Limits()
+    given = starts or [None] * len(problems)
+    traces = [follow(p, solver, merit, device, most=limits.most, x0=x0) for p, x0 in zip(problems, given, strict=True)]
+    return Outcome(name, traces, [t.verdict(merit, limits) for t in traces])
+
+
+def counted(words: Iterable[str]) -> str:
+    """Return how often each word comes, the most frequent first."""
+    return ", ".join(f"{n} {word}" for word, n in Counter(words).most_common())
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return mean (smallest to largest, standard deviation)."""
+    if not values:
+        return ""
+    return f"{statistics.fmean(values):.2f} ({min(values):g} to {max(values):g}, {statistics.pstdev(values):.2f})"

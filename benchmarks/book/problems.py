@@ -1,0 +1,133 @@
+"""The problems of [Book] appendix C twice: by the recipes of its code, Num4LCP, and with a solution that is one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.gallery import Plant, Problem, contact, planted, poisson
+from warp_lcp.gallery.matrices import banded_matrix, spectrum_matrix
+
+BLOCK = 6  # unknowns of a contact: normal, four tangents, slip speed
+ZEROS = 0.25  # share of zeros in x in all experiments of Num4LCP
+SEED = 2015
+SMALL = 32  # cells along a side of the largest grid below which all experiments are small
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large the experiments are.
+
+    Args:
+        problems: number of random problems of each kind.
+        side: a fluid problem has side^3 unknowns.
+        contacts: a contact problem has six times as many unknowns.
+        dense: unknowns of the dense problems.
+        grids: cells along a side of the grids whose cost is measured.
+        rows: numbers of contacts of the contact problems whose cost is measured.
+        sweeps: limit of the sweeps on contact scenes, as in figure 2.12.
+    """
+
+    problems: int
+    side: int
+    contacts: int
+    dense: int
+    grids: tuple[int, ...]
+    rows: tuple[int, ...]
+    sweeps: int
+
+    @staticmethod
+    def of(options: Options) -> Scale:
+        """Return the book's numbers, or small ones where only small grids are asked for."""
+        grids = options.sizes or (16, 32, 64)
+        if max(grids) < SMALL:
+            return Scale(2 * options.repeat, 4, 3, 12, grids, (2, 4), 40)
+        return Scale(20 * options.repeat, 10, 30, 100, grids, (10, 20, 40, 80), 5000)
+
+
+def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
+    """Return the problem that Num4LCP's `make_lcp` makes of a matrix.
+
+    Its `solution` is the x that it plants, uniform in (0, 1) with a quarter set to 0, b = -A x where x > 0 and 0 elsewhere. That x is no
+    solution where (A x)_i < 0 at a zero: with an M-matrix everywhere.
+    """
+    x = rng.random(A.shape[0])
+    x[x < ZEROS] = 0
+    b = np.where(x > 0, -(A @ x), 0.0)
+    return Problem(name, A, b, np.zeros(len(x)), np.full(len(x), np.inf), x, frozenset())
+
+
+def complementary(A: Any, rng: np.random.Generator, name: str) -> Problem:
+    """Return a problem with a complementary solution: a quarter of x at zero with y > 0 there, b = y - A x."""
+    return planted(A, rng, Plant(active=ZEROS), name=name, facts=frozenset())
+
+
+RULES: dict[str, Callable[[Any, np.random.Generator, str], Problem]] = {"recipe": recipe, "planted": complementary}
+
+
+def contact_matrix(contacts: int, rng: np.random.Generator) -> np.ndarray:
+    """Return Num4LCP's contact matrix, which no contact of bodies has.
+
+    Random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern of Stewart and Trinkle written over
+    those that are left.
+    """
+    n = BLOCK * contacts
+    R = rng.random((n, n))
+    A = 0.5 * (R + R.T)
+    kept = A[BLOCK // 2 :: BLOCK, BLOCK // 2 :: BLOCK] <= 0.5
+    A *= np.kron(kept, np.ones((BLOCK, BLOCK)))
+    lowest = float(np.linalg.eigvalsh(A)[0])
+    if lowest <= 0:
+        A += (0.5 - lowest) * np.eye(n)
+    blocks = A.reshape(contacts, BLOCK, contacts, BLOCK)
+    i, j = np.nonzero(blocks[:, 0, :, 0])
+    last, tangents = BLOCK - 1, slice(1, BLOCK - 1)
+    blocks[i, last, j, 0] = 0.5  # mu
+    blocks[i, last, j, last] = blocks[i, 0, j, last] = 0.0
+    blocks[i, last, j, tangents] = -1.0
+    blocks[i, tangents, j, last] = 1.0
+    return A
+
+
+def dense(rule: str, scale: Scale, number: int, zeros: float = 0.0) -> Problem:
+    """Return a dense positive semi-definite problem: eigenvalues 1/n, 2/n, ... 1, the smallest share `zeros` of them set to 0."""
+    n, rng = scale.dense, np.random.default_rng([SEED + 2, number, int(1000 * zeros)])
+    eigenvalues = np.arange(1, n + 1) / n
+    eigenvalues[: int(n * zeros)] = 0
+    return RULES[rule](spectrum_matrix(eigenvalues, rng), rng, f"{rule} {number}")
+
+
+def kinds(scale: Scale) -> dict[str, Callable[[int], Problem]]:
+    """Return what makes the fluid and the contact problems, by kind, each a function of the problem's number."""
+    n = scale.side**3
+
+    def fluid(rule: str) -> Callable[[int], Problem]:
+        def make(k: int) -> Problem:
+            rng = np.random.default_rng([SEED, k])
+            return RULES[rule](banded_matrix(n, 3, rng), rng, f"fluid {rule} {k}")
+
+        return make
+
+    def contacts(rule: str) -> Callable[[int], Problem]:
+        def make(k: int) -> Problem:
+            rng = np.random.default_rng([SEED + 1, k])
+            return RULES[rule](contact_matrix(scale.contacts, rng), rng, f"contact {rule} {k}")
+
+        return make
+
+    def seven_point(k: int) -> Problem:
+        return poisson((scale.side,) * 3, plant=Plant(active=ZEROS), seed=SEED + k, device="cpu", dtype=wp.float64).sparse()
+
+    return {
+        "fluid, recipe": fluid("recipe"),
+        "fluid, recipe's matrix, planted": fluid("planted"),
+        "fluid, 7-point, planted": seven_point,
+        "contact, recipe": contacts("recipe"),
+        "contact, recipe's matrix, planted": contacts("planted"),
+        "contact, rigid bodies": lambda k: contact(scale.contacts, seed=SEED + k),
+    }
