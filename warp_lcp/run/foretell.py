@@ -131,7 +131,7 @@ def _grown(part: Part, factor: float) -> Part:
 
 
 def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
-    """Yield settings that look like mistakes, a line each, besides those of `Scene.notes`: of frames, their format, and of what solids fill."""
+    """Yield settings that look like mistakes, a line each, besides those of `Scene.notes`: of frames and of what solids fill."""
     yield from check_output(scene)
     frames, rate = scene.time.frame_count, scene.time.frames_per_second
     if frames > MANY_FRAMES:
