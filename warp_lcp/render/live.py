@@ -209,6 +209,7 @@ class LiveServer(ThreadingHTTPServer):
     """Serves the page of a run on the loopback address, by few threads and descriptors whatever comes: the run needs its own."""
 
     daemon_threads = True
+    request_queue_size = 64  # wait in the system: a busy run takes them late
 
     def __init__(self, live: Live, port: int) -> None:
         self.live = live
