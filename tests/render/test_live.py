@@ -1,10 +1,15 @@
 """The page of a run, asked as a browser asks for it."""
 
+import errno
 import json
+import socket
 import subprocess
+import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from http.client import HTTPConnection
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 
@@ -16,7 +21,9 @@ from small_runs import MINIMAL, ball, write_run
 from warp_lcp.cli import commands as cli
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.frames.vtu import read_vtu
-from warp_lcp.render.live import LOOPBACK, LiveServer, live_server
+from warp_lcp.render import live
+from warp_lcp.render.live import LOOPBACK, MOST_ANSWERED, MOST_CONNECTIONS, Answers, LiveServer, live_server
+from warp_lcp.render.recording import RenderError
 from warp_lcp.simulation import Points
 
 SOLID = "[[solid]]\nshape = 'sphere'\ncenter = [0.5, 0.5]\nradius = 0.2\n"
@@ -123,7 +130,7 @@ def test_nothing_else_is_told_and_to_nobody_else(dots, tmp_path):
             "/log?from=x",
             "/frame?number=²",
         ):
-            assert ask(server, path.replace("²", "%C2%B2"))[0] == 404, path
+            assert ask(server, path.replace("²", "%C2%B2"))[0] in (400, 404), path
         status, page = ask(server, "/")
         assert status == 200
         assert b"http://" not in page.replace(b"http://www.w3.org", b""), "the page loads nothing from elsewhere"
@@ -156,3 +163,91 @@ def test_a_run_is_served_and_shown_from_its_beginning(dots, tmp_path, monkeypatc
     refused = CliRunner().invoke(cli.app, ["run", str(scene), "--out", str(tmp_path / "other"), "--view", "--device", "cpu"])
     assert refused.exit_code == cli.WRONG_INPUT
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost:evil", "localhost:", "evil:80", "localhost.evil:80", "evil", "", "localhost:1@evil", "127.0.0.1.evil:80"]
+)
+def test_other_names_of_this_machine_are_refused(dots, tmp_path, host):
+    with serving(write_run(tmp_path / "run", [])) as server:
+        with socket.create_connection((LOOPBACK, server.server_port), timeout=30) as connection:
+            connection.sendall(f"GET / HTTP/1.0\r\nHost: {host}\r\n\r\n".encode())
+            assert b" 403 " in connection.recv(4096)
+        assert ask(server, "/", "localhost:9000")[0] == 200  # a port that is forwarded here
+
+
+@pytest.mark.parametrize(
+    ("begin", "status"), [("0", 200), ("5", 200), ("99999999999999", 200), ("999999999999999", 200), ("9999999999999999", 400), ("-1", 400),
+                          ("x", 400), ("", 400), ("1.5", 400), ("%E2%85%A7", 400), ("0x10", 400)]
+)  # fmt: skip
+def test_the_log_from_any_byte(dots, tmp_path, begin, status):
+    folder = write_run(tmp_path / "run", [])
+    (folder / "log.csv").write_text("step,time\n1,0.5\n2,")
+    with serving(folder) as server:
+        answer = ask(server, f"/log?from={begin}")
+    assert answer[0] == status
+    if status == 200:
+        assert answer[1] == b"step,time\n1,0.5\n"[int(begin) :]
+    else:
+        assert answer[1] == b"from must be a whole number of at most 15 digits"
+
+
+def test_a_log_that_leads_elsewhere_is_not_shown(dots, tmp_path):
+    (tmp_path / "secret").write_text("precious\n")
+    folder = write_run(tmp_path / "run", [])
+    (folder / "log.csv").symlink_to(tmp_path / "secret")
+    with serving(folder) as server:
+        status, body = ask(server, "/log?from=0")
+    assert status == 500
+    assert b"is a link" in body
+
+
+def test_idle_connections_take_few_threads_and_descriptors(dots, tmp_path):
+    """And the page is there all the same, for whoever asks."""
+    with serving(write_run(tmp_path / "run", [])) as server, ExitStack() as stack:
+        before = threading.active_count()
+        idle = []
+        for _ in range(250):
+            idle.append(stack.enter_context(socket.create_connection((LOOPBACK, server.server_port), timeout=30)))
+            assert threading.active_count() - before <= MOST_ANSWERED
+        assert ask(server, "/run")[0] == 200
+        for connection in idle[:-MOST_CONNECTIONS]:
+            assert connection.recv(1) == b""  # closed by the server
+        assert ask(server, "/")[0] == 200
+        while threading.active_count() - before > MOST_CONNECTIONS + 2:
+            time.sleep(0.01)
+        assert len(server._open) <= MOST_CONNECTIONS
+
+
+def test_an_idle_connection_ends(dots, tmp_path, monkeypatch):
+    monkeypatch.setattr(Answers, "timeout", 0.1)
+    with serving(write_run(tmp_path / "run", [])) as server:
+        with socket.create_connection((LOOPBACK, server.server_port), timeout=30) as connection:
+            connection.sendall(b"GET / HTTP/1.0\r\nHost: loc")
+            assert connection.recv(1) == b""
+        assert ask(server, "/")[0] == 200
+
+
+def test_without_descriptors_the_page_waits(dots, tmp_path, monkeypatch):
+    left, take = [3], ThreadingHTTPServer.get_request
+
+    def get_request(self):
+        left[0] -= 1
+        if left[0] >= 0:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return take(self)
+
+    monkeypatch.setattr(live, "SHORTAGE", 0.01)
+    monkeypatch.setattr(ThreadingHTTPServer, "get_request", get_request)
+    with serving(write_run(tmp_path / "run", [])) as server:
+        assert ask(server, "/")[0] == 200
+    assert left[0] < 0
+
+
+def test_a_run_goes_on_without_a_page(tmp_path, monkeypatch):
+    def refuse(folder, *, port=0, show=None):
+        raise RenderError("--port 0: cannot be served on: Too many open files; 0 takes a free one")
+
+    monkeypatch.setattr(live, "live_server", refuse)
+    with live.served(tmp_path) as address:
+        assert address.startswith("none (--port 0: cannot be served on: Too many open files")

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import socket
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from http import HTTPStatus
@@ -18,18 +22,29 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import warp as wp
 
+from warp_lcp.files.atomic import open_in_place
 from warp_lcp.grid.motion import Pose
 from warp_lcp.render.recording import PALETTES, Recording, RenderError, Show
 from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.run.folder import read_record
 from warp_lcp.scene.camera import viewpoint
+from warp_lcp.simulation import InputError
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765  # unless told
-HOSTS = {LOOPBACK, "localhost"}  # that a browser may have asked for: a name of somebody else's that leads here may not read the run
+HOST = re.compile(r"(?:127\.0\.0\.1|localhost)(?::\d{1,5})?")  # that a browser may have asked for, at a port that may be forwarded here:
+# a name of somebody else's that leads here may not read the run
+PATIENCE = 10.0  # seconds without a byte after which a connection is closed
+MOST_CONNECTIONS = 16  # of which the oldest gives way to a new one, and
+MOST_ANSWERED = 64  # requests at a time, those of connections that are gone included; more are turned away
+SHORTAGE = 0.2  # seconds
 MOST_POINTS = 300_000  # of a frame's particles; of more every second, third ... goes to the page
 SOLID_POINTS = {2: 512, 3: 96}  # along the longest side of the lattice whose points near a solid's surface are drawn
 SAFE = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:"
+
+
+class QueryError(ValueError):
+    """A number that a request needs is none."""
 
 
 @dataclass
@@ -61,7 +76,7 @@ class Live:
         with self._lock:
             try:
                 numbers = self._recording.look_again()
-            except RenderError as error:
+            except InputError as error:
                 return state | {"waits": str(error)}
         scene = self._recording.scene
         view = viewpoint(scene, 1.0)
@@ -94,12 +109,16 @@ class Live:
         return head + b"".join(array.tobytes() for array in flat.values())
 
     def log(self, begin: int) -> bytes:
-        """Return what the log holds from a byte on, whole lines."""
+        """Return what the log holds from a byte on, whole lines; nothing beyond its end.
+
+        Raises:
+            OSError: it cannot be read, or is a link to another file.
+        """
         file = self.folder / "log.csv"
         if not file.is_file():
             return b""
-        with open(file, "rb") as opened:
-            opened.seek(begin)
+        with open(open_in_place(file, os.O_RDONLY), "rb") as opened:
+            opened.seek(min(begin, os.fstat(opened.fileno()).st_size))
             rows = opened.read()
         return rows[: rows.rfind(b"\n") + 1]
 
@@ -132,25 +151,46 @@ class Answers(BaseHTTPRequestHandler):
     """Answers a page: itself, `/run`, `/frame?number=N` and `/log?from=BYTE`; nothing else of the machine can be asked for."""
 
     server: LiveServer
+    timeout = PATIENCE
 
     def do_GET(self) -> None:
         """Answer a request."""
-        asked = urlsplit(self.path)
-        if self.headers.get("Host", "").rpartition(":")[0] not in HOSTS:
+        hosts = self.headers.get_all("Host", [])
+        if len(hosts) != 1 or not HOST.fullmatch(hosts[0]):
             return self._tell(HTTPStatus.FORBIDDEN, b"this page is for this machine alone")
-        live, words = self.server.live, parse_qs(asked.query)
         try:
-            if asked.path == "/":
-                return self._tell(HTTPStatus.OK, self.server.page, "text/html; charset=utf-8")
-            if asked.path == "/run":
-                return self._tell(HTTPStatus.OK, json.dumps(live.state()).encode(), "application/json")
-            if asked.path == "/frame":
-                return self._tell(HTTPStatus.OK, live.frame(_number(words, "number")), "application/octet-stream")
-            if asked.path == "/log":
-                return self._tell(HTTPStatus.OK, live.log(_number(words, "from")), "text/csv; charset=utf-8")
-        except RenderError as error:
+            answer, kind = self._answer()
+        except QueryError as error:
+            return self._tell(HTTPStatus.BAD_REQUEST, str(error).encode())
+        except InputError as error:
             return self._tell(HTTPStatus.NOT_FOUND, str(error).encode())
-        return self._tell(HTTPStatus.NOT_FOUND, b"no such page")
+        except OSError as error:
+            return self._tell(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).encode())
+        return self._tell(HTTPStatus.OK, answer, kind)
+
+    def _answer(self) -> tuple[bytes, str]:
+        """Return what is asked for, and its kind.
+
+        Raises:
+            QueryError: a number is none.
+            InputError: there is no such thing.
+            OSError: a file cannot be read.
+        """
+        try:
+            asked = urlsplit(self.path)
+            words = parse_qs(asked.query)
+        except ValueError as error:
+            raise QueryError(f"no address: {error}") from error
+        live = self.server.live
+        if asked.path == "/":
+            return self.server.page, "text/html; charset=utf-8"
+        if asked.path == "/run":
+            return json.dumps(live.state()).encode(), "application/json"
+        if asked.path == "/frame":
+            return live.frame(_number(words, "number")), "application/octet-stream"
+        if asked.path == "/log":
+            return live.log(_number(words, "from")), "text/csv; charset=utf-8"
+        raise RenderError("no such page")
 
     def _tell(self, status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> None:
         self.send_response(status)
@@ -167,12 +207,16 @@ class Answers(BaseHTTPRequestHandler):
 
 
 class LiveServer(ThreadingHTTPServer):
-    """Serves the page of a run on the loopback address."""
+    """Serves the page of a run on the loopback address, by few threads and descriptors whatever comes: the run needs its own."""
 
     daemon_threads = True
+    request_queue_size = 64  # wait in the system: a busy run takes them late
 
     def __init__(self, live: Live, port: int) -> None:
         self.live = live
+        self._open: dict[socket.socket, None] = {}  # connections, the oldest first
+        self._answered = 0  # requests that a thread is at
+        self._counting = Lock()
         self.page = files("warp_lcp.render").joinpath("live.html").read_bytes()
         super().__init__((LOOPBACK, port), Answers)
 
@@ -180,6 +224,36 @@ class LiveServer(ThreadingHTTPServer):
     def address(self) -> str:
         """Return what to open in a browser."""
         return f"http://{LOOPBACK}:{self.server_port}/"
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        """Take a connection; without a descriptor for it, wait a little, as the loop around this would try again at once."""
+        try:
+            return super().get_request()
+        except OSError:
+            time.sleep(SHORTAGE)
+            raise
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer on a thread; the oldest connection is closed if there are too many."""
+        with self._counting:
+            full = self._answered >= MOST_ANSWERED
+            self._answered += 1
+            while len(self._open) >= MOST_CONNECTIONS:
+                oldest = next(iter(self._open))
+                del self._open[oldest]
+                with suppress(OSError):
+                    oldest.shutdown(socket.SHUT_RDWR)  # its thread sees the end and closes it
+            self._open[request] = None
+        if full:
+            return self.shutdown_request(request)
+        return super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection that was answered, or is not."""
+        with self._counting:
+            self._open.pop(request, None)
+            self._answered -= 1
+        super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a browser that has gone away."""
@@ -199,11 +273,15 @@ def live_server(folder: Path, *, port: int = PORT, show: Show | None = None) -> 
 
 @contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """Serve a run's page beside it, on the usual port if that is free; what the block gets is the address."""
+    """Serve a run's page beside it, on the usual port if that is free; the block gets the address, or why there is none."""
     try:
         server = live_server(folder)
     except RenderError:
-        server = live_server(folder, port=0)
+        try:
+            server = live_server(folder, port=0)
+        except RenderError as error:
+            yield f"none ({error})"
+            return
     with server:
         Thread(target=server.serve_forever, daemon=True).start()
         yield server.address
@@ -213,5 +291,5 @@ def served(folder: Path) -> Iterator[str]:
 def _number(query: dict[str, list[str]], name: str) -> int:
     text = query.get(name, [""])[0]
     if not (text.isascii() and text.isdigit() and len(text) < 16):
-        raise RenderError(f"{name} must be a number")
+        raise QueryError(f"{name} must be a whole number of at most 15 digits")
     return int(text)
