@@ -136,6 +136,43 @@ def test_the_log_says_how_well_contacts_are_solved(simulator: str) -> None:
     assert all(0.0 < row["contact_residual"] <= 1e-5 for row in rows)
 
 
+@pytest.mark.parametrize("simulator", ["fluids", "granular"])
+def test_a_body_leaves_by_an_open_side(simulator: str, tmp_path: Path) -> None:
+    """It slides out over the floor, whose plane does not end outside; the other stays, and a run goes on from any state bit for bit."""
+    solids = [{**BLOCK, "translate": [0.2, -0.6], "velocity": [3.0, 0.0], "friction": 0.0}, {**BLOCK, "translate": [0.0, 0.1]}]
+    domain = {"size": [1.0, 1.0], "resolution": 16, "open": ["right"]}
+    through, later = (make(*solids, simulator=simulator, domain=domain) for _ in range(2))
+    rows = [through.step(0.01) for _ in range(8)]
+    assert {row["bodies_gone"] for row in rows[:6]} == {0}
+    rows += [through.step(0.01) for _ in range(6)]
+    assert rows[-1]["bodies_gone"] == 1
+    assert tuple(rows[-1]) == through.columns()
+    gone = through.bodies.bodies[0]
+    assert gone.position[0] > 1.2
+    assert not gone.velocity.any()
+    assert rows[-1]["body1_vy"] == pytest.approx(-GRAVITY * (through.time - 0.005))
+    bodies = next(part for part in through.frame() if part.name == "bodies")
+    assert set(bodies.fields["body"]) == {1}
+    assert bodies.corners.shape == (4, 2)
+    assert bodies.corners.max() < len(bodies.points)
+    later.restore({name: array.copy() for name, array in through.state().items()})
+    for _ in range(3):
+        assert through.step(0.01) == later.step(0.01)
+
+
+def test_frames_without_a_body_left_are_written(tmp_path: Path) -> None:
+    domain = {"size": [1.0, 1.0], "resolution": 16, "open": ["top"]}
+    simulation = make({**BLOCK, "velocity": [0.0, 20.0]}, domain=domain)
+    while simulation.time < 0.04:
+        row = simulation.step(0.005)
+    assert row["bodies_gone"] == 1
+    part = next(part for part in simulation.frame() if part.name == "bodies")
+    assert isinstance(part, Surface)
+    assert len(part.points) == 0
+    write_vtu(tmp_path / "bodies.vtu", part)
+    simulation.step(simulation.stable_dt())
+
+
 def test_frames_show_the_outlines(tmp_path: Path) -> None:
     simulation = make(BLOCK, {"shape": "sphere", "center": [0.2, 0.6], "radius": 0.1, "mass": 1.0, "velocity": [0.3, 0.0]})
     simulation.step(0.01)

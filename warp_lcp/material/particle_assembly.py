@@ -73,7 +73,9 @@ def make_bodies(scene: ParticleScene, placed: Sequence[PlacedSolid], make: Calla
         if not ((body.position >= 0.0) & (body.position <= np.array(_vector(scene.domain.size)))).all():
             raise ValueError(f"{body.name} has its center of mass at {body.position.round(6).tolist()} m, outside the domain")
     shapes = [placed[number - 1].geometry for number in motions]
-    return make(bodies, shapes, list(motions), (walls, *others), scene.dimension)
+    made = make(bodies, shapes, list(motions), (walls, *others), scene.dimension)
+    made.exits = (scene.domain.size, side_bits(scene.domain.open))
+    return made
 
 
 def make_boundary(

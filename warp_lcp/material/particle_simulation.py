@@ -371,6 +371,7 @@ class ParticleSimulation(ParticleCheckpoints):
             self.bodies.end_step(dt)
             if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
                 raise SimulationFailed(f"step {self.step_count}: {trouble}")
+            self.bodies.leave()
         self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
         self.spray.fly(self.gravity * self.kick_dt, dt)
         if self.flights is not None:

@@ -16,6 +16,7 @@ from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.outline import BodySurface, body_surface
 
 STATE = 20  # numbers of a body's state
+OUTSIDE = 3.0  # times a body's reach: where its center lies when it has left
 IN_PLANE = ("x", "y", "vx", "vy", "angle", "spin")
 IN_SPACE = ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")
 
@@ -60,6 +61,8 @@ class RigidBodies:
         time: of the state [s].
         contacts: points where bodies touched in the last step.
         contact_residual: of the last problem of contacts, relative to that of no impulses.
+        exits: sides of the domain that bodies leave by: its size [m], and bits of `warp_lcp.grid.sides.side_bits`. A body whose center of
+            mass has crossed one is out of the simulation for good: at rest outside, touched by nothing, in no frame.
 
     Raises:
         ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
@@ -82,6 +85,7 @@ class RigidBodies:
         self._surfaces: list[BodySurface] | None = None
         self._begun: _Begun | None = None
         self.contacts, self.contact_residual = 0, 0.0
+        self.exits: tuple[Sequence[float], int] = ((), 0)
         self._solve.check_start(self.time)
 
     @property
@@ -105,12 +109,13 @@ class RigidBodies:
         gravity = np.asarray(gravity, dtype=np.float64)
         for body in self.bodies:
             body.time = time
-        states = self._states()
-        contacts = self._solve.find(time, dt, gravity)
+        states, gone = self._states(), self.gone()
+        contacts = self._solve.find(time, dt, gravity, gone)
         approach = self._solve.approach(contacts)
-        for body in self.bodies:
+        for number, body in enumerate(self.bodies):
             body.release()
-            body.accelerate(gravity, kick_dt)
+            if not gone[number]:
+                body.accelerate(gravity, kick_dt)
         before = self._solve.bounce(contacts, approach, dt, kick_dt, gravity)
         free = self._momenta()
         impulses = self._solve.push_apart(contacts)
@@ -159,6 +164,27 @@ class RigidBodies:
                     body.shift(way[number])
         self._begun = None
 
+    def gone(self) -> np.ndarray:
+        """Return which bodies have left the domain, shape (n,)."""
+        size, sides = self.exits
+        beyond = np.zeros(len(self.bodies), dtype=bool)
+        for axis, length in enumerate(size):
+            at = np.array([body.position[axis] for body in self.bodies])
+            beyond |= bool(sides >> 2 * axis & 1) & (at < 0.0) | bool(sides >> 2 * axis + 1 & 1) & (at > length)
+        return beyond
+
+    def leave(self) -> None:
+        """Put bodies that have crossed an open side out of the way, at rest."""
+        size, sides = self.exits
+        for number in np.flatnonzero(self.gone()):
+            body, way = self.bodies[number], OUTSIDE * self.shapes[number].reach(self.bodies[number].properties.center)
+            body.momentum, body.angular_momentum = np.zeros(3), np.zeros(3)
+            for axis, length in enumerate(size):
+                if sides >> 2 * axis & 1 and body.position[axis] < 0.0:
+                    body.position[axis] = -way
+                if sides >> 2 * axis + 1 & 1 and body.position[axis] > length:
+                    body.position[axis] = length + way
+
     def restore_step(self) -> None:
         """Undo `begin_step`, if a step has begun."""
         if self._begun is not None:
@@ -189,7 +215,9 @@ class RigidBodies:
             span: what is looked ahead [s].
             gravity: its size [m/s^2].
         """
-        return max(body_speed(body, shape) for body, shape in zip(self.bodies, self.shapes, strict=True)) + span * gravity
+        gone = self.gone()
+        speeds = [body_speed(body, shape) for body, shape, out in zip(self.bodies, self.shapes, gone, strict=True) if not out]
+        return max(speeds) + span * gravity if speeds else 0.0
 
     def kinetic_energy(self) -> float:
         """Return the energy of motion and spin [J; J/m in 2-D]."""
@@ -225,10 +253,16 @@ class RigidBodies:
 
         x, y, z: the center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, how far it has turned [degrees] and how fast
         it turns [degrees/s]; 3-D: wx, wy, wz, the angular velocity [degrees/s]. contacts: points where bodies touch or nearly do;
-        contact_residual: how well the problem of their impulses was solved, relative to that of no impulses.
+        contact_residual: how well the problem of their impulses was solved, relative to that of no impulses. With open sides:
+        bodies_gone, how many bodies have left by them.
         """
         names = IN_PLANE if self.dimension == 2 else IN_SPACE
-        return (*(f"body{number}_{name}" for number in range(len(self.bodies)) for name in names), "contacts", "contact_residual")
+        return (
+            *(f"body{number}_{name}" for number in range(len(self.bodies)) for name in names),
+            "contacts",
+            "contact_residual",
+            *(("bodies_gone",) if self.exits[1] else ()),
+        )
 
     def row(self) -> dict[str, float | int]:
         """Return the entries of the columns."""
@@ -240,18 +274,21 @@ class RigidBodies:
             else:
                 values += [*body.position, *body.velocity, *spin]
         numbers = [float(value) for value in values]
-        return dict(zip(self.columns(), [*numbers, self.contacts, float(self.contact_residual)], strict=True))
+        gone = [int(self.gone().sum())] if self.exits[1] else []
+        return dict(zip(self.columns(), [*numbers, self.contacts, float(self.contact_residual), *gone], strict=True))
 
     def surfaces(self) -> BodySurface:
         """Return the surfaces of all bodies as they are, for a frame; fields: `body`, counted from 0, and `velocity` [m/s]."""
         if self._surfaces is None:
             self._surfaces = [body_surface(geometry, self.dimension) for geometry in self._geometries]
-        placed = []
+        placed, gone = [], self.gone()
         for number, (body, motion, surface) in enumerate(zip(self.bodies, self.motions, self._surfaces, strict=True)):
             points = motion.pose(body.time).apply(surface.points)
             velocity = body.velocity + np.cross(body.angular_velocity, points - body.position)
             fields = {"body": np.full(len(points), number, dtype=np.int32), "velocity": velocity.astype(np.float32)}
-            placed.append(BodySurface(points.astype(np.float32), surface.corners, fields))
+            shown = surface.corners[:0] if gone[number] else surface.corners
+            kept = slice(0, 0 if gone[number] else None)
+            placed.append(BodySurface(points[kept].astype(np.float32), shown, {name: values[kept] for name, values in fields.items()}))
         return BodySurface.joined(placed)
 
     def _states(self) -> np.ndarray:

@@ -68,13 +68,14 @@ class ContactSolve:
                 raise ValueError(f"{name} reaches {deep:.3g} m into {found.obstacle.name} at the start: they must lie apart")
             raise ValueError(f"{name} overlaps {self.bodies[found.second].name} by {deep:.3g} m at the start: bodies must lie apart")
 
-    def find(self, time: float, dt: float, gravity: np.ndarray) -> Contacts:
+    def find(self, time: float, dt: float, gravity: np.ndarray, gone: np.ndarray | None = None) -> Contacts:
         """Return where bodies touch now or may in the step.
 
         Args:
             time: of the state [s].
             dt: time step [s].
             gravity: [m/s^2], shape (3,); the bodies' velocities are those before it acts.
+            gone: bodies that touch nothing, shape (n,); None: there are none.
         """
         falls = float(np.linalg.norm(gravity)) * dt
         six = self._six()
@@ -83,6 +84,9 @@ class ContactSolve:
         brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
         near = NEAR * float(self._size.min())
         found = self.detection.find(time, ways, near + np.array(brought), near)
+        if gone is not None and gone.any():
+            out = np.append(gone, False)
+            found = [pair for pair in found if not (out[pair.first] or out[pair.second])]
         return self.assembled(found, time, dt, gravity)
 
     def approach(self, contacts: Contacts) -> np.ndarray:
