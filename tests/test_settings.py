@@ -133,7 +133,9 @@ def test_messages_name_setting_value_and_range(make, message):
 def test_the_limits_themselves():
     """By hand: a range whose end is turned around refuses what users take."""
     taken = wl.StoppingCriteria(rtol=0, max_iterations=1e4, max_seconds=math.inf, divergence=math.inf, patience=np.int32(1))
-    assert repr(taken) == ("StoppingCriteria(rtol=0.0, atol=0.0, max_iterations=10000, patience=1, divergence=inf, max_seconds=inf)")
+    assert repr(taken) == (
+        "StoppingCriteria(rtol=0.0, atol=0.0, max_iterations=10000, patience=1, divergence=inf, max_seconds=inf, merits=False)"
+    )
     assert wl.CycleSettings(gamma=1, semi=1.0, one_launch_cuda=0).gamma == 1
     assert wl.FischerNewton(share=1.0, warm_start=0, monotone_cycles=0).share == 1.0
     assert wl.BlockedGaussSeidel(blocks=[[0, 1], [2]]).blocks == [[0, 1], [2]]
