@@ -110,7 +110,8 @@ def _panels(canvas: Any, chart: Panels) -> None:
         axes.yaxis.label.set_size(7)
         shown |= {line.get_label(): line for line in axes.lines}
     if any(names):
-        canvas.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=len(names) if len(names) < 6 else 4, fontsize=7)
+        beside = int(PANEL[0] * chart.columns / (0.055 * max(map(len, names)) + 0.55))  # names of this many letters of 7 points, and lines
+        canvas.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=max(1, min(beside, len(names))), fontsize=7)
 
 
 def _lines(axes: Axes, chart: Lines, names: Sequence[str] = ()) -> None:
