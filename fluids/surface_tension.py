@@ -167,6 +167,8 @@ class SurfaceTension:
     def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
         """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
         self._continue(source, before, self._cosine)
+        if before == 0 and self._cosine != 0.0:  # `begin_kernel` looks farther than others' cells are known
+            self._join(source)
         for done in range(1, passes + 1):
             out = free[done % 2]
             window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
