@@ -167,6 +167,8 @@ class SurfaceTension:
     def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
         """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
         self._continue(source, before, self._cosine)
+        if before == 0 and self._cosine != 0.0:  # `begin_kernel` looks farther than others' cells are known
+            self._join(source)
         for done in range(1, passes + 1):
             out = free[done % 2]
             window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
@@ -181,9 +183,11 @@ class SurfaceTension:
 
     def _continue(self, field: wp.array, passes: int, cosine: float) -> None:
         """Continue a share into walls, after so many passes; with a cosine of 0 whatever a field has."""
-        spread = math.sqrt(0.25 + 0.5 * passes)
-        inputs = [*self._walls, self._lean.flatten(), cosine, spread, self.grid.planes, self._blocked, field, field.flatten()]
-        launch_list(kernels.continue_kernel, len(self._walls[0]), inputs, device=self.grid.device)
+        walls, fields = [*self._walls, self._lean.flatten(), cosine], [self.grid.planes, self._blocked, field, field.flatten()]
+        kernel, spread = kernels.continue_kernel, [math.sqrt(0.25 + 0.5 * passes)]
+        if passes == 0 and cosine != 0.0:  # a cell's kernel has no tails
+            kernel, spread = kernels.begin_kernel, []
+        launch_list(kernel, len(self._walls[0]), [*walls, *spread, *fields], device=self.grid.device)
 
     def _find_walls(self) -> None:
         """Find the cells of walls that passes read, and where what they get comes from."""

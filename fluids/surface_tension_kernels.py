@@ -17,7 +17,8 @@ from warp_lcp.rows import RowPass
 HEADERS = Path(__file__).parent / "headers"
 MODULE = "fluids.surface_tension"
 FLOATS = wp.array(dtype=wp.float32)
-TAIL = wp.constant(1e-4)  # shares nearer to 0 or 1 have no place on the profile
+TAIL = wp.constant(1e-6)  # shares nearer to 0 or 1 have no place on the profile
+FARAWAY = wp.constant(4.0)  # cells; no kernel within reach of a wall's cell is cut by a surface that is farther from it
 FURTHER, MOST = wp.constant(2.0), wp.constant(3.0)  # cells, from beside a wall and along it, to where the surface's curvature is asked for
 NEAR = wp.constant(2.0)  # cells from the surface, beyond which parallel surfaces meet a wall as they do there
 BAND = 0.02  # cells whose share is nearer to 0 or 1 are too far from the surface to matter
@@ -173,6 +174,76 @@ def lean_kernel(
         kappa = part * total / weight
         fall = cosine * (1.0 - kappa * wp.clamp(d - 0.5 * way[i] * cosine, -NEAR, NEAR))
     lean[cells[i]] = fall
+
+
+@wp.func
+def distance_for(share: float):
+    """Return the distance [cells] at which `filled` gives this share of a cell's kernel, by bisection."""
+    low = float(-1.5)
+    high = float(1.5)
+    for _step in range(16):
+        d = 0.5 * (low + high)
+        if filled(-d) > share:
+            low = d
+        else:
+            high = d
+    return 0.5 * (low + high)
+
+
+@list_kernel(MODULE)
+def begin_kernel(
+    i, cells: INTS, points: POINTS, way: FLOATS, lean: FLOATS, cosine: float, planes: int, blocked: MARKS, share: FIELD, flat: FLOATS
+):  # fmt: skip
+    """Continue the share of cells' kernels into a wall's cell, as `continue_kernel` does with smoothed shares.
+
+    A kernel is 3 cells wide. Before a wetted wall it may hold no liquid where that of the wall's cell, which the surface reaches first,
+    does. There the distance to the surface follows from cells around: it grows by the angle's cosine away from the wall and by its sine
+    along it. The same holds for air at a wall that liquid does not wet.
+    """
+    p = points[i]
+    low = share.shape[1] * share.shape[2]
+    k = cells[i] // low
+    j = (cells[i] - k * low) // share.shape[2]
+    away = p - wp.vec3(float(cells[i] - k * low - j * share.shape[2]), float(j), float(k))
+    away = away / wp.max(wp.length(away), 1e-6)
+    a = int(wp.floor(p[0]))
+    b = int(wp.floor(p[1]))
+    c = int(wp.floor(p[2]))
+    total = float(0.0)
+    weight = float(0.0)
+    for dk in range(planes):
+        for dj in range(2):
+            for di in range(2):
+                w = wp.where(di == 0, 1.0 - (p[0] - float(a)), p[0] - float(a))
+                w *= wp.where(dj == 0, 1.0 - (p[1] - float(b)), p[1] - float(b))
+                if planes == 2:
+                    w *= wp.where(dk == 0, 1.0 - (p[2] - float(c)), p[2] - float(c))
+                if w > 1e-3:
+                    if blocked[c + dk, b + dj, a + di] == wp.int8(0):
+                        total += w * share[c + dk, b + dj, a + di]
+                        weight += w
+    if weight > 0.0:
+        value = total / weight
+        fall = way[i] * lean[cells[i]]
+        if value > TAIL and value < 1.0 - TAIL:
+            value = filled(fall - distance_for(value))
+        else:
+            if (value - 0.5) * cosine < 0.0:  # empty before a wall that liquid wets, or full before one that it does not
+                sign = wp.where(cosine > 0.0, 1.0, -1.0)
+                sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
+                least = float(4.0)
+                for z in range(wp.where(planes == 2, wp.max(c - 2, 0), c), wp.where(planes == 2, wp.min(c + 4, share.shape[0]), c + 1)):
+                    for y in range(wp.max(b - 2, 0), wp.min(b + 4, share.shape[1])):
+                        for x in range(wp.max(a - 2, 0), wp.min(a + 4, share.shape[2])):
+                            near = share[z, y, x]
+                            if blocked[z, y, x] == wp.int8(0) and near > TAIL and near < 1.0 - TAIL:
+                                e = p - wp.vec3(float(x), float(y), float(z))
+                                n = wp.dot(e, away)
+                                along = wp.length(e - n * away)
+                                least = wp.min(least, sign * (distance_for(near) + n * cosine) + along * sine)
+                if least < FARAWAY:
+                    value = filled(fall - sign * wp.max(least, 1.5))
+        flat[cells[i]] = value
 
 
 @list_kernel(MODULE)

@@ -193,6 +193,31 @@ def test_a_meniscus_has_the_curvature_of_its_arc(width: int, angle: float) -> No
     assert columns.max() < 1.1
 
 
+@pytest.mark.parametrize("angle", [30.0, 150.0])
+def test_the_widest_filter_bends_no_flat_surface_beside_a_wall(angle: float) -> None:
+    """A kernel may be empty, or full, where that of the wall's cell behind it is not: the surface seemed to turn by 0.028 there."""
+    turns, rng = [], np.random.default_rng(11)
+    cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    simulation = tank(2, 32, angle=angle)
+    tension, at = simulation.tension, samples(simulation, 10)
+    assert tension is not None
+    kick = tension.longest_step()
+    assert tension._passes_for(kick) == MOST_PASSES
+    for _ in range(8):
+        foot = 16.0 + 6.0 * cosine + rng.uniform(-0.5, 0.5)
+        liquid, open_ = at[..., 0] * cosine + (at[..., 1] - foot) * sine < 0.0, ((at > 0.0) & (at < 32.0))[..., :2].all(axis=-1)
+        distance = measured(simulation, liquid, open_, 10)
+        _, kind = take(simulation, distance)
+        tension.act(simulation.velocity, simulation.grid.everywhere, simulation.projection.kind, kick)
+        turn = 0.0
+        for i in range(1, 5):
+            j = np.flatnonzero((kind[1, :-1, i] == wl.FLUID) & (kind[1, 1:, i] == wl.AIR))[-1]
+            below, above = distance[1, j : j + 2, i]
+            turn += np.interp(0.0, [below, above], tension.jump.numpy()[1, j : j + 2, i]) / kick
+        turns.append(turn)
+    assert abs(np.mean(turns)) < 0.015
+
+
 def test_cells_of_walls_mirror_what_is_before_them() -> None:
     simulation = tank(2, 8, solid=[box([4.0, 0.0], [8.0, 2.0])])
     base = simulation.boundary.base.numpy()
@@ -431,12 +456,9 @@ def test_a_meniscus_rises_along_walls_that_let_go(width: float, angle: float) ->
     assert fastest["separating"] < 1.1 * fastest["free-slip"]
 
 
-@pytest.mark.parametrize(("angle", "error"), [(60.0, 0.04), (30.0, 0.09)])
-def test_liquid_rises_between_plates(angle: float, error: float) -> None:
-    """By 2 sigma cos(angle) / (rho g width) over its pressure's level, 12 cells apart and 30, the mean over the width.
-
-    At 30 degrees particles become fewer beside the walls, which takes 5 % of it.
-    """
+@pytest.mark.parametrize("angle", [60.0, 30.0])
+def test_liquid_rises_between_plates(angle: float) -> None:
+    """By 2 sigma cos(angle) / (rho g width) over its pressure's level, 12 cells apart and 30, the mean over the width."""
     plate, bath = box([0.004, 0.002], [0.006, 0.02]), [box([0.0, 0.0], [0.016, 0.006])]
     tables = {"solid": [plate], "viscosity": {"value": 0.05, "slip_length": math.inf}, "particles": {"transfer": "pic"}}
     tension = {"coefficient": SIGMA, "contact_angle": angle}
@@ -449,7 +471,7 @@ def test_liquid_rises_between_plates(angle: float, error: float) -> None:
         levels = [float(((x > low) & (x < high) & (y > 0.002)).sum()) * area / (high - low) for low, high in ((0.0, 0.004), (0.006, 0.016))]
         rises += [levels[0] - levels[1]] if simulation.time > 0.3 else []
     expected = 2.0 * SIGMA * math.cos(math.radians(angle)) / (RHO * 9.81) * (1.0 / 0.004 - 1.0 / 0.01)
-    assert np.mean(rises) == pytest.approx(expected, rel=error)
+    assert np.mean(rises) == pytest.approx(expected, rel=0.03)
 
 
 def test_a_full_box_has_no_surface() -> None:
