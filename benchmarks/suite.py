@@ -109,6 +109,11 @@ THREADS = Suite(
     "kernels, cycles, solves and steps of scenes on 1, 2, 4, ... threads up to all cores, against what memory allows",
     "4 minutes",
 )
+DEVICES = Suite(
+    "devices",
+    "the same solves, contacts, steps and kernels on any machine, CPU or GPU, one file for each; `--compare` puts two side by side",
+    "4 minutes",
+)
 DOMAINS = Suite(
     "domains",
     "the same liquid in domains of 48^3 to 768^3 cells: a step, its memory, a checkpoint; laying grids around a ball that flies",

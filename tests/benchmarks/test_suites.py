@@ -71,6 +71,22 @@ def test_solvers(tmp_path):
     assert "[1.000, 1.000]    within noise" in again.stdout
 
 
+def test_devices(tmp_path):
+    records = measured(tmp_path, "devices", "--size", 16)
+    assert records["16^3: ProjectedMultigrid"]["status"] == "CONVERGED"
+    names = {"16^3: a sweep of PGS", "16^3: product", "a step of dam-break, 16 cells", "a step of column-collapse, 16 cells"}
+    assert names <= records.keys()
+    assert all(records[name]["figures"]["seconds"]["value"] > 0 for name in names)
+
+
+def test_kept_machines_can_be_compared():
+    results = Path(__file__).parents[2] / "benchmarks" / "results"
+    cpu, gpu = (results / name / "devices.json" for name in ("amd-epyc", "nvidia-h200"))
+    compared = call("devices", "--compare", cpu, gpu)
+    assert compared.exit_code == 0, compared.stderr
+    assert "128^3: ProjectedMultigrid" in compared.stdout
+
+
 def test_run(tmp_path):
     records = measured(tmp_path, "run", "--size", 16)
     scene = records["dam-break"]["figures"]

@@ -1,0 +1,128 @@
+"""CPU beside GPU: the same work on each machine, one file of figures for each, which `--compare` puts side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.benchmarks.contacts import next_step, unhindered
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table, shown
+from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns
+from warp_lcp.benchmarks.problems import splash
+from warp_lcp.gallery.contact_models import BoxedModel
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.simulator import simulators
+
+TITLE = "One machine: solvers, contacts, steps, kernels"
+SIZES = (64, 128)
+STOPPING = wl.StoppingCriteria(rtol=1e-6)
+SWEEPS = 20  # of PGS: its time is given for one; to 1e-6 it needs thousands on these grids
+METHODS: dict[str, Callable[[], Any]] = {
+    "ProjectedMultigrid": wl.ProjectedMultigrid,
+    "MinimumMapNewton": wl.MinimumMapNewton,
+    "MPRGP": wl.MPRGP,
+    "FischerNewton": wl.FischerNewton,
+    "InteriorPoint": wl.InteriorPoint,
+}
+CONTACTS, CONTACT_SWEEPS = "wall", 200  # scene of the gallery, and sweeps in a sample
+STEPS = ("dam-break", "column-collapse")  # built-in scenes whose steps are timed: a liquid, sand
+LARGEST_STEP = 128  # cells along the longest side: of sand in 256 a step takes minutes on two cores
+BEFORE, TIMED = 10, 20  # steps until the material moves, and those that are timed
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Measure all kinds of work."""
+    records = [machine(options.device, elements=1 << 24, repeat=options.repeat)]
+    for n in options.sizes or SIZES:
+        options.say(f"{n}^3")
+        records += _solves(n, options)
+        records += _kernels(n, options)
+        records += [_step(name, n, options) for name in STEPS if n <= LARGEST_STEP]
+    options.say("contacts")
+    records.append(_contacts(options))
+    rows = [[r.name, *shown(r, ["seconds"], factor=1e3), *shown(r, ["iterations"], ".0f")] for r in records[1:]]
+    remark = "Least of the samples, warm: kernels loaded, workspaces made. Iterations: to 1e-6 of the residual at the start."
+    chart = Bars(
+        "seconds", "Time of each piece of work", "ms", {r.name: 1e3 * (r.value("seconds") or 0) for r in records[1:]}, logarithmic=True
+    )
+    return Results(records, [Table("Work", ["work", "ms", "iterations"], rows, remark)], [chart])
+
+
+def _solves(n: int, options: Options) -> list[Record]:
+    """Time solves of a splash whose walls let go, and sweeps of PGS."""
+    problem, device = splash(n).problem("walls", options.device), options.device
+    work: dict[str, Callable[[], object]] = {}
+    found: dict[str, wl.SolveResult] = {}
+
+    def solve(name: str, method: Any, workspace: Any, stopping: wl.StoppingCriteria) -> None:
+        found[name] = wl.solve(problem, method, stopping=stopping, workspace=workspace)
+        wp.synchronize_device(device)
+
+    for name, kind in METHODS.items():
+        method = kind()
+        work[name] = partial(solve, name, method, method.init(problem), STOPPING)
+    pgs = wl.ProjectedSOR(omega=1.0)
+    work["PGS"] = partial(solve, "PGS", pgs, pgs.init(problem), unhindered(SWEEPS))
+    records = []
+    for name, taken in in_turns(work, options.repeat).items():
+        if name == "PGS":
+            records.append(Record(f"{n}^3: a sweep of PGS", {"seconds": Figure.least([t / SWEEPS for t in taken], "s")}))
+            continue
+        figures = {"seconds": Figure.least(taken, "s"), "iterations": Figure(found[name].iterations)}
+        records.append(Record(f"{n}^3: {name}", figures, {"status": found[name].status.name}))
+    return records
+
+
+def _kernels(n: int, options: Options) -> list[Record]:
+    """Time the product with the Laplacian of a full box and a multigrid cycle."""
+    box = wl.GridPoisson(np.full((n,) * 3, wl.FLUID, np.int8), device=options.device)
+    x, y = (wp.ones(box.layout.size, dtype=wp.float32, device=options.device) for _ in range(2))
+    problem = splash(n).problem("linear", options.device)
+    kept: Any = wl.ProjectedMultigrid().init(problem)
+    wl.solve(problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept)
+
+    def product() -> None:
+        box.stencil.product(x, y)
+        wp.synchronize_device(options.device)
+
+    def cycle() -> None:
+        kept.hierarchy.cycle.run()
+        wp.synchronize_device(options.device)
+
+    taken = in_turns({"product": product, "multigrid cycle": cycle}, options.repeat)
+    return [Record(f"{n}^3: {name}", {"seconds": Figure.least(times, "s")}) for name, times in taken.items()]
+
+
+def _step(name: str, cells: int, options: Options) -> Record:
+    """Time the steps of a built-in scene."""
+    scene = load_scene(name, [f"domain.resolution={cells}"])
+    simulation = simulators()[scene.scene.simulator].create(scene, device=options.device, folder=Path.cwd())
+    taken = []
+    for step in range(BEFORE + TIMED):
+        begun = time.perf_counter()
+        simulation.step(simulation.stable_dt())
+        wp.synchronize_device(options.device)
+        taken += [time.perf_counter() - begun] if step >= BEFORE else []
+    return Record(f"a step of {name}, {cells} cells", {"seconds": Figure.of(taken, "s")})
+
+
+def _contacts(options: Options) -> Record:
+    """Time sweeps of PGS over the contacts of a wall of boxes."""
+    problem = BoxedModel().problem(next_step(CONTACTS, options.device).system).lcp(device=options.device)
+    method = wl.ProjectedSOR(omega=1.0)
+    kept, sweeps = method.init(problem), unhindered(CONTACT_SWEEPS)
+
+    def sweep() -> None:
+        wl.solve(problem, method, stopping=sweeps, workspace=kept)
+        wp.synchronize_device(options.device)
+
+    taken = in_turns({"sweep": sweep}, options.repeat)["sweep"]
+    return Record(f"contacts of {CONTACTS}: a sweep of PGS", {"seconds": Figure.least([t / CONTACT_SWEEPS for t in taken], "s")})
