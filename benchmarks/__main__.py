@@ -11,7 +11,7 @@ from pathlib import Path
 from warp_lcp.benchmarks.harness.timing import Options
 
 SUITES = (
-    "kernels", "solvers", "scaling", "tank", "threads", "domains", "ranks", "peers", "sparse", "run", "sand", "contacts", "book",
+    "kernels", "solvers", "published", "scaling", "tank", "threads", "domains", "ranks", "peers", "sparse", "run", "sand", "contacts", "book",
     "models", "tradeoff", "validation", "extremes",
 )  # fmt: skip
 

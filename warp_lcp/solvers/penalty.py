@@ -22,11 +22,16 @@ from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.principal_system import ON_FREE, principal_system
 
 HEADERS, f64, u8 = Path(__file__).parent / "headers", wp.float64, wp.uint8
-PENALTY_STEP = RowPass(
-    "penalty.step", HEADERS / "penalty_step.h", f64, bounds=True, reads={"e": "S", "y": f64, "d": "D", "unknown": wp.int8},
-    writes={"x": f64, "side": wp.int8, "shift": f64, "free": u8, "inside": u8},
-    numbers={"size": f64, "rho": f64, "unit": f64, "first": bool}, sums=("moved", "active", "square"),
+MOVE = RowPass(
+    "penalty.move", HEADERS / "penalty_move.h", f64, reads={"e": "S", "unknown": wp.int8, "side": wp.int8}, writes={"x": f64},
+    numbers={"size": f64},
 )  # fmt: skip
+SORT = RowPass(
+    "penalty.sort", HEADERS / "penalty_sort.h", f64, bounds=True, reads={"y": f64, "d": "D", "unknown": wp.int8},
+    writes={"x": f64, "side": wp.int8, "shift": f64, "free": u8, "inside": u8},
+    numbers={"rho": f64, "unit": f64, "first": bool, "keep": bool}, sums=("moved", "active", "square"),
+)  # fmt: skip
+DOMINANT = 4.0  # residual over the springs' error from which on something else is to be mended; |A D^-1| <= 2 on grids
 SHARE = 0.1  # of the tolerance that the penalty's own error may take
 LEAST_RAISE = 10.0  # factor by which rho grows at least
 LARGEST = 1e12  # rho, beyond which float64 does not see the violation of an unknown of its bound's size
@@ -44,8 +49,8 @@ class Penalty(Settings):
     finitely many steps; on other matrices V may cycle, and the solve ends with STAGNATED or MAX_ITERATIONS.
 
     The error: where y > 0, z is below its bound by y / (rho d), and neighbors solve their equations with that z. What is returned is
-    x = clip(z, l, u), whose natural residual is O(1 / rho): about |A D^-1 y_V| / rho. The solve is judged by it. If V stays and that error
-    is more than a tenth of the tolerance, rho grows in proportion, once as a rule, up to 1e12.
+    x = clip(z, l, u), whose natural residual is O(1 / rho): about |A D^-1 y_V| / rho. The solve is judged by it. Where V stays, or that
+    error is most of the residual, and it is more than a tenth of the tolerance, rho grows in proportion, once as a rule, up to 1e12.
 
     `linear_iterations` counts iterations on the finest grid, factorizations where A is dense.
 
@@ -118,7 +123,7 @@ class PenaltyWorkspace(IterateMemory):
         s = self.settings
         self.cycles_left = s.monotone_cycles if self.active_set is not None and self.problem.bounded and not warm else 0
         self.rho, self.steps, self.target = s.rho, 0, tolerance
-        self._excess, self._moved = 0.0, math.inf
+        self._excess, self._moved, self._stale = 0.0, math.inf, True
         self.side.zero_()
         self.system.refresh()
         if self.active_set is not None:
@@ -132,45 +137,50 @@ class PenaltyWorkspace(IterateMemory):
 
     def policy_step(self, x: wp.array[Any]) -> Step:
         """Solve with the springs of the unknowns that are beyond their bounds, and find these anew."""
-        s = self.settings
-        raised = self._raise()
-        if self.steps == 0 or raised:
+        s, p = self.settings, self.problem
+        first = self.steps == 0
+        if first:
             self.residual.affine(x)
-            self._sort(x, 0.0, first=True)
-            self._evaluate(x)
+        if first or self._raise():
+            self._sort(x, first=first, keep=not first)
+            self.residual.affine(x)  # unknowns within y / (rho d) of a bound are on it now
+            self._stale = True
         self.steps += 1
-        settled, size = self._moved == 0, max(self.residual.norm, 1e-300)
-        if not settled or raised or self.steps == 1:
+        if self._stale:
             self.system.restrict(self._free, self._shift)
-        ON_FREE.bind(self._sums.rows, y=self.residual.y, free=self._free, g=self.system.r, scale=1 / size, out=self._sums.partials).launch()
+        settled, size = self._moved == 0, max(self.residual.norm, 1e-300)
+        self._sums.of(ON_FREE, y=self.residual.y, free=self._free, g=self.system.r, scale=1 / size)
         if self.floating is not None:  # what is singular: components without springs
             self.floating.project(self.system.r, self._inside)
         factor = max(s.eta**2 if settled else s.eta, 0.3 * SHARE * self.target / size)
         norm = self.system.norm()
         iterations = self.system.solve(factor * norm, s.max_linear_iterations)[0] if norm > 0 else 0
-        active = self._sort(x, size, first=False)
+        MOVE.bind(self._sums.rows, x=x, e=self.system.e, unknown=p.unknown, side=self.side, size=size).launch()
+        self.residual.affine(x)
+        active = self._sort(x)
         self._finish_move(x)
-        self._evaluate(x)
-        return Step("policy", iterations, active, interim=self._moved > 0 and self.steps <= EARLY)
+        NaturalResidual.evaluate(self.residual, x)  # which writes y; the grid's own evaluation leaves it out
+        self._stale = self._moved > 0
+        return Step("policy", iterations, active, interim=self._stale and self.steps <= EARLY)
 
     def _raise(self) -> bool:
-        """Stiffen the springs where the set has stayed and their error exceeds its share of the tolerance; return whether they are."""
+        """Stiffen the springs where their error is most of the residual and beyond its share of the tolerance; return whether they are."""
         allowed = SHARE * self.target
-        if self._moved > 0 or not self._excess > allowed > 0 or self.rho >= LARGEST:
+        settled = self._moved == 0 or self.residual.norm <= DOMINANT * self._excess
+        if not settled or not self._excess > allowed > 0 or self.rho >= LARGEST:
             return False
         self.rho = min(LARGEST, self.rho * max(LEAST_RAISE, self._excess / allowed))
         return True
 
-    def _sort(self, x: wp.array[Any], size: float, *, first: bool) -> int:
-        """Move x by size e onto its bounds and note which ones it would pass; return how many unknowns do."""
-        p, r = self.problem, self.residual
-        fields = {"x": x, "e": self.system.e, "y": r.y, "d": r.diagonal, "unknown": p.unknown, "side": self.side}
-        fields |= {"shift": self._shift, "free": self._free, "inside": self._inside}
-        numbers = {"size": size, "rho": self.rho, "unit": r.unit, "first": first}
-        moved, active, square = self._sums.of(PENALTY_STEP, bounds=p.bounds.operands, **fields, **numbers)
-        self._moved, self._excess = float(moved), math.sqrt(float(square))
-        return int(active)
+    def _sort(self, x: wp.array[Any], *, first: bool = False, keep: bool = False) -> int:
+        """Find the springs of the next step at z, project it onto the bounds, and return how many springs there are.
 
-    def _evaluate(self, x: wp.array[Any]) -> float:
-        """Return the norm of the natural residual, and write y, which the grid's own evaluation leaves out."""
-        return NaturalResidual.evaluate(self.residual, x)
+        A spring stays if z is still beyond its bound. Its row of the step says z - g = -y / (rho d), so that y has the sign that matters;
+        the solution of the linear solve has not, which knows no sizes below its tolerance.
+        """
+        p, r = self.problem, self.residual
+        fields = {"x": x, "y": r.y, "d": r.diagonal, "unknown": p.unknown, "side": self.side, "shift": self._shift}
+        fields |= {"free": self._free, "inside": self._inside, "rho": self.rho, "unit": r.unit, "first": first, "keep": keep}
+        moved, active, square = self._sums.of(SORT, bounds=p.bounds.operands, **fields)
+        self._moved, self._excess = float(moved), math.sqrt(float(square)) / self.rho
+        return int(active)
