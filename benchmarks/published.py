@@ -65,7 +65,12 @@ class Entry:
 
 ENTRIES = (
     Entry("Chentanez and Mueller 2011", "projected multigrid cycles", wl.ProjectedMultigrid(monotone_cycles=10_000)),
-    Entry("Andersen et al. 2017", "minimum map, CG by products", wl.MinimumMapNewton(safeguard=False, max_linear_iterations=2000), ProductsOnly),
+    Entry(
+        "Andersen et al. 2017",
+        "minimum map, CG by products",
+        wl.MinimumMapNewton(safeguard=False, max_linear_iterations=2000),
+        ProductsOnly,
+    ),
     Entry("Macklin et al. 2019", "Fischer-Burmeister, r = A_ii", wl.FischerNewton(monotone_cycles=0)),
     Entry("Lai et al. 2020", "policy iteration", wl.PrimalDualActiveSet(monotone_cycles=0)),
     Entry("Lai et al. 2020", "penalty", wl.Penalty(monotone_cycles=0)),
@@ -128,5 +133,5 @@ def _table(n: int, bounds: str, records: Sequence[Record]) -> Table:
         counts = shown(r, ["iterations", "linear_iterations", "residual"])
         rows.append([r.facts["source"], r.facts["method"], *counts, *shown(r, ["total"], ".1f", 1e3), spread(r.figures["total"], 1e3)])
         rows[-1] += shown(r, ["over_linear"], ".2f")
-    remark = f"Cold solves to {RTOL:g}, set-up from host arrays included; x linear solve: the default multigrid without bounds, same rounds."
+    remark = f"Cold solves to {RTOL:g}, set-up included; x linear solve: the default multigrid without bounds, same rounds."
     return Table(f"p >= 0 {'at the walls' if bounds == 'walls' else bounds}, {n}^3", columns, rows, remark)

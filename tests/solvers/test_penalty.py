@@ -95,7 +95,9 @@ def test_bounds_that_are_equal_and_infinite_ones(device):
         B = rng.standard_normal((5, 5))
         A = B @ B.T + 5 * np.eye(5)
         b, (lower, upper) = rng.uniform(-9.0, 9.0, 5), boxes(5, rng)
-        result = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper), wl.Penalty(), stopping=wl.StoppingCriteria(rtol=1e-10))
+        result = wl.solve(
+            wl.LCP(wl.DenseOperator(A, device=device), b, lower, upper), wl.Penalty(), stopping=wl.StoppingCriteria(rtol=1e-10)
+        )
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy(), boxed(A, b, lower, upper), atol=1e-8)
 
