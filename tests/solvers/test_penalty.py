@@ -132,7 +132,7 @@ def test_a_soft_start_reaches_tight_tolerances_on_grids(shape, device):
     result = wl.solve(problem, method, stopping=stopping, workspace=work)
     x, fluid = result.x.numpy(), cells == wl.FLUID
     assert result, result.status
-    assert result.iterations <= 20
+    assert result.iterations <= 10  # springs that stiffen tenfold a step take more
     assert 1e6 < work.rho < 1e12
     np.testing.assert_allclose(x[fluid], reference.x.numpy()[fluid], atol=1e-7)
     assert (x >= lower)[fluid].all()
