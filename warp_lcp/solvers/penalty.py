@@ -45,8 +45,9 @@ class Penalty(Settings):
     The equations are A z + b + rho D (min(z - l, 0) + max(z - u, 0)) = 0, D the diagonal of the natural residual's d. With V the unknowns
     beyond a bound, a step is Newton's: (A + rho D_V) z+ = -b + rho D_V g, g the bound that is passed. It depends on V alone, so it starts
     from x = clip(z, l, u), where its right-hand side is -(A x + b): nothing cancels however large rho is. On grids it is solved by
-    conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix each step from the second on lowers z, and V is found after
-    finitely many steps; on other matrices V may cycle, and the solve ends with STAGNATED or MAX_ITERATIONS.
+    conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and bounds on one side the equations are
+    concave or convex: from the second step on z moves off the bounds, V shrinks, and is found after finitely many steps. Elsewhere V may
+    cycle, and the solve ends with STAGNATED or MAX_ITERATIONS.
 
     The error: where y > 0, z is below its bound by y / (rho d), and neighbors solve their equations with that z. What is returned is
     x = clip(z, l, u), whose natural residual is O(1 / rho): about |A D^-1 y_V| / rho. The solve is judged by it. Where V stays, or that
