@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -34,6 +34,7 @@ class Case:
     device: str  # Warp device
     full: bool = True  # whether reuse, warm starts and time to tolerances are measured too
     label: str = ""  # what the method is called; its class's name if empty
+    operator: Callable[..., Any] = wl.GridPoisson  # of cells, a device and coefficients of faces
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
     history: list[wl.Record] = field(default_factory=list)
@@ -58,7 +59,7 @@ class Case:
         """Build operator, problem and workspace from host arrays and solve: a user's first solve. All in one sample."""
         lower = self.scene.lower(self.bounds)
         times = [time.perf_counter()]
-        A = wl.GridPoisson(self.scene.cells, device=self.device, **self.scene.faces)
+        A = self.operator(self.scene.cells, device=self.device, **self.scene.faces)
         times.append(time.perf_counter())
         problem = wl.LCP(A, self.scene.b, lower)
         times.append(time.perf_counter())

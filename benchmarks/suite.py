@@ -94,6 +94,11 @@ SOLVERS = Suite(
     "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy; every method on small problems",
     "7 minutes",
 )
+PUBLISHED = Suite(
+    "published",
+    "methods that were published for the pressure LCP, as published and as here, on the same splash: iterations and seconds",
+    "3 minutes",
+)
 SCALING = Suite(
     "scaling",
     "linear and LCP solves from 32^3 up to what memory holds: seconds to three tolerances, bytes a cell, exponents, floors",

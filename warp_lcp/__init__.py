@@ -42,6 +42,7 @@ from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.nncg import NNCG
+from warp_lcp.solvers.penalty import Penalty
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -104,6 +105,7 @@ __all__ = [
     "MinimumMapNewton",
     "NaturalResidual",
     "Operator",
+    "Penalty",
     "Precision",
     "PrimalDualActiveSet",
     "ProjectedJacobi",

@@ -310,6 +310,15 @@ FORMULAS = [
         ("t[:-1] - np.multiply.outer", "t[:-1] + np.multiply.outer"),
     ),
     *_changes(
+        "solvers/headers/penalty_sort.h",
+        "solvers/test_penalty.py",
+        ("(spring & is) ? within : v", "v"),
+        ("old < 0) | (spring & equal)", "old < 0)"),
+        ("is & (y[i] < 0) &", "is & (y[i] > 0) &"),
+    ),
+    *_changes("solvers/headers/penalty_move.h", "solvers/test_penalty.py", ("& (side[i] == 0)", "& true")),
+    *_changes("solvers/penalty.py", "solvers/test_penalty.py", ("self._excess / allowed)", "allowed / self._excess)")),
+    *_changes(
         "problem/merits.py",
         "problem/test_merits.py",
         ("(slope < 0)", "(slope > 0)"),

@@ -44,7 +44,7 @@ def is_feasible(A, b):
     return scipy.optimize.linprog(np.zeros(len(b)), A_ub=-A, b_ub=b, bounds=(0.0, None)).status == 0
 
 
-@pytest.mark.parametrize("method", [wl.MinimumMapNewton(), wl.PrimalDualActiveSet(), wl.InteriorPoint()])
+@pytest.mark.parametrize("method", [wl.MinimumMapNewton(), wl.PrimalDualActiveSet(), wl.Penalty(), wl.InteriorPoint()])
 def test_flipped_matrices_take_no_steps(method):
     for seed in range(6201, 6216):
         A = drawn(seed)

@@ -23,6 +23,7 @@ from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.nncg import NNCG
+from warp_lcp.solvers.penalty import Penalty
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -72,6 +73,7 @@ METHODS = Methods(
         "minimum-map-newton": MinimumMapNewton,
         "mprgp": MPRGP,
         "nncg": NNCG,
+        "penalty": Penalty,
         "primal-dual-active-set": PrimalDualActiveSet,
         "projected-jacobi": ProjectedJacobi,
         "projected-multigrid": ProjectedMultigrid,

@@ -1,0 +1,17 @@
+// Springs that y still pulls on stay, others let go at z = g - y / (rho d); unknowns beyond a bound go onto it and get one. `first`: so do those
+// that -y / (rho d) takes beyond it. `keep`: all stay. The shift is rho d where there is a spring; the sums are changes, springs, and the
+// square of y on those that stay.
+T moved = 0, active = 0, square = 0;
+with_bounds([&](auto lower, auto upper) {
+    SIMD for (int i = 0; i < n; ++i) {
+        const double entry = unit*(double)d[i], magnitude = entry < 0 ? -entry : entry, scale = magnitude == 0 ? 1.0 : magnitude;
+        const double l = lower(i), u = upper(i), v = x[i]; const int old = side[i];
+        const bool is = unknown[i] == 1, loose = is & (old == 0), below = loose & (v < l), above = loose & !below & (v > u);
+        const double stiff = rho*scale; const bool spring = old != 0, equal = l == u;
+        const bool low = is & (y[i] > 0) & ((old < 0) | (spring & equal) | (first & (stiff*(v - l) < y[i])));
+        const bool high = is & (y[i] < 0) & ((old > 0) | (spring & equal) | (first & (stiff*(v - u) > y[i])));
+        const int sorted = (int)(high | above) - (int)(low | below), now = keep ? old : sorted; const bool out = now != 0;
+        const double within = clipped(v - y[i]/stiff, l, u);
+        x[i] = keep ? v : ((below | low) ? l : ((above | high) ? u : ((spring & is) ? within : v)));
+        side[i] = (signed char)now; shift[i] = out ? stiff : 0.0; free[i] = is; inside[i] = is & !out;
+        moved += now != old ? (T)1 : (T)0; active += out ? (T)1 : (T)0; square += (out & (now == old)) ? y[i]*y[i] : (T)0; } });

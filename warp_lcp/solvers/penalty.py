@@ -1,0 +1,187 @@
+"""The penalty method: unknowns beyond a bound are pushed back by a stiff spring; Newton's method on that is policy iteration."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.rows import RowPass
+from warp_lcp.rows.vectors import Sums, rows_of
+from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
+from warp_lcp.solvers.principal_system import ON_FREE, principal_system
+
+HEADERS, f64, u8 = Path(__file__).parent / "headers", wp.float64, wp.uint8
+MOVE = RowPass(
+    "penalty.move", HEADERS / "penalty_move.h", f64, reads={"e": "S", "unknown": wp.int8, "side": wp.int8}, writes={"x": f64},
+    numbers={"size": f64},
+)  # fmt: skip
+SORT = RowPass(
+    "penalty.sort", HEADERS / "penalty_sort.h", f64, bounds=True, reads={"y": f64, "d": "D", "unknown": wp.int8},
+    writes={"x": f64, "side": wp.int8, "shift": f64, "free": u8, "inside": u8},
+    numbers={"rho": f64, "unit": f64, "first": bool, "keep": bool}, sums=("moved", "active", "square"),
+)  # fmt: skip
+DOMINANT = 4.0  # residual over the springs' error from which on something else is to be mended; |A D^-1| <= 2 on grids
+SHARE = 0.1  # of the tolerance that the penalty's own error may take
+LEAST_RAISE = 10.0  # factor by which rho grows at least
+LARGEST = 1e12  # rho, beyond which float64 does not see the violation of an unknown of its bound's size
+EARLY = 10  # steps in which the set may wander while the residual rises
+
+
+@dataclass(frozen=True, kw_only=True)
+class Penalty(Settings):
+    """Replace the bounds by springs, and solve the piecewise linear equations by policy iteration (Lai et al. 2020).
+
+    The equations are A z + b + rho D (min(z - l, 0) + max(z - u, 0)) = 0, D the diagonal of the natural residual's d. With V the unknowns
+    beyond a bound, a step is Newton's: (A + rho D_V) z+ = -b + rho D_V g, g the bound that is passed. It depends on V alone, so it starts
+    from x = clip(z, l, u), where its right-hand side is -(A x + b): nothing cancels however large rho is. On grids it is solved by
+    conjugate gradients with a multigrid cycle on A + rho D_V. With an M-matrix and bounds on one side the equations are
+    concave or convex: from the second step on z moves off the bounds, V shrinks, and is found after finitely many steps. Elsewhere V may
+    cycle, and the solve ends with STAGNATED or MAX_ITERATIONS.
+
+    The error: where y > 0, z is below its bound by y / (rho d), and neighbors solve their equations with that z. What is returned is
+    x = clip(z, l, u), whose natural residual is O(1 / rho): about |A D^-1 y_V| / rho. The solve is judged by it. Where V stays, or that
+    error is most of the residual, and it is more than a tenth of the tolerance, rho grows in proportion, once as a rule, up to 1e12.
+
+    `linear_iterations` counts iterations on the finest grid, factorizations where A is dense.
+
+    Args:
+        rho: stiffness of the springs in units of d, without units; 1e6 suffices for tolerances down to about 1e-6 of the residual.
+        precision: "mixed": x float64, corrections float32 on grids; "double"; or "single": x rounded to float32 as well.
+        monotone_cycles: projected multigrid cycles of a cold start on a grid.
+        eta: each linear solve reduces its residual by this factor, its square where V has stayed, or to what the solve still needs.
+        max_linear_iterations: the most iterations of one linear solve.
+        cycle: how multigrid cycles go.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
+        >>> result = wl.solve(wl.LCP(A, np.array([2.0, -3.0])), wl.Penalty())
+        >>> print(result.status.name, result.x.numpy().round(4))
+        CONVERGED [0.  1.5]
+    """
+
+    needs: ClassVar[str] = "M-matrix; other positive definite matrices without a proof"
+    definite: ClassVar[bool] = True
+
+    rho: Positive = 1e6
+    precision: PrecisionName = "mixed"
+    monotone_cycles: CountOrZero = 2
+    eta: Share = 0.01
+    max_linear_iterations: Count = 200
+    cycle: CycleSettings = field(default_factory=CycleSettings)
+
+    def init(self, problem: LCP) -> PenaltyWorkspace:
+        """Return a workspace."""
+        return PenaltyWorkspace(problem, self)
+
+    def step(self, problem: LCP, work: PenaltyWorkspace, x: wp.array[Any]) -> Step:
+        """Take a monotone cycle while the start is cold, else a step of policy iteration."""
+        if work.cycles_left > 0:
+            work.cycles_left -= 1
+            return work.monotone_step()
+        return work.policy_step(x)
+
+
+class PenaltyWorkspace(IterateMemory):
+    """Memory of the method for one problem.
+
+    Attributes:
+        rho: stiffness as it is now, in units of d.
+        side: stored int8 field; the bound that each unknown is beyond, -1 the lower and 1 the upper one, else 0.
+    """
+
+    def __init__(self, problem: LCP, settings: Penalty) -> None:
+        self.settings, layout = settings, problem.layout
+        self.active_set: GridNewtonWorkspace | None = None
+        if takes_points(problem.A):
+            newton = MinimumMapNewton(precision=settings.precision, monotone_cycles=settings.monotone_cycles, cycle=settings.cycle)
+            self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
+            self.scratch = self.active_set.scratch
+        shared: dict[str, Any] = {"x": self.active_set.x, "residual": self.active_set.residual} if self.active_set else {}
+        super().__init__(problem, settings.precision, **shared)
+        self.system: Any = principal_system(
+            problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True,
+            hierarchy=self.active_set.hierarchy if self.active_set else None,
+        )  # fmt: skip
+        self.side, self._shift = layout.zeros(wp.int8), layout.zeros(wp.float64)
+        self._free, self._inside = layout.zeros(wp.uint8), layout.zeros(wp.uint8)
+        self._sums = Sums(rows_of(self.x), 3)
+        self.rho, self.cycles_left, self.steps, self.target = settings.rho, 0, 0, 0.0
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the set and the last stiffness; the operator may have changed."""
+        s = self.settings
+        self.cycles_left = s.monotone_cycles if self.active_set is not None and self.problem.bounded and not warm else 0
+        self.rho, self.steps, self.target = s.rho, 0, tolerance
+        self._excess, self._moved, self._stale = 0.0, math.inf, True
+        self.side.zero_()
+        self.system.refresh()
+        if self.active_set is not None:
+            self.active_set.floating = self.floating
+            self.active_set.start(warm=warm, tolerance=tolerance)
+
+    def monotone_step(self) -> Step:
+        """Projected multigrid cycle on all unknowns."""
+        assert self.active_set is not None
+        return self.active_set.monotone_step()
+
+    def policy_step(self, x: wp.array[Any]) -> Step:
+        """Solve with the springs of the unknowns that are beyond their bounds, and find these anew."""
+        s, p = self.settings, self.problem
+        first = self.steps == 0
+        if first:
+            self.residual.affine(x)
+        if first or self._raise():
+            self._sort(x, first=first, keep=not first)
+            self.residual.affine(x)  # unknowns within y / (rho d) of a bound are on it now
+            self._stale = True
+        self.steps += 1
+        if self._stale:
+            self.system.restrict(self._free, self._shift)
+        settled, size = self._moved == 0, max(self.residual.norm, 1e-300)
+        self._sums.of(ON_FREE, y=self.residual.y, free=self._free, g=self.system.r, scale=1 / size)
+        if self.floating is not None:  # what is singular: components without springs
+            self.floating.project(self.system.r, self._inside)
+        factor = max(s.eta**2 if settled else s.eta, 0.3 * SHARE * self.target / size)
+        norm = self.system.norm()
+        iterations = self.system.solve(factor * norm, s.max_linear_iterations)[0] if norm > 0 else 0
+        MOVE.bind(self._sums.rows, x=x, e=self.system.e, unknown=p.unknown, side=self.side, size=size).launch()
+        self.residual.affine(x)
+        active = self._sort(x)
+        self._finish_move(x)
+        NaturalResidual.evaluate(self.residual, x)  # which writes y; the grid's own evaluation leaves it out
+        self._stale = self._moved > 0
+        return Step("policy", iterations, active, interim=self._stale and self.steps <= EARLY)
+
+    def _raise(self) -> bool:
+        """Stiffen the springs where their error is most of the residual and beyond its share of the tolerance; return whether they are."""
+        allowed = SHARE * self.target
+        settled = self._moved == 0 or self.residual.norm <= DOMINANT * self._excess
+        if not settled or not self._excess > allowed > 0 or self.rho >= LARGEST:
+            return False
+        self.rho = min(LARGEST, self.rho * max(LEAST_RAISE, self._excess / allowed))
+        return True
+
+    def _sort(self, x: wp.array[Any], *, first: bool = False, keep: bool = False) -> int:
+        """Find the springs of the next step at z, project it onto the bounds, and return how many springs there are.
+
+        A spring stays if z is still beyond its bound. Its row of the step says z - g = -y / (rho d), so that y has the sign that matters;
+        the solution of the linear solve has not, which knows no sizes below its tolerance.
+        """
+        p, r = self.problem, self.residual
+        fields = {"x": x, "y": r.y, "d": r.diagonal, "unknown": p.unknown, "side": self.side, "shift": self._shift}
+        fields |= {"free": self._free, "inside": self._inside, "rho": self.rho, "unit": r.unit, "first": first, "keep": keep}
+        moved, active, square = self._sums.of(SORT, bounds=p.bounds.operands, **fields)
+        self._moved, self._excess = float(moved), math.sqrt(float(square)) / self.rho
+        return int(active)
