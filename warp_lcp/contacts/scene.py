@@ -49,7 +49,7 @@ class ContactOutput(Output):
 class ContactScene(Scene):
     """A scene of rigid bodies without a material."""
 
-    elsewhere: ClassVar = {"liquid": "fluids", "sand": "granular", "material": "granular", "friction": "granular", "particles": "fluids"}
+    elsewhere: ClassVar = dict.fromkeys(("sand", "material", "friction"), "granular") | dict.fromkeys(("liquid", "particles"), "fluids")
     domain: ContactDomain
     solver: ContactSolver = Field(default_factory=ContactSolver)  # type: ignore[assignment]
     output: ContactOutput = Field(default_factory=ContactOutput)
@@ -93,4 +93,3 @@ class ContactScene(Scene):
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
             found.append(Complaint(("domain", "periodic"), self.domain.periodic, f"must have {self.dimension} entries"))
         return found
-

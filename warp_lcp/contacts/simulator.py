@@ -15,15 +15,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import NoStopwatch, Part, SimulationFailed, Stopwatch, Surface
 
-COLUMNS = (
-    "kinetic_energy",
-    "potential_energy",
-    "max_speed",
-    "solver",
-    "solve_status",
-    "solve_iterations",
-    "solve_residual",
-)
+COLUMNS = ("kinetic_energy", "potential_energy", "max_speed", "solver", "solve_status", "solve_iterations", "solve_residual")
 
 
 class ContactSimulation:
@@ -104,8 +96,11 @@ class ContactSimulation:
         self.step_count = int(state["step_count"])
 
     def notes(self) -> list[str]:
-        """Return facts for the start of a run."""
-        return self.scene.notes()
+        """Return facts for the start of a run, and settings that look like mistakes."""
+        sides = " x ".join(f"{side:g}" for side in self.scene.domain.size)
+        count = len(self.bodies.bodies)
+        room = "a domain without far ends" if self.scene.domain.boundless else f"{sides} m"
+        return [f"{count} rigid {'body' if count == 1 else 'bodies'} in {room}", *self.scene.notes()]
 
     def _row(self, dt: float) -> dict[str, float | int | str | None]:
         bodies, solved = self.bodies, self.bodies.contacts > 0

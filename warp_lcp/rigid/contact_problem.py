@@ -112,7 +112,11 @@ class ContactProblem:
         order, starts = self.islands()
         diagonal, yields = (values.reshape(k, rows)[order] for values in self.yields())
         x = np.zeros(k * rows) if start is None else start[order].ravel()
-        residual, rounds, J = np.zeros(len(starts) - 1), np.zeros(len(starts) - 1), np.concatenate([self.one[order], self.other[order]], axis=2)
+        residual, rounds, J = (
+            np.zeros(len(starts) - 1),
+            np.zeros(len(starts) - 1),
+            np.concatenate([self.one[order], self.other[order]], axis=2),
+        )
         w = np.zeros((self.bodies + 1) * q)
         fields = {"J": J, "b": self.b[order], "e": yields, "d": diagonal, "mu": self.friction[order], "w": w, "x": x, "residual": residual}
         fields["rounds"] = rounds
