@@ -35,8 +35,8 @@ HEAD = """# Gallery
 Every built-in scene: what a run shows, the commands that make the picture, what the run took. `warp-lcp scenes` lists them, `warp-lcp run
 NAME` runs one, `warp-lcp check NAME` says before how large it is, `--set` changes a key. Times on one core of a shared
 {device}, {date}, frames included, kernels compiled before (a first run compiles for some seconds). Memory is the process's largest,
-about {base} MB of it the program itself. Pictures of liquids in 3-D are of their surface, the others of particles, or of bodies where there is nothing
-else; times of bodies alone are of a shared AMD EPYC.
+about {base} MB of it the program itself. Pictures of liquids in 3-D are of their surface, the others of particles, or of bodies
+where there is nothing else. Times of bodies alone are of a shared AMD EPYC.
 """
 
 

@@ -28,7 +28,7 @@ class ContactSolver(Table):
     """[solver]: the method for the impulses of contacts, and how far it goes."""
 
     preset: PresetName | None = Field(default=None, description="not for bodies alone")
-    method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE] = Field(  # type: ignore[valid-type]
+    method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE] = Field(
         default=DEFAULT,
         description="sweeps-and-newton is that of bodies in liquids; of the others those from nncg to staggering take friction in boxes, "
         "those from lemke on the model of Stewart and Trinkle",

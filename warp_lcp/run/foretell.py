@@ -38,14 +38,16 @@ def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None)
         simulation: where it begins.
         seconds: a step, as measured; None: by the list of prices.
     """
-    of_particles = isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation)
-    steps = expected_steps(scene, simulation) if of_particles else longest_steps(scene, simulation)
+    where = "as measured"
+    if isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation):
+        steps = expected_steps(scene, simulation)
+        if seconds is None:
+            seconds, where = expected_step(scene, simulation), "by the list of prices, on one core"
+    else:
+        steps = longest_steps(scene, simulation)
     size = expected_bytes(scene, simulation, steps)
-    where = "by the list of prices, on one core" if seconds is None else "as measured"
-    if seconds is None and not of_particles:
-        return [("steps", f"about {steps:,}"), ("disk", f"about {in_words(size)}")]
     if seconds is None:
-        seconds = expected_step(scene, simulation)
+        return [("steps", f"about {steps:,}"), ("disk", f"about {in_words(size)}")]
     frames = scene.time.frame_count * FRAME_SECONDS + size * BYTE_SECONDS
     whole = steps * (seconds + ROW_SECONDS) + frames
     lasts = timedelta(seconds=round(whole)) if whole >= 10.0 else f"{whole:.2g} s"
