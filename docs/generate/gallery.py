@@ -25,7 +25,7 @@ PAGE, FOLDER = DOCS / "gallery.md", DOCS / "gallery"
 FIGURES = FOLDER / "figures.json"
 PICTURES = 3  # of a sheet: early, in the middle, late
 SIZE = "1500x480"  # pixels: one row
-SETTINGS = {"fluids": ("output.surface=true",), "granular": ()}  # of 3-D scenes, besides their own
+SETTINGS = {"fluids": ("output.surface=true",), "granular": (), "contacts": ()}  # of 3-D scenes, besides their own
 SURFACE = ("--show", "surface")
 
 HEAD = """# Gallery
@@ -35,7 +35,8 @@ HEAD = """# Gallery
 Every built-in scene: what a run shows, the commands that make the picture, what the run took. `warp-lcp scenes` lists them, `warp-lcp run
 NAME` runs one, `warp-lcp check NAME` says before how large it is, `--set` changes a key. Times on one core of a shared
 {device}, {date}, frames included, kernels compiled before (a first run compiles for some seconds). Memory is the process's largest,
-about {base} MB of it the program itself. Pictures of liquids in 3-D are of their surface, the others of particles.
+about {base} MB of it the program itself. Pictures of liquids in 3-D are of their surface, the others of particles, or of bodies
+where there is nothing else. Times of bodies alone are of a shared AMD EPYC.
 """
 
 
@@ -45,9 +46,9 @@ def scene_text(name: str) -> str:
 
 
 def scene_names() -> list[str]:
-    """Return the built-in scenes, liquids first."""
+    """Return the built-in scenes: liquids, sand, bodies alone."""
     names = [Path(entry.name).stem for entry in files("warp_lcp.scene.scenes").iterdir() if entry.name.endswith(".toml")]
-    return sorted(names, key=lambda name: (tomllib.loads(scene_text(name))["scene"]["simulator"], name))
+    return sorted(names, key=lambda name: ([*SETTINGS].index(tomllib.loads(scene_text(name))["scene"]["simulator"]), name))
 
 
 def commands(name: str) -> tuple[list[str], list[str]]:
@@ -96,7 +97,7 @@ def entry(name: str, figures: dict[str, Any]) -> str:
     """Return what the page says of a scene."""
     about = tomllib.loads(scene_text(name))["scene"]
     run, draw = commands(name)
-    size = figures["note"].split(" m,")[0]
+    size = figures["note"].split(" m,")[0]  # of a grid; bodies alone have none
     took = f"{figures['seconds']:.0f} s for {figures['steps']} steps and {figures['frames']} frames, {figures['megabytes']} MB; {size}"
     description = about["description"][0].upper() + about["description"][1:]
     block = f"```sh\n{' '.join(run)} --out out/{name}\n{' '.join(draw)}\n```"

@@ -8,7 +8,7 @@ from typing import Any
 from warp_lcp.scene.scene_file import installed_simulators
 
 PAGE = Path(__file__).parents[1] / "scenes.md"
-MATERIALS = {"fluids": "liquid", "granular": "sand"}
+MATERIALS = {"fluids": "liquid", "granular": "sand", "contacts": "bodies alone"}
 SHAPES = ("box", "sphere", "capsule", "plane", "mesh")
 Definition = dict[str, Any]
 
@@ -205,6 +205,11 @@ The log has the place, velocity and turn of each body, numbered from 0 in the or
 """
 
 
+BODIES_ALONE = """`scene.simulator = "contacts"`. Walls, gravity and [[solid]]s, at least one with `density` or `mass`, as in a liquid; see
+[bodies without a material](bodies.md#without-a-material).
+"""
+
+
 def array_section(schema: Definition, name: str) -> str:
     """Return the keys of an array besides those of its shape."""
     definition = shapes_of(schema, name)["box"]
@@ -217,7 +222,7 @@ def page() -> str:
     """Return the page."""
     installed = installed_simulators()
     schemas = {name: installed[name].scene_model.model_json_schema(by_alias=True) for name in MATERIALS}
-    first, second = schemas.values()
+    first, second, _ = schemas.values()
     tables = {name: tables_of(schema) for name, schema in schemas.items()}
     shared = [name for name, definition in tables["fluids"].items() if tables["granular"].get(name) == definition]
     parts = [HEAD, "## Every scene\n", *(section(3, name, tables["fluids"][name]) for name in shared)]
@@ -226,6 +231,11 @@ def page() -> str:
     parts += [TIMES, shape_section(first), motion_section(first), BODIES]
     for simulator, material in MATERIALS.items():
         schema = schemas[simulator]
+        if simulator == "contacts":  # the same [[solid]] as in liquids, and some of the tables
+            own = {name: definition for name, definition in tables[simulator].items() if tables["fluids"].get(name) != definition}
+            parts.append(f"## {material.capitalize()}\n\n{BODIES_ALONE}")
+            parts += [section(3, name, definition) for name, definition in own.items()]
+            continue
         parts.append(f'## {material.capitalize()}\n\n`scene.simulator = "{simulator}"`.\n')
         parts += [section(3, name, definition) for name, definition in tables[simulator].items() if name not in shared]
         parts += [section(3, f"[{name}]", definition) for name, definition in lists_of(schema).items()]

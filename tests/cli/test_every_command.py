@@ -47,13 +47,13 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
     sets = [word for override in overrides for word in ("--set", override)]
     loaded = load_scene(str(scene))
     alone = loaded.scene.simulator == "fluids" and not any(solid.is_body for solid in loaded.solid)
-    assert "whole run" in done("check", scene, "--device", "cpu", *sets)
+    assert "disk" in done("check", scene, "--device", "cpu", *sets)
     assert "seconds a step" in done("check", scene, "--device", "cpu", "--calibrate", *sets)
     recorded = ["--record-problems", problems] if alone else []
     assert "finished: frame 1 " in done("run", scene, "--device", "cpu", "--out", out, "--frames", 1, *recorded, *sets)
     assert "finished: frame 2 " in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
     assert "finished before" in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
-    assert "whole run" in done("check", out / "scene.toml", "--device", "cpu"), "the scene as it ran is one"
+    assert "disk" in done("check", out / "scene.toml", "--device", "cpu"), "the scene as it ran is one"
     assert "image" in done("render", out, "--slice", "--size", "320x240")
     assert "frame_000002.png" in done("render", out, "--frame", 2, "--size", "320x240")
     assert "3 frames" in done("export", out, "--out", tmp_path / "run.usda")
@@ -86,7 +86,7 @@ def written(seed: int, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", built_in_scenes())
 def test_every_built_in_scene_is_checked(name: str) -> None:
-    assert "whole run" in done("check", name, "--device", "cpu", "--set", small(name))
+    assert "disk" in done("check", name, "--device", "cpu", "--set", small(name))
 
 
 @pytest.mark.parametrize("seed", [*FEW, *(pytest.param(seed, marks=pytest.mark.slow) for seed in MORE)])

@@ -64,7 +64,7 @@ def test_changed_scenes(data: bytes) -> None:
         except SceneError as error:
             assert error.problems and len(str(error)) < 200_000
         else:
-            assert dict(lines)["grid"]
+            assert dict(lines)["frames"]
 
 
 @given(mutated(SMALL) | st.sampled_from(SMALL).flatmap(lambda data: st.integers(0, 2**32).map(lambda s: fuzzed(random.Random(s), data))))

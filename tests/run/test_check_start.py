@@ -12,11 +12,12 @@ import pytest
 import tomli_w
 from typer.testing import CliRunner, Result
 
+from particle_scenes import particle_scenes
 from warp_lcp.cli import commands as cli
 from warp_lcp.run.check import check_scene, start
 from warp_lcp.run.stepping import take_step
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.scene_file import MOST_TABLES, built_in_scenes, load_scene
+from warp_lcp.scene.scene_file import MOST_TABLES, load_scene
 from warp_lcp.scene.table import SceneError
 
 LIQUID = {"shape": "box", "min": [0.0, 0.0], "max": [1.0, 0.3]}
@@ -121,7 +122,7 @@ def test_no_more_particles_than_foretold(seed: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", built_in_scenes())
+@pytest.mark.parametrize("name", particle_scenes())
 def test_no_more_particles_than_foretold_in_built_in_scenes(name: str) -> None:
     assert_foretold(load_scene(name), 10)
 

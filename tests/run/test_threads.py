@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 import warp_lcp as wl
+from particle_scenes import particle_scenes
 from warp_lcp.rows import team
-from warp_lcp.scene.scene_file import built_in_scenes, load_scene
+from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
 CELLS = {  # whose sizes need others
@@ -30,7 +31,7 @@ def digests(name: str, count: int, steps: int) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("name", built_in_scenes())
+@pytest.mark.parametrize("name", particle_scenes())
 def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):
     for module in ("team", "program", "row_pass"):
         monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 100)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import pytest
 from typer.testing import CliRunner
 
+from particle_scenes import particle_scenes
 from warp_lcp.benchmarks.models import offers
 from warp_lcp.cli import commands as cli
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.run.check import check_scene
 from warp_lcp.scene.models import Model, Price, model_lines, predicted_seconds, prices
-from warp_lcp.scene.scene_file import built_in_scenes, load_scene
+from warp_lcp.scene.scene_file import load_scene
 
 CELLS, PARTICLES = 1000, 4000
 LISTED = {
@@ -52,7 +53,7 @@ def test_every_model_that_is_measured_has_its_price(simulator: str, dimension: i
     assert listed["cut cells"].bytes(CELLS, PARTICLES) > 0
 
 
-@pytest.mark.parametrize("name", sorted(built_in_scenes()))
+@pytest.mark.parametrize("name", particle_scenes())
 def test_every_built_in_scene_says_which_models_it_has(name: str) -> None:
     scene, lines = check_scene(name)
     assert isinstance(scene, ParticleScene)

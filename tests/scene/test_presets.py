@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from particle_scenes import particle_scenes
 from warp_lcp.run.check import check_scene
 from warp_lcp.run.trial import trial
 from warp_lcp.scene.presets import PRESETS, changed, price_table, value_of
-from warp_lcp.scene.scene_file import built_in_scenes, dump_scene, load_scene
+from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.scene.table import SceneError
 
 SCENE = """
@@ -34,7 +35,7 @@ def scene_file(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", built_in_scenes())
+@pytest.mark.parametrize("name", particle_scenes())
 def test_every_scene_takes_every_preset(name: str, preset: str) -> None:
     plain, scene = load_scene(name), load_scene(name, [f"solver.preset={preset}"])
     assert scene.solver.preset == preset

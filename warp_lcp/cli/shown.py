@@ -26,7 +26,11 @@ from warp_lcp.run.terminal import Terminal, say, tell
 
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]
 ShowOption = Annotated[
-    Show | None, typer.Option(help="What is shown; the surface where a run of liquid wrote one, else particles.", show_default=False)
+    Show | None,
+    typer.Option(
+        help="What is shown; the surface where a run of liquid wrote one, else particles; bodies where the run has only those.",
+        show_default=False,
+    ),
 ]
 ColorOption = Annotated[
     Color | None, typer.Option(help="What colors the particles, on one scale for the whole run; speed unless given.", show_default=False)

@@ -32,10 +32,11 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
 from warp_lcp.rigid.obstacles import domain_walls, obstacle
+from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.shapes import SolidProperties
 
 
-def placed_solids(scene: ParticleScene, folder: Path) -> list[PlacedSolid]:
+def placed_solids(scene: Scene, folder: Path) -> list[PlacedSolid]:
     """Return the scene's solids, rigid bodies with the motion of a body each; files that it names are relative to `folder`.
 
     Raises:
@@ -52,7 +53,7 @@ def placed_solids(scene: ParticleScene, folder: Path) -> list[PlacedSolid]:
     return placed
 
 
-def make_bodies(scene: ParticleScene, placed: Sequence[PlacedSolid], make: Callable[..., RigidBodies] = RigidBodies) -> RigidBodies | None:
+def make_bodies(scene: Scene, placed: Sequence[PlacedSolid], make: Callable[..., RigidBodies] = RigidBodies) -> RigidBodies | None:
     """Return the rigid bodies among a scene's solids, if there are any, among its walls and the other solids.
 
     Args:

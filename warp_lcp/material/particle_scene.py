@@ -16,7 +16,7 @@ from warp_lcp.material.particle_volume import VOLUME_BYTES
 from warp_lcp.scene.models import Model, model_lines, prices
 from warp_lcp.scene.presets import preset_values
 from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source, SourceProperties
+from warp_lcp.scene.shapes import Drain, MaterialProperties, Source, SourceProperties
 from warp_lcp.scene.table import Complaint, Table
 from warp_lcp.scene.unusual import material_notes
 from warp_lcp.settings import Count, CountOrZero, Part, Share
@@ -177,11 +177,6 @@ class ParticleScene(Scene):
         """Return whether bodies in flight can be told: not where they lack particles inside, nor where they go on at another side."""
         return self.particles.narrow_band is None and not self.stays_full and not self.endless
 
-    @property
-    def endless(self) -> tuple[int, ...]:
-        """Return the axes without an end: what leaves at one side comes in at the other."""
-        return ()
-
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
         key, materials = self.materials()
@@ -210,11 +205,6 @@ class ParticleScene(Scene):
         key, value, word = ("min", least, "most") if least > at_rest else ("max", most, "least")
         message = f"must be at {word} the {at_rest} particles of a cell at rest"
         return [Complaint(("particles", "reseed", key), value, message)]
-
-    def body_frictions(self) -> list[float]:
-        """Return Coulomb's coefficient of each solid's surface against bodies and walls."""
-        given = [BODY_FRICTION if solid.friction is None else solid.friction for solid in self.solid]
-        return [STICKS if friction == "stick" else float(friction) for friction in given]
 
     def particle_estimate(self, *, later: bool = True) -> int:
         """Return how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.

@@ -10,7 +10,7 @@ import numpy as np
 from warp_lcp.grid.motion import Pose
 from warp_lcp.render.actors import SHADES, Actors, Drawn, body_meshes, shaded, surface_meshes
 from warp_lcp.render.grains import grains
-from warp_lcp.render.recording import Color, Frame, Recording, Show
+from warp_lcp.render.recording import WITH_SURFACE, Color, Frame, Recording, Show
 from warp_lcp.render.solid_meshes import FlatSolids, RoomSolids, apart, prescribed_solids
 from warp_lcp.render.sunlight import LIGHT, SHADE, Sunlight, scattered
 from warp_lcp.scene.camera import viewpoint
@@ -56,7 +56,7 @@ class Picture:
         self.samples = 1 if plotter else SAMPLES
         self.plotter = plotter or pyvista.Plotter(off_screen=True, window_size=[SAMPLES * side for side in size], lighting="none")
         self.plotter.render_window.SetMultiSamples(0 if plotter is None else 8)  # 0 is three times as fast in software; SAMPLES smooths too
-        water = recording.show is not Show.PARTICLES and scene.palette == "water"
+        water = recording.show in WITH_SURFACE and scene.palette == "water"
         self.plotter.set_background("white" if self.flat else BACKDROPS["water"] if water else BACKDROPS["other"], top="white")
         for position, kind, intensity in [(LIGHT, "scene light", 0.45), (np.array([0.0, 0.0, 1.0]), "headlight", 0.25)]:
             light = pyvista.Light(position=tuple(position), focal_point=(0, 0, 0), light_type=kind, intensity=intensity)

@@ -47,8 +47,13 @@ class Show(StrEnum):
     PARTICLES = "particles"
     SURFACE = "surface"
     BOTH = "both"
+    BODIES = "bodies"  # nothing of it
 
 
+WITH_PARTICLES, WITH_SURFACE = (Show.PARTICLES, Show.BOTH), (Show.SURFACE, Show.BOTH)
+
+
+PARTS = {Show.PARTICLES: "particles", Show.SURFACE: "surface", Show.BODIES: "bodies"}  # that frames must have
 LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}  # what sand's particles know besides
 
 
@@ -109,7 +114,8 @@ class Recording:
     Args:
         folder: of the run.
         color: what is to be read besides the positions; speed unless given.
-        show: what is to be read; particles if a color is given, of sand, or where there is no surface, else the surface.
+        show: what is to be read; particles if a color is given, of sand, or where there is no surface, else the surface; bodies where the
+            run writes nothing but them.
         overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
         cells: read the cells too, where the run wrote them; then their pressure is the color unless another is given, or the surface is all
             that there is of the material.
@@ -133,14 +139,17 @@ class Recording:
         self.scene: Scene = load_scene(folder / "scene.toml", overrides)
         check_shapes(self.scene, str(folder / "scene.toml"))
         self.cells = cells
+        output = self.scene.output
         surface_alone = bool(self._numbers("surface")) and not self._numbers("particles")
-        if cells and color is None and show is not Show.SURFACE and not surface_alone:
+        if cells and color is None and show in (None, *WITH_PARTICLES) and not surface_alone and self._numbers("particles"):
             color = Color.PRESSURE if self._numbers("grid") else Color.SPEED
         grains = self.scene.palette == "sand" and bool(self._numbers("particles"))  # a heap's surface is lace where it is thin, else clay
-        self.show = show or (Show.SURFACE if color is None and not grains and self._numbers("surface") else Show.PARTICLES)
-        if self.show is Show.SURFACE and color not in (None, Color.PLAIN):
-            raise RenderError(f"--color {color} is for particles, which --show surface leaves out; choose both or particles")
-        self.color = Color.PLAIN if self.show is Show.SURFACE else color or Color.SPEED
+        smooth = color is None and not grains and bool(self._numbers("surface"))
+        bodies_alone = color in (None, Color.PLAIN) and not (output.particles or output.surface) and bool(self._numbers("bodies"))
+        self.show = show or (Show.BODIES if bodies_alone else Show.SURFACE if smooth else Show.PARTICLES)
+        if self.show not in WITH_PARTICLES and color not in (None, Color.PLAIN):
+            raise RenderError(f"--color {color} is for particles, which --show {self.show} leaves out; choose both or particles")
+        self.color = Color.PLAIN if self.show not in WITH_PARTICLES else color or Color.SPEED
         self.look_again()
         if self.color is Color.PRESSURE and not set(self.numbers) <= set(self._numbers("grid")):
             raise RenderError(f"{folder}: --color pressure needs a frame of cells for each of particles; choose speed or plain")
@@ -165,8 +174,8 @@ class Recording:
         Raises:
             RenderError: a file cannot be read, or lacks a field.
         """
-        points, values = (np.zeros((0, 3)), np.zeros(0)) if self.show is Show.SURFACE else self.read(number)
-        surface = self.surface(number) if self.show is not Show.PARTICLES else None
+        points, values = (np.zeros((0, 3)), np.zeros(0)) if self.show not in WITH_PARTICLES else self.read(number)
+        surface = self.surface(number) if self.show in WITH_SURFACE else None
         filled = self._cells(number) if self.cells and self._file("grid", number).is_file() else None
         return Frame(self.scene.time.frame_time(number), points, values, surface, self.bodies(number), filled)
 
@@ -231,7 +240,7 @@ class Recording:
 
     def particle_spacing(self) -> float:
         """Return how far apart neighbors are at the start [m], from the number of particles in the cells that hold some."""
-        points = self.particles(self.numbers[0]).points if self.show is not Show.SURFACE else np.zeros((0, 3))
+        points = self.particles(self.numbers[0]).points if self.show in WITH_PARTICLES else np.zeros((0, 3))
         if not len(points):
             return self.scene.spacing
         cells = np.unique(np.floor(points / self.scene.spacing), axis=0)
@@ -252,12 +261,12 @@ class Recording:
         Raises:
             RenderError: there is none.
         """
-        parts = ("surface", "particles") if self.show is Show.BOTH else ("surface",) if self.show is Show.SURFACE else ("particles",)
+        parts = ("surface", "particles") if self.show is Show.BOTH else (PARTS[self.show],)
         found = {part: self._numbers(part) for part in parts}
         for part, numbers in found.items():
             if not numbers:
                 output = self.scene.output
-                why = "" if getattr(output, part) else f"; the scene's output.{part} is false"
+                why = "" if getattr(output, part, True) else f"; the scene's output.{part} is false"
                 if output.format in WRITTEN_ONLY:
                     why = f'; output.format = "{output.format}" is for other programs and not read back'
                 raise RenderError(f"{self.folder}: holds no frames of {'a surface' if part == 'surface' else part}{why}")

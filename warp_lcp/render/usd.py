@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_lcp.files.atomic import make_folder, replacing_by_name
 from warp_lcp.render.actors import BODY_COLORS, SURFACES
-from warp_lcp.render.recording import Recording, RenderError, Show
+from warp_lcp.render.recording import WITH_PARTICLES, WITH_SURFACE, Recording, RenderError, Show
 from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.shapes import PlaneTable
@@ -119,10 +119,10 @@ class Stage:
         color = SURFACES[scene.palette]["color"]
         self._line_width = LINE_WIDTH * scene.spacing if self._dimension == 2 else 0.0
         self._spacing = recording.particle_spacing()
-        self._surface = self._shape("surface", color) if recording.show is not Show.PARTICLES else None
+        self._surface = self._shape("surface", color) if recording.show in WITH_SURFACE else None
         if self._surface is not None and self._dimension == 3:
             self._surface.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        self._particles = self._points(color) if recording.show is not Show.SURFACE else None
+        self._particles = self._points(color) if recording.show in WITH_PARTICLES else None
         self._moving = self._solids()
         self._bodies: dict[int, tuple[np.ndarray, Any]] = {}
 

@@ -11,7 +11,7 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
-from warp_lcp.rigid.contact_solve import Contacts, ContactSolve
+from warp_lcp.rigid.contact_solve import Contacts, ContactSolve, ImpulseSolver, sweeps_and_newton
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.outline import BodySurface, body_surface
 
@@ -55,12 +55,14 @@ class RigidBodies:
         numbers: the wall number of each, 1 + the index of its solid.
         obstacles: what else they may touch.
         dimension: 2 or 3.
+        solver: of the contacts' impulses.
 
     Attributes:
         motions: a `BodyMotion` of each, for the solids.
         time: of the state [s].
         contacts: points where bodies touched in the last step.
         contact_residual: of the last problem of contacts, relative to that of no impulses.
+        contact_iterations: of its solve.
         exits: sides of the domain that bodies leave by: its size [m], and bits of `warp_lcp.grid.sides.side_bits`. A body whose center of
             mass has crossed one is out of the simulation for good: at rest outside, touched by nothing, in no frame.
 
@@ -75,16 +77,17 @@ class RigidBodies:
         numbers: Sequence[int],
         obstacles: Sequence[Obstacle],
         dimension: int,
+        solver: ImpulseSolver = sweeps_and_newton,
     ) -> None:
         """Prepare the shapes for contact, and check that bodies start apart."""
         self.bodies, self.numbers, self.dimension = list(bodies), list(numbers), dimension
         self.motions = [BodyMotion(body) for body in bodies]
         self._geometries = list(geometries)
         self.shapes = [ContactShape.of(geometry, dimension) for geometry in geometries]
-        self._solve = ContactSolve(ContactDetection(self.bodies, self.shapes, obstacles, dimension))
+        self._solve = ContactSolve(ContactDetection(self.bodies, self.shapes, obstacles, dimension), solver)
         self._surfaces: list[BodySurface] | None = None
         self._begun: _Begun | None = None
-        self.contacts, self.contact_residual = 0, 0.0
+        self.contacts, self.contact_residual, self.contact_iterations = 0, 0.0, 0
         self.exits: tuple[Sequence[float], int] = ((), 0)
         self._solve.check_start(self.time)
 
@@ -120,7 +123,7 @@ class RigidBodies:
         free = self._momenta()
         impulses = self._solve.push_apart(contacts)
         self._solve.hold(contacts, impulses)
-        self.contact_residual = self._solve.residual
+        self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses))
 
     def solve_contacts(self) -> None:
@@ -137,7 +140,7 @@ class RigidBodies:
             for body, momenta in zip(self.bodies, begun.free, strict=True):
                 body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
             impulses = self._solve.push_apart(begun.contacts, begun.impulses)
-            self.contact_residual = self._solve.residual
+            self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = replace(begun, impulses=impulses, settled=True)
 
     def end_step(self, dt: float) -> None:

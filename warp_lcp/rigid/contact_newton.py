@@ -74,6 +74,7 @@ class ContactNewton:
     Attributes:
         x: impulses of the least residual so far, shape (k rows,).
         residual: theirs, relative to that of no impulses.
+        steps: linear systems solved.
     """
 
     def __init__(self, problem: ContactProblem, x: np.ndarray) -> None:
@@ -87,7 +88,7 @@ class ContactNewton:
         self._own = np.repeat(self._normals, rows - 1)  # the normal of each tangent
         self._friction = np.repeat(problem.friction, rows - 1)
         self._scale = np.concatenate([np.ones(self._J.shape[1]), 1.0 / np.sqrt(self._diagonal)])
-        self.x, self.residual = x.ravel(), np.inf
+        self.x, self.residual, self.steps = x.ravel(), np.inf, 0
         self.take(self.x)
 
     def active_set(self, rtol: float) -> None:
@@ -191,6 +192,7 @@ class ContactNewton:
             coupling: entries of C in the rows of tangents, at their normals.
             right: of the equation.
         """
+        self.steps += 1
         bodies, n, scale = self._J.shape[1], len(diagonal), self._scale
         J = self._small if self._small is not None else self._J
         values, rows = np.concatenate([diagonal, coupling]), np.concatenate([np.arange(n), self._tangents])

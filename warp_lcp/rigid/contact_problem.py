@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -28,11 +28,25 @@ NNCG = RowPass(
     "warp_lcp.rigid.contacts.nncg",
     Path(__file__).parent / "headers" / "nncg.h",
     wp.float64,
-    box={"residual": wp.float64},  # of each island, relative to that of x = 0
+    box={"residual": wp.float64, "rounds": wp.float64},  # of each island: relative to that of x = 0; iterations taken
     whole=dict.fromkeys(("J", "b", "e", "d", "mu", "w", "g", "way", "best", "x"), wp.float64) | dict.fromkeys(_INDICES, wp.int32),
     numbers={"q": int, "dim": int, "rtol": wp.float64, "most": int},
     constants={"EACH": 8},  # iterations between looks at the residual, which costs as much as a sweep
 )
+
+
+class ContactImpulses(NamedTuple):
+    """What a solve of a `ContactProblem` has found.
+
+    Attributes:
+        impulses: [N s], shape (k, rows).
+        residual: the largest of an island, relative to that of no impulses.
+        iterations: the most of an island: sweeps, and steps of Newton's methods.
+    """
+
+    impulses: np.ndarray
+    residual: float
+    iterations: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +98,8 @@ class ContactProblem:
         fields = (self.one[contacts], self.other[contacts], self.b[contacts], self.friction[contacts])
         return ContactProblem(number[first], number[second], *fields, len(bodies))
 
-    def solve(self, stopping: StoppingCriteria, start: np.ndarray | None = None, unsolved: float = np.inf) -> tuple[np.ndarray, float]:
-        """Return impulses, shape (k, rows), and the largest residual of an island, relative to that of no impulses.
+    def solve(self, stopping: StoppingCriteria, start: np.ndarray | None = None, unsolved: float = np.inf) -> ContactImpulses:
+        """Return impulses, their residual and the iterations that they took.
 
         An island that does not reach the tolerance is taken at its least residual, which says so.
 
@@ -96,11 +110,16 @@ class ContactProblem:
         """
         k, rows, q = self.one.shape
         order, starts = self.islands()
-        diagonal, more = (values.reshape(k, rows)[order] for values in self.yields())
+        diagonal, yields = (values.reshape(k, rows)[order] for values in self.yields())
         x = np.zeros(k * rows) if start is None else start[order].ravel()
-        residual, J = np.zeros(len(starts) - 1), np.concatenate([self.one[order], self.other[order]], axis=2)
+        residual, rounds, J = (
+            np.zeros(len(starts) - 1),
+            np.zeros(len(starts) - 1),
+            np.concatenate([self.one[order], self.other[order]], axis=2),
+        )
         w = np.zeros((self.bodies + 1) * q)
-        fields = {"J": J, "b": self.b[order], "e": more, "d": diagonal, "mu": self.friction[order], "w": w, "x": x, "residual": residual}
+        fields = {"J": J, "b": self.b[order], "e": yields, "d": diagonal, "mu": self.friction[order], "w": w, "x": x, "residual": residual}
+        fields["rounds"] = rounds
         given = {name: _real(field) for name, field in fields.items()} | {name: _real(np.zeros(k * rows)) for name in ("g", "way", "best")}
         given |= {"one": _index(self.first[order]), "other": _index(self.second[order]), "starts": _index(starts)}
         islands = Rows.entries(len(residual), wp.get_device("cpu"))
@@ -108,13 +127,14 @@ class ContactProblem:
         x = x.reshape(k, rows)
         for island in np.flatnonzero(residual > unsolved):
             mine = slice(starts[island], starts[island + 1])
-            x[mine], residual[island] = self.part(order[mine])._go_on(stopping.rtol, x[mine])
+            x[mine], residual[island], more = self.part(order[mine])._go_on(stopping.rtol, x[mine])
+            rounds[island] += more
         result = np.empty((k, rows))
         result[order] = x
-        return result, float(residual.max(initial=0.0))
+        return ContactImpulses(result, float(residual.max(initial=0.0)), int(rounds.max(initial=0.0)))
 
-    def _go_on(self, rtol: float, x: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return better impulses than those that sweeps have found, and their residual.
+    def _go_on(self, rtol: float, x: np.ndarray) -> ContactImpulses:
+        """Return better impulses than those that sweeps have found, their residual, and the iterations that they took.
 
         Active sets solve what rests, from what sweeps have left, in a few steps, interior points what they start too far from. Where a
         column topples and bodies hit each other these jam, and many sweeps come near enough for active sets.
@@ -122,10 +142,13 @@ class ContactProblem:
         newton = ContactNewton(self, x)
         newton.active_set(rtol)
         newton.interior_point(rtol)
+        sweeps = 0
         if newton.residual > rtol:
-            newton.take(self.solve(StoppingCriteria(rtol=rtol, max_iterations=MANY), newton.x.reshape(x.shape))[0].ravel())
+            swept = self.solve(StoppingCriteria(rtol=rtol, max_iterations=MANY), newton.x.reshape(x.shape))
+            newton.take(swept.impulses.ravel())
             newton.active_set(rtol)
-        return newton.x.reshape(x.shape), newton.residual
+            sweeps = swept.iterations
+        return ContactImpulses(newton.x.reshape(x.shape), newton.residual, newton.steps + sweeps)
 
 
 def _real(values: np.ndarray) -> wp.array[Any]:

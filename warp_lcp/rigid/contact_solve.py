@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +11,7 @@ from warp_lcp.grid.motion import Motion
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.body import AXES, PLANAR, in_space, rotation_by
 from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints, Place, between
-from warp_lcp.rigid.contact_problem import ContactProblem
+from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
 
@@ -30,20 +30,30 @@ ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no directio
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
 
 
+ImpulseSolver = Callable[[ContactProblem, np.ndarray], ContactImpulses]  # of a problem and the impulses to start from
+
+
+def sweeps_and_newton(problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
+    """Solve by nonlinear conjugate gradients on sweeps, and by Newton's methods where sweeps are not enough."""
+    return problem.solve(EXACT, start, UNSOLVED)
+
+
 class ContactSolve:
     """Find contacts and solve for their impulses.
 
     Args:
         detection: of the bodies.
+        solver: solves for the impulses of a step; overlaps, and what rests while others bounce, have their own.
 
     Attributes:
         residual: of the last problem, relative to that of no impulses; 0 without contacts.
+        iterations: of the last solve; 0 without contacts.
         memory: impulses of the last step.
     """
 
-    def __init__(self, detection: ContactDetection) -> None:
+    def __init__(self, detection: ContactDetection, solver: ImpulseSolver = sweeps_and_newton) -> None:
         self.detection, self.bodies, self.dimension = detection, detection.bodies, detection.dimension
-        self.residual, self.memory = 0.0, ContactMemory(len(self.bodies))
+        self.residual, self.iterations, self.memory, self._solver = 0.0, 0, ContactMemory(len(self.bodies)), solver
         bodies, shapes = self.bodies, detection.shapes
         self._reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
@@ -121,7 +131,7 @@ class ContactSolve:
         b[:, 0] -= contacts.target
         problem, others, V = self._problem(contacts, b, contacts.friction), np.flatnonzero(~may), self._velocities()
         if len(others):  # what rests on them does not fall
-            before[others] = problem.part(others).solve(EXACT)[0]
+            before[others] = problem.part(others).solve(EXACT).impulses
             V = V + self._answer(contacts.on_bodies(before, len(self.bodies)))
             free = contacts.velocities(V)[:, 0]
         a = np.clip((free - approach) / kick_dt, -FALL * g, FALL * g)
@@ -195,14 +205,14 @@ class ContactSolve:
             contacts: the contacts.
             start: impulses to start from; those of the last step if None.
         """
-        self.residual = 0.0
+        self.residual, self.iterations = 0.0, 0
         if not len(contacts):
             return np.zeros((0, self.dimension))
         b = contacts.velocities(self._velocities())
         b[:, 0] -= contacts.target
         start = self.memory.recall(contacts, self.bodies) if start is None else start
         problem = self._problem(contacts, b, contacts.friction)
-        impulses, self.residual = problem.solve(EXACT, start, UNSOLVED)
+        impulses, self.residual, self.iterations = self._solver(problem, start)
         for body, impulse in zip(self.bodies, contacts.on_bodies(impulses, len(self.bodies)), strict=True):
             body.push(impulse)
         return impulses
@@ -226,8 +236,7 @@ class ContactSolve:
             return None
         b = np.where(deep, RATE * gap, np.maximum(gap, 0.0))
         problem = self._problem(contacts, b[:, None], np.zeros(len(b)))
-        x, _ = problem.solve(ROUGH)
-        return self._answer(contacts.on_bodies(x, len(self.bodies)))
+        return self._answer(contacts.on_bodies(problem.solve(ROUGH).impulses, len(self.bodies)))
 
     def hold(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Let contacts that bear against walls and other solids take what impulses would move into them, for each body by itself.

@@ -8,7 +8,6 @@ from pathlib import Path
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.files.claims import one_line
 from warp_lcp.frames.meshio_format import Dress, holds
-from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.run.devices import free_memory
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
@@ -138,7 +137,7 @@ def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
 
 def _check_bodies(scene: Scene, source: str) -> None:
     """Refuse rigid bodies that overlap each other, walls or other solids."""
-    if not isinstance(scene, ParticleScene) or not any(solid.is_body for solid in scene.solid):
+    if not any(solid.is_body for solid in scene.solid):
         return
     from warp_lcp.material.particle_assembly import make_bodies, placed_solids
 

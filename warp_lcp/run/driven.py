@@ -293,7 +293,7 @@ class Run:
         table = simulation.scene.materials()[0]
         data = self.scene.model_dump(by_alias=True, exclude_none=True)
         data[table] = [*data.get(table, []), shape]
-        entries = load_scene(data).materials()[1]  # type: ignore[attr-defined]
+        entries = load_scene(data).materials()[1]
         try:
             return pour(simulation, entries[-1], f"{table}[{len(entries) - 1}] ({entries[-1].shape})")
         except ValueError as error:

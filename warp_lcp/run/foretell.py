@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -39,13 +38,16 @@ def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None)
         simulation: where it begins.
         seconds: a step, as measured; None: by the list of prices.
     """
-    if not (isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation)):
-        return []
-    steps = expected_steps(scene, simulation)
-    size = expected_bytes(scene, cast(Simulation, simulation), steps)
-    where = "by the list of prices, on one core" if seconds is None else "as measured"
+    where = "as measured"
+    if isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation):
+        steps = expected_steps(scene, simulation)
+        if seconds is None:
+            seconds, where = expected_step(scene, simulation), "by the list of prices, on one core"
+    else:
+        steps = longest_steps(scene, simulation)
+    size = expected_bytes(scene, simulation, steps)
     if seconds is None:
-        seconds = expected_step(scene, simulation)
+        return [("steps", f"about {steps:,}"), ("disk", f"about {in_words(size)}")]
     frames = scene.time.frame_count * FRAME_SECONDS + size * BYTE_SECONDS
     whole = steps * (seconds + ROW_SECONDS) + frames
     lasts = timedelta(seconds=round(whole)) if whole >= 10.0 else f"{whole:.2g} s"
@@ -108,10 +110,18 @@ def expected_steps(scene: ParticleScene, simulation: ParticleSimulation) -> int:
     return round(time.frame_count * max(a_frame + PIECE * min(a_frame, 1.0), 1.0))
 
 
-def expected_bytes(scene: ParticleScene, simulation: Simulation, steps: int) -> int:
+def longest_steps(scene: Scene, simulation: Simulation) -> int:
+    """Return how many steps a run takes if all are as long as the first may be."""
+    dt = min(max(simulation.stable_dt(), scene.time.dt_min), scene.time.dt_max)
+    count = scene.time.frame_count
+    return count * math.ceil(scene.time.duration / count / dt * (1.0 - 1e-9))
+
+
+def expected_bytes(scene: Scene, simulation: Simulation, steps: int) -> int:
     """Return about how much a run will leave on the disk: frames, of as many particles as there will be, checkpoints and the log."""
     output, wanted = scene.output, {"particles": scene.output.particles, "grid": scene.output.grid}
-    frame = [_grown(part, expected_growth(scene)) for part in simulation.frame() if wanted.get(part.name, True)]
+    growth = expected_growth(scene) if isinstance(scene, ParticleScene) else 1.0
+    frame = [_grown(part, growth) for part in simulation.frame() if wanted.get(part.name, True)]
     each = frame_bytes(frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format)
     state = sum(array.nbytes for array in simulation.state().values())
     log = steps * LOG_BYTES * (len(simulation.columns()) + 5)

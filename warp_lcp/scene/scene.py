@@ -17,7 +17,7 @@ from warp_lcp.grid.voxelize import STRAY
 from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.scene.camera import Camera
 from warp_lcp.scene.presets import PresetName, fill_in, preset_line
-from warp_lcp.scene.shapes import Liquid, Shape, Solid, Wall
+from warp_lcp.scene.shapes import BODY_FRICTION, STICKS, Liquid, MaterialProperties, Shape, Solid, Wall
 from warp_lcp.scene.table import Complaint, KeyFault, SceneError, Table, Vector, refuse, validate
 from warp_lcp.scene.unusual import scene_notes
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
@@ -250,6 +250,20 @@ class Scene(Table):
         """Return the cells along x, y and z; one along z in 2-D."""
         x, y, z = [round(side / self.spacing) for side in [*self.domain.size, self.spacing][:3]]
         return x, y, z
+
+    @property
+    def endless(self) -> tuple[int, ...]:
+        """Return the axes without an end: what leaves at one side comes in at the other."""
+        return ()
+
+    def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
+        """Return the key of the material's shapes in the file, such as `liquid`, and the shapes; bodies alone have none."""
+        return "material", ()
+
+    def body_frictions(self) -> list[float]:
+        """Return Coulomb's coefficient of each solid's surface against bodies and walls."""
+        given = [BODY_FRICTION if solid.friction is None else solid.friction for solid in self.solid]
+        return [STICKS if friction == "stick" else float(friction) for friction in given]
 
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys. Subclasses add theirs to `super().complaints()`."""

@@ -40,13 +40,16 @@ for (int t = first; t < last; ++t) {
     if (reference <= 1e-15*sqrt(size)) {
         for (int i = low; i < high; ++i) x[i] = 0.0;
         residual[t] = 0.0;
+        rounds[t] = 0.0;
         continue;
     }
     for (int i = low; i < high; ++i) { x[i] = clipped(i, x[i]); way[i] = 0.0; }
     gather();
     double norm = left(), least = norm, before = 0.0;
+    int done = 0;
     for (int i = low; i < high; ++i) best[i] = x[i];
     for (int round = 1; round <= most && least > rtol*reference; ++round) {
+        done = round;
         double square = 0.0, change = 0.0;
         for (int i = low; i < high; ++i) {
             const double old = x[i], fresh = clipped(i, old - velocity(i)/d[i]);
@@ -74,4 +77,5 @@ for (int t = first; t < last; ++t) {
     }
     for (int i = low; i < high; ++i) x[i] = best[i];
     residual[t] = least/reference;
+    rounds[t] = done;
 }

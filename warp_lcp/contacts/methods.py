@@ -1,0 +1,86 @@
+"""The methods that solve for the impulses of contacts, and the model of friction that each of them takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+
+import warp_lcp as wl
+from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
+from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
+from warp_lcp.rigid.contacts import jacobian
+from warp_lcp.solvers.registry import METHODS
+
+DEFAULT = "sweeps-and-newton"  # of `warp_lcp.rigid.contact_problem`: what bodies in liquids and in sand are solved by
+PIVOTING = 1e-8  # of the normal and the friction problem of a staggered iteration, solved by pivoting
+
+# |r_t| <= mu r_n along each tangent: bounds that are affine in x
+BOXED: dict[str, Callable[[ContactSystem], Any]] = {
+    "nncg": lambda s: wl.NNCG(),
+    "psor": lambda s: wl.ProjectedSOR(omega=1.0),
+    "projected-jacobi": lambda s: wl.ProjectedJacobi(),
+    "blocked-gauss-seidel": lambda s: wl.BlockedGaussSeidel(blocks=s.blocks()),
+    "subspace-minimization": lambda s: wl.SubspaceMinimization(precision="double"),
+    "staggering": lambda s: wl.Staggering(blocks=s.staggered(), solvers=wl.IncrementalPivoting(), eta=PIVOTING),
+}
+# a cone of several sides and the slip as one more unknown: an unsymmetric linear complementarity problem
+STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
+    "lemke": lambda s: wl.Lemke(),
+    "fischer-newton": lambda s: wl.FischerNewton(),
+    "minimum-map-newton": lambda s: wl.MinimumMapNewton(),
+    "interior-point": lambda s: wl.InteriorPoint(precision="double"),
+    "primal-dual-active-set": lambda s: wl.PrimalDualActiveSet(),
+}
+assert {*BOXED, *STEWART_TRINKLE} <= METHODS.keys()
+
+
+class MethodOfChoice:
+    """Solve the problem of a step's contacts by a method of `wl.METHODS`; an `ImpulseSolver`.
+
+    Args:
+        name: of the method; DEFAULT for none of them.
+        directions: sides of the friction cone of Stewart and Trinkle, for the methods of that model.
+        tolerance: residual to reach, relative to that of no impulses.
+        most: iterations.
+        device: Warp device's name.
+
+    Attributes:
+        status: of the last solve.
+    """
+
+    def __init__(self, name: str, *, directions: int, tolerance: float, most: int, device: str) -> None:
+        self._method = BOXED.get(name) or STEWART_TRINKLE.get(name)
+        self._model: ContactModel = StewartTrinkleModel(directions) if name in STEWART_TRINKLE else BoxedModel()
+        self._stopping = wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most)
+        self._device, self.status = device, wl.SolveStatus.CONVERGED
+
+    def __call__(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
+        """Return the impulses; those of the least residual where the method does not converge, as `status` says."""
+        self.status = wl.SolveStatus.CONVERGED
+        if self._method is None:
+            found = problem.solve(self._stopping, start, self._stopping.rtol)
+            if found.residual > self._stopping.rtol:
+                self.status = wl.SolveStatus.MAX_ITERATIONS
+            return found
+        if not (problem.b[:, 0] < 0.0).any():  # nothing approaches: impulses are 0
+            return ContactImpulses(np.zeros_like(start), 0.0, 0)
+        system = contact_system(problem)
+        lcp = self._model.problem(system).lcp(device=self._device)
+        x0 = self._model.guess(system, start.ravel())
+        result = wl.solve(lcp, self._method(system), stopping=self._stopping, x0=x0)
+        self.status = result.status
+        impulses = self._model.impulses(system, result.x.numpy()).reshape(start.shape)
+        return ContactImpulses(impulses, float(result.relative_residual), result.iterations)
+
+
+def contact_system(problem: ContactProblem) -> ContactSystem:
+    """Return u = B r + b with B = J J' + diag(yields) as a matrix, shape (rows of all contacts, the same)."""
+    J = jacobian(problem.first, problem.second, problem.one, problem.other, problem.bodies)
+    B = csr_array(J @ J.T)
+    _, yields = problem.yields()
+    B.setdiag(B.diagonal() + yields)
+    B = csr_array(0.5 * (B + B.T))  # rounding must not make it unsymmetric
+    return ContactSystem("contacts", B, problem.b.ravel(), problem.friction, dim=problem.one.shape[1])

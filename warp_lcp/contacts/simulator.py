@@ -1,0 +1,147 @@
+"""The simulation of rigid bodies alone: gravity, contacts, motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from warp_lcp.contacts.methods import MethodOfChoice
+from warp_lcp.contacts.scene import ContactScene
+from warp_lcp.material.particle_assembly import make_bodies, placed_solids
+from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import NoStopwatch, Part, SimulationFailed, Stopwatch, Surface
+
+COLUMNS = ("kinetic_energy", "potential_energy", "max_speed", "solver", "solve_status", "solve_iterations", "solve_residual")
+
+
+class ContactSimulation:
+    """Rigid bodies on their way, as `RigidBodies` moves them.
+
+    Velocities are those of the middle of the last step: v' = v + g (dt + dt_before) / 2 + M^-1 J' r, x' = x + dt v'.
+
+    Args:
+        scene: what is simulated.
+        bodies: the scene's.
+        method: solves for the impulses of their contacts.
+
+    Attributes:
+        time: of the state [s].
+        step_count: steps taken.
+        watch: measures the stages of a step.
+    """
+
+    def __init__(self, scene: ContactScene, bodies: RigidBodies, method: MethodOfChoice) -> None:
+        self.scene, self.bodies, self._method = scene, bodies, method
+        self.time, self.step_count, self._last_dt = 0.0, 0, 0.0
+        self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
+        self.watch: Stopwatch = NoStopwatch()
+
+    def stable_dt(self) -> float:
+        """Return the step [s] in which the fastest body goes by `time.cfl` sizes of the smallest one."""
+        speed = self.bodies.top_speed(self.scene.time.dt_max, float(np.linalg.norm(self.gravity)))
+        size = min(shape.size for shape in self.bodies.shapes)
+        return self.scene.time.cfl * size / speed if speed > 0.0 else np.inf
+
+    def step(self, dt: float) -> dict[str, float | int | str | None]:
+        """Advance by dt [s] and return a row of the log.
+
+        Raises:
+            SimulationFailed: a body is not finite any more.
+        """
+        with self.watch.stage("contacts"):
+            self.bodies.begin_step(self.time, dt, self.gravity, 0.5 * (self._last_dt + dt))
+            self.bodies.solve_contacts()
+        with self.watch.stage("motion"):
+            self.bodies.end_step(dt)
+        if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
+            raise SimulationFailed(f"step {self.step_count + 1}: {trouble}")
+        self.bodies.leave()
+        self.time, self.step_count, self._last_dt = self.time + dt, self.step_count + 1, dt
+        return self._row(dt)
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns.
+
+        Energies [J; J/m in 2-D] are those of the step's middle, of which the velocities are; potential_energy is 0 at the origin.
+        max_speed: of a point of a body [m/s]. solve_residual: of the problem of the contacts' impulses as the method takes it, relative
+        to that of no impulses; empty, as what stands before it, where nothing touches. The bodies' are those of `RigidBodies.columns`.
+        """
+        return (*COLUMNS, *self.bodies.columns())
+
+    def frame(self) -> list[Part]:
+        """Return the surfaces of the bodies."""
+        surface = self.bodies.surfaces()
+        return [Surface("bodies", surface.points, surface.corners, surface.fields)]
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return everything that `restore` needs."""
+        clock = np.array([self.time, self._last_dt])
+        return {"clock": clock, "step_count": np.array(self.step_count), **self.bodies.state()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            ValueError: it is of other bodies.
+        """
+        missing = {"clock", "step_count", "bodies"} - set(state)
+        if missing:
+            raise ValueError(f"the state is not one of bodies alone: it has no {', '.join(sorted(missing))}")
+        self.bodies.restore(state)
+        self.time, self._last_dt = (float(value) for value in state["clock"])
+        self.step_count = int(state["step_count"])
+
+    def notes(self) -> list[str]:
+        """Return facts for the start of a run, and settings that look like mistakes."""
+        sides = " x ".join(f"{side:g}" for side in self.scene.domain.size)
+        count = len(self.bodies.bodies)
+        room = "a domain without far ends" if self.scene.domain.boundless else f"{sides} m"
+        return [f"{count} rigid {'body' if count == 1 else 'bodies'} in {room}", *self.scene.notes()]
+
+    def _row(self, dt: float) -> dict[str, float | int | str | None]:
+        bodies, solved = self.bodies, self.bodies.contacts > 0
+        momentum = np.sum([body.momentum for body in bodies.bodies], axis=0)
+        energy = bodies.potential_energy(self.gravity) + 0.5 * dt * float(momentum @ self.gravity)  # back by half a step
+        own: dict[str, float | int | str | None] = {
+            "kinetic_energy": bodies.kinetic_energy(),
+            "potential_energy": energy,
+            "max_speed": bodies.top_speed(0.0),
+            "solver": self.scene.solver.method if solved else None,
+            "solve_status": self._method.status.name if solved else None,
+            "solve_iterations": bodies.contact_iterations if solved else None,
+            "solve_residual": float(bodies.contact_residual) if solved else None,
+        }
+        return own | bodies.row()
+
+
+class ContactSimulator:
+    """The plug-in for rigid bodies that touch."""
+
+    name = "contacts"
+    summary = "rigid bodies that stack, slide, topple and bounce"
+    scene_model = ContactScene
+
+    def create(self, scene: Scene, *, device: str, folder: Path) -> ContactSimulation:
+        """Build a simulation of `scene`.
+
+        Args:
+            scene: a ContactScene.
+            device: a Warp device's name; of the methods but the default one, which works on the CPU.
+            folder: where the files are that the scene names.
+
+        Raises:
+            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+        """
+        if not isinstance(scene, ContactScene):
+            raise ValueError("scene.simulator: contacts needs a scene of rigid bodies")
+        solver = scene.solver
+        method = MethodOfChoice(
+            solver.method, directions=solver.directions, tolerance=solver.tolerance, most=solver.max_iterations, device=device
+        )
+        bodies = make_bodies(scene, placed_solids(scene, folder), partial(RigidBodies, solver=method))
+        assert bodies is not None  # of which the scene has one
+        return ContactSimulation(scene, bodies, method)
