@@ -10,7 +10,7 @@ SCENES = ("cube", "brick", "plane")
 OURS = ("petsc", "newton", "multigrid")
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("ranks", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_petscs_own_methods_find_the_same_solution_and_active_set(mpi, ranks):
     lines = mpi(ranks, PROGRAM, *SCENES).stdout.splitlines()
     found = json.loads(next(line for line in lines if line.startswith("{")))

@@ -116,7 +116,7 @@ def logs():
     return found
 
 
-@pytest.mark.parametrize("ranks", [2, 4])
+@pytest.mark.parametrize("ranks", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs, ranks):
     mpi(ranks, PROGRAM, "run", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}, seconds=300.0)
     for name, (rows, cells, pressure) in logs.items():
@@ -170,6 +170,7 @@ def test_a_dam_break_has_the_log_of_one_process(mpi, tmp_path):
     same(json.loads((tmp_path / "dam.json").read_text()), rows, 3e-6)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
     environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
     for ranks, what in ((2, "keep,go-on"), (4, "go-on")):
