@@ -48,6 +48,9 @@ if TYPE_CHECKING:
     from warp_lcp.fluids.distributed import DistributedLiquid
 
 
+MOST_PARTS = 8  # of the viscous solve in a step that is much shorter than the last one
+
+
 class LiquidSimulation(ParticleSimulation):
     """A liquid in progress; implements `warp_lcp.simulation.Simulation`.
 
@@ -311,7 +314,7 @@ class LiquidSimulation(ParticleSimulation):
         self.extend(window, projection.known, projection.kind, projection.contact)
         # A step much shorter than the last one, as a retry is, still has half of that to make up for: equations no stiffer than its own
         # length asks for are solved several times.
-        parts, total = max(1, int(self.kick_dt / dt)), None
+        parts, total = min(max(1, int(self.kick_dt / dt)), MOST_PARTS), None
         for part in range(parts):
             if part:
                 viscosity.keep_change()
