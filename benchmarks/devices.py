@@ -57,7 +57,7 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _solves(n: int, options: Options) -> list[Record]:
-    """Time solves of a splash whose walls let go, and sweeps of PGS."""
+    """Time solves of a splash with separating walls, and sweeps of PGS."""
     problem, device = splash(n).problem("walls", options.device), options.device
     work: dict[str, Callable[[], object]] = {}
     found: dict[str, wl.SolveResult] = {}

@@ -190,6 +190,30 @@ def distance_for(share: float):
     return 0.5 * (low + high)
 
 
+@wp.func
+def open_mean(p: wp.vec3, planes: int, blocked: MARKS, share: FIELD):
+    """Return the share interpolated at a point from the open cells around it, and the weight of these cells, 0 if there are none."""
+    a = int(wp.floor(p[0]))
+    b = int(wp.floor(p[1]))
+    c = int(wp.floor(p[2]))
+    total = float(0.0)
+    weight = float(0.0)
+    for dk in range(planes):
+        for dj in range(2):
+            for di in range(2):
+                w = wp.where(di == 0, 1.0 - (p[0] - float(a)), p[0] - float(a))
+                w *= wp.where(dj == 0, 1.0 - (p[1] - float(b)), p[1] - float(b))
+                if planes == 2:
+                    w *= wp.where(dk == 0, 1.0 - (p[2] - float(c)), p[2] - float(c))
+                if w > 1e-3:
+                    if blocked[c + dk, b + dj, a + di] == wp.int8(0):
+                        total += w * share[c + dk, b + dj, a + di]
+                        weight += w
+    if weight > 0.0:
+        total = total / weight
+    return total, weight
+
+
 @list_kernel(MODULE)
 def begin_kernel(
     i, cells: INTS, points: POINTS, way: FLOATS, lean: FLOATS, cosine: float, planes: int, blocked: MARKS, share: FIELD, flat: FLOATS
@@ -209,21 +233,8 @@ def begin_kernel(
     a = int(wp.floor(p[0]))
     b = int(wp.floor(p[1]))
     c = int(wp.floor(p[2]))
-    total = float(0.0)
-    weight = float(0.0)
-    for dk in range(planes):
-        for dj in range(2):
-            for di in range(2):
-                w = wp.where(di == 0, 1.0 - (p[0] - float(a)), p[0] - float(a))
-                w *= wp.where(dj == 0, 1.0 - (p[1] - float(b)), p[1] - float(b))
-                if planes == 2:
-                    w *= wp.where(dk == 0, 1.0 - (p[2] - float(c)), p[2] - float(c))
-                if w > 1e-3:
-                    if blocked[c + dk, b + dj, a + di] == wp.int8(0):
-                        total += w * share[c + dk, b + dj, a + di]
-                        weight += w
+    value, weight = open_mean(p, planes, blocked, share)
     if weight > 0.0:
-        value = total / weight
         fall = way[i] * lean[cells[i]]
         if value > TAIL and value < 1.0 - TAIL:
             value = filled(fall - distance_for(value))
@@ -257,24 +268,8 @@ def continue_kernel(
     [cells] turns shares into distances and back. A cell reads open cells and writes none.
     """
     p = points[i]
-    a = int(wp.floor(p[0]))
-    b = int(wp.floor(p[1]))
-    c = int(wp.floor(p[2]))
-    total = float(0.0)
-    weight = float(0.0)
-    for dk in range(planes):
-        for dj in range(2):
-            for di in range(2):
-                w = wp.where(di == 0, 1.0 - (p[0] - float(a)), p[0] - float(a))
-                w *= wp.where(dj == 0, 1.0 - (p[1] - float(b)), p[1] - float(b))
-                if planes == 2:
-                    w *= wp.where(dk == 0, 1.0 - (p[2] - float(c)), p[2] - float(c))
-                if w > 1e-3:
-                    if blocked[c + dk, b + dj, a + di] == wp.int8(0):
-                        total += w * share[c + dk, b + dj, a + di]
-                        weight += w
+    value, weight = open_mean(p, planes, blocked, share)
     if weight > 0.0:
-        value = total / weight
         if cosine != 0.0 and value > TAIL and value < 1.0 - TAIL:
             place = spread * 1.41421356 * wp.erfinv(2.0 * value - 1.0) + way[i] * lean[cells[i]]
             value = 0.5 + 0.5 * wp.erf(place / (1.41421356 * spread))

@@ -44,7 +44,7 @@ def small(name: str) -> str:
 
 
 def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
-    """Try what can be done with a scene, and then with the folder of its run; a window and a page wait for somebody."""
+    """Run every command on a scene and on its run folder, except those that open a window."""
     out, problems = tmp_path / "out", tmp_path / "problems"
     sets = [word for override in overrides for word in ("--set", override)]
     loaded = load_scene(str(scene))
@@ -73,7 +73,7 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
 
 @pytest.fixture
 def nobody_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Somebody ends the server of a page at once."""
+    """End the server of the live page at once."""
 
     def end(server: Any) -> None:
         raise KeyboardInterrupt

@@ -45,7 +45,7 @@ def test_no_method_calls_the_start_a_solution(name):
     """[[2, 1], [1, 2]] and b = (-1, 1e16): (0, 0) was called CONVERGED, and (.5, 0) is right."""
     problem = wl.LCP(np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([-1.0, 1e16]))
     result = wl.solve(problem, METHODS[name](), stopping=CRITERIA)
-    if name == "penalty":  # springs of 1e6 d give way to 1e16, and the residual grows: it says so
+    if name == "penalty":  # its penalty of 1e6 d is small beside b = 1e16: the residual grows
         assert result.status is wl.SolveStatus.DIVERGED
         return
     assert result, result.status

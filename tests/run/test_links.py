@@ -1,4 +1,4 @@
-"""A folder that somebody else has prepared: nothing that a run writes goes through its links, hard links or pipes."""
+"""A run writes through no link, hard link or pipe that another user has put into its folder."""
 
 import os
 import shutil

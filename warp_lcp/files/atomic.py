@@ -1,4 +1,4 @@
-"""Write files whole or not at all, and never through a link that somebody has laid in their place."""
+"""Write files whole or not at all, and never through a link."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def replacing_by_name(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[tuple[_Folder, str]]:
-    """Give the folder of a file and a name there that nobody knows before; what has that name at the end is deleted."""
+    """Yield the folder and a random temporary name beside a file; delete the temporary file at the end."""
     name = f".{path.name.removeprefix('.').removesuffix(SUFFIX)}.{secrets.token_hex(8)}{SUFFIX}"
     with _Folder.opened(path.parent) as folder:
         try:
@@ -202,7 +202,7 @@ def _write_over(spare: Path, data: bytes, path: Path) -> bool:
     with _temporary(path) as (folder, name):
         try:
             descriptor = open_in_place(spare, os.O_RDWR)
-        except OSError:  # nobody has kept room, or something else lies in its place
+        except OSError:  # there is no reserved file, or another file has its name
             return False
         with open(descriptor, "r+b") as file:
             folder.rename(spare.name, name)

@@ -33,7 +33,7 @@ from warp_lcp.simulation import InputError
 LOOPBACK = "127.0.0.1"
 PORT = 8765  # unless told
 HOST = re.compile(r"(?:127\.0\.0\.1|localhost)(?::\d{1,5})?")  # that a browser may have asked for, at a port that may be forwarded here:
-# a name of somebody else's that leads here may not read the run
+# refuse other host names that resolve to this machine (DNS rebinding)
 PATIENCE = 10.0  # seconds without a byte after which a connection is closed
 MOST_CONNECTIONS = 16  # of which the oldest gives way to a new one, and
 MOST_ANSWERED = 64  # requests at a time, those of connections that are gone included; more are turned away

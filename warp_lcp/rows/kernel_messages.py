@@ -73,7 +73,7 @@ def _native_messages_dropped() -> Iterator[None]:
     """Keep what native code writes to the error stream off it, where there is one."""
     try:
         kept = os.dup(2)
-    except OSError:  # it is closed: nobody reads
+    except OSError:  # the stream is closed
         yield
         return
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -20,7 +20,7 @@ FRACTION = 0.25 * math.pi  # of which angles in radians are often multiples
 DIGITS = 1e-3  # to how much, relative
 STRONG = 50.0  # gravity [m/s^2]: twice that of Jupiter
 FAST = 340.0  # of a velocity [m/s]: sound in air, beyond which no liquid or sand is incompressible for long
-MOVED = 0.5  # cells: what moves less by the end of a run, nobody sees
+MOVED = 0.5  # cells: a motion shorter than this by the end of a run is not visible
 
 
 @dataclass(frozen=True)

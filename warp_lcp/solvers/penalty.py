@@ -137,7 +137,7 @@ class PenaltyWorkspace(IterateMemory):
         return self.active_set.monotone_step()
 
     def policy_step(self, x: wp.array[Any]) -> Step:
-        """Solve with the springs of the unknowns that are beyond their bounds, and find these anew."""
+        """Solve with a penalty on the unknowns beyond their bounds, then update that set."""
         s, p = self.settings, self.problem
         first = self.steps == 0
         if first:
