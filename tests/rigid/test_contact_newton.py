@@ -76,7 +76,7 @@ def test_newton_finds_the_impulses_of_sweeps(method, dimension, seed):
 
 
 def test_islands_that_sweeps_solve_stay_as_they_are():
-    """And of the others Newton's residual is told."""
+    """The residual of the other groups is that of Newton's method."""
     made = problem_of(3, 611)
     rough = StoppingCriteria(rtol=1e-9, max_iterations=16)
     swept, before, _ = made.solve(rough)

@@ -100,7 +100,7 @@ class RigidBodies:
         """Let gravity act, and contacts; hold bodies that rest against walls and solids that the scene moves or that stand.
 
         Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it meets a body on the floor as it meets the
-        floor. `solve_contacts` decides anew whether contacts bear.
+        floor. `solve_contacts` updates which contacts bear.
 
         Args:
             time: of the state [s].
