@@ -53,6 +53,7 @@ def test_the_late_one_is_named(posts, expected):
     said = verdict(dict(enumerate(posts)))
     assert said.startswith(expected)
     assert bool(said) == bool(expected)
+    assert verdict(dict(reversed(list(enumerate(posts))))) == said  # whichever rank says it
 
 
 def test_a_post_is_there_whole_or_not_at_all(tmp_path):

@@ -179,8 +179,8 @@ def verdict(posts: Mapping[int, Post | None]) -> str:
     Args:
         posts: of all ranks, which have not gone on for long; None: it tells nothing.
     """
-    inside = {rank: post for rank, post in posts.items() if post and post.name}
-    outside = {rank: post for rank, post in posts.items() if post and not post.name}
+    inside = {rank: post for rank, post in sorted(posts.items()) if post and post.name}
+    outside = {rank: post for rank, post in sorted(posts.items()) if post and not post.name}
     silent = sorted(rank for rank, post in posts.items() if post is None)
     if not inside and not silent:
         return ""  # all compute
