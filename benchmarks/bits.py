@@ -120,15 +120,15 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
         for method in (wl.ProjectedMultigrid, wl.MinimumMapNewton, MPRGP, wl.InteriorPoint, wl.FischerNewton):
             made = method(precision=precision)
             for kind in ("walls", "everywhere", "linear"):
-                yield f"splash 32 {kind}", splash(32).problem(kind, "cpu"), made, None
-            yield "cut splash 32", cut_cells(splash(32)).problem("walls", "cpu"), made, None
+                yield f"splash 32 {kind}", splash(32).lcp(kind, device="cpu"), made, None
+            yield "cut splash 32", cut_cells(splash(32)).lcp("walls", device="cpu"), made, None
             yield "closed box", wl.LCP(wl.GridPoisson(box, device="cpu"), b - b.mean(), 0.0), made, None
         low = wl.LowRankOperator(columns, [100.0, 100.0], device="cpu")
         A = wl.SumOperator(wl.GridPoisson(np.where(b > 1.5, wl.AIR, wl.FLUID), device="cpu"), low)
         for coupled in (wl.ProjectedMultigrid(precision=precision), wl.MinimumMapNewton(precision=precision)):
             yield "low rank", wl.LCP(A, b, 0.0), coupled, None
     for sweeping in (wl.ProjectedSOR(), wl.NNCG()):
-        yield "splash 32 walls", splash(32).problem("walls", "cpu"), sweeping, None
+        yield "splash 32 walls", splash(32).lcp("walls", device="cpu"), sweeping, None
 
 
 def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:

@@ -125,7 +125,7 @@ class Case:
 
     def to_tolerances(self) -> None:
         """Solve cold to the tightest tolerance and keep the history; set-up is added later."""
-        problem = self.scene.problem(self.bounds, self.device)
+        problem = self.scene.lcp(self.bounds, device=self.device)
         work = self.solver.init(problem)
         result = wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work)
         self.history, reference = result.history, result.residual / result.relative_residual if result.relative_residual else 1.0
@@ -143,7 +143,7 @@ class Case:
     def _in_place(self) -> tuple[wl.LCP, wp.array[Any]]:
         """Return the problem with b in the stored layout, as a time-stepping code has it, and b."""
         b = self._stored(self.scene.b)
-        return self.scene.problem(self.bounds, self.device, b), b
+        return self.scene.lcp(self.bounds, device=self.device, b=b), b
 
     def _stored(self, values: np.ndarray) -> wp.array[Any]:
         return wp.array(np.pad(values, 1), dtype=wp.float64, device=self.device)

@@ -58,7 +58,7 @@ def measure(options: Options, out: Path) -> Results:
 
 def _solves(n: int, options: Options) -> list[Record]:
     """Time solves of a splash with separating walls, and sweeps of PGS."""
-    problem, device = splash(n).problem("walls", options.device), options.device
+    problem, device = splash(n).lcp("walls", device=options.device), options.device
     work: dict[str, Callable[[], object]] = {}
     found: dict[str, wl.SolveResult] = {}
 
@@ -85,7 +85,7 @@ def _kernels(n: int, options: Options) -> list[Record]:
     """Time the product with the Laplacian of a full box and a multigrid cycle."""
     box = wl.GridPoisson(np.full((n,) * 3, wl.FLUID, np.int8), device=options.device)
     x, y = (wp.ones(box.layout.size, dtype=wp.float32, device=options.device) for _ in range(2))
-    problem = splash(n).problem("linear", options.device)
+    problem = splash(n).lcp("linear", device=options.device)
     kept: Any = wl.ProjectedMultigrid().init(problem)
     wl.solve(problem, wl.ProjectedMultigrid(), stopping=STOPPING, workspace=kept)
 

@@ -129,7 +129,7 @@ class Verdict:
     def residuals(self) -> str:
         """Evaluate residuals of a splash by no code of the solvers."""
         scene, n = splash(32 if self.rehearsal else 128), 32 if self.rehearsal else 128
-        problem = scene.problem("walls", self.device)
+        problem = scene.lcp("walls", device=self.device)
         result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-7))
         lower = np.where(scene.wall, 0.0, -np.inf)
         start, end = (np.linalg.norm(natural(scene.cells, scene.b, lower, x)) for x in (np.zeros(scene.cells.shape), result.x.numpy()))
@@ -221,7 +221,7 @@ class Verdict:
         """Time cold solves and steps, and put them beside the model's tables."""
         rows, steps = [], []
         for n in (16, 32) if self.rehearsal else (128, 256, 512):
-            problem, method = splash(n).problem("walls", self.device), wl.ProjectedMultigrid()
+            problem, method = splash(n).lcp("walls", device=self.device), wl.ProjectedMultigrid()
             workspace, taken = method.init(problem), []
             for _ in range(4):  # the first loads kernels and captures graphs
                 wp.synchronize()

@@ -78,7 +78,7 @@ def large(device: str, n: int = 48) -> Arrays:
     """Return x of a splash, large enough for all paths of a device."""
     found = {}
     for method in (wl.ProjectedMultigrid(), wl.MinimumMapNewton(), wl.InteriorPoint(), wl.MPRGP()):
-        result = wl.solve(splash(n).problem("walls", device), method, stopping=wl.StoppingCriteria(rtol=1e-7))
+        result = wl.solve(splash(n).lcp("walls", device=device), method, stopping=wl.StoppingCriteria(rtol=1e-7))
         found[f"{type(method).__name__}, {n}^3: {result.status.name}"] = result.x.numpy()
     return found
 

@@ -164,7 +164,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
 
 def solve(n: int) -> tuple[Work, int]:
     """Return the work of a cold solve of a splash with separating walls to 1e-6, and its iterations."""
-    problem, method, found = splash(n).problem("walls", "cpu"), wl.ProjectedMultigrid(), list[wl.SolveResult]()
+    problem, method, found = splash(n).lcp("walls", device="cpu"), wl.ProjectedMultigrid(), list[wl.SolveResult]()
 
     def make() -> Callable[[], object]:
         workspace = method.init(problem)

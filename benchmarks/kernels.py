@@ -168,7 +168,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
     with mock.patch.object(RowPass, "bind", listening):
         for solver, most in ((wl.ProjectedMultigrid(), 5), (wl.MinimumMapNewton(), 4), (wl.ProjectedSOR(), 1)):
             for bounds in ("walls", "linear") if isinstance(solver, wl.ProjectedMultigrid) else ("walls",):
-                wl.solve(scene.problem(bounds, device), solver, stopping=wl.StoppingCriteria(rtol=0, max_iterations=most))
+                wl.solve(scene.lcp(bounds, device=device), solver, stopping=wl.StoppingCriteria(rtol=0, max_iterations=most))
         A = wl.GridPoisson(scene.cells, device=device, **scene.faces)
         x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device=device)
         A.stencil.product(x, wp.zeros_like(x))

@@ -115,7 +115,7 @@ def measure(options: Options, out: Path) -> Results:
 
 def floor(scene: Splash, bounds: str, precision: str, device: str) -> Record:
     """Solve until no step makes the residual smaller; return that over the residual at 0, computed here and as the solve tells it."""
-    result = wl.solve(scene.problem(bounds, device), wl.ProjectedMultigrid(precision=precision), stopping=ENDLESS)
+    result = wl.solve(scene.lcp(bounds, device=device), wl.ProjectedMultigrid(precision=precision), stopping=ENDLESS)
     x = result.x.numpy().astype(np.float64).reshape(scene.b.shape)
     norms = [float(np.linalg.norm(natural(scene.cells, scene.b, scene.lower(bounds), p))) for p in (x, np.zeros_like(x))]
     figures = {"floor": Figure(norms[0] / norms[1]), "told": Figure(result.relative_residual), "iterations": Figure(result.iterations)}

@@ -153,7 +153,7 @@ def compare() -> None:
     rows, floors = [], []
     for n in SIZES:
         scene = splash(n)
-        problem = scene.problem("walls", "cpu")
+        problem = scene.lcp("walls", device="cpu")
         for rtol in TOLERANCES:
             found = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=rtol))
             x, norm = found.x.numpy(), lambda r, unit=found.history[0].residual: float(np.linalg.norm(r.ravel()) / unit)

@@ -56,7 +56,7 @@ def test_operators():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"solver": "lemke"}, "solver is a str"),
+        ({"solver": "lemk"}, "solver = 'lemk': must be one of accelerated-projected-gradient, .*did you mean 'lemke'"),
         ({"solver": wl.Lemke}, "solver is the class Lemke"),
         ({"stopping": 1e-6}, "stopping is a float"),
         ({"x0": 0.0}, r"x0 has shape \(\)"),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from warp_lcp.default import default_method, solve
 from warp_lcp.gradients.vjp import Gradients, vjp
 from warp_lcp.linear_complementarity import linear_complementarity
+from warp_lcp.monitor import plot_convergence, print_progress
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators import (
     AIR,
@@ -130,6 +131,8 @@ __all__ = [
     "enumerate_batch",
     "get_threads",
     "linear_complementarity",
+    "plot_convergence",
+    "print_progress",
     "read_frame",
     "recommend",
     "set_threads",

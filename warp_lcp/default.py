@@ -26,6 +26,7 @@ from warp_lcp.recommend import Recommendation, method_for, recommend, steps_allo
 from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
+from warp_lcp.solvers.registry import method_of
 
 SMALL = 600  # unknowns up to which a factorization of a dense matrix takes a hundredth of a second
 LARGE = 2000  # unknowns from which it pays to look whether a matrix is a grid's
@@ -52,22 +53,24 @@ def default_method(problem: LCP) -> Solver:
 
 
 def solve(
-    problem: LCP | ConvexSetProblem, solver: Solver | None = None, *, stopping: StoppingCriteria | MeanCriteria | None = None,
+    problem: LCP | ConvexSetProblem, solver: Solver | str | None = None, *, stopping: StoppingCriteria | MeanCriteria | None = None,
     x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None, **misplaced: Never,
 ) -> SolveResult:  # fmt: skip
     """Solve a problem by a method.
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
-        solver: the method, say `MinimumMapNewton()`. None: what `wl.recommend` names, and where that
-            fails, its alternatives, each from the same start. Their steps add up, no more than
-            `stopping` allows in all; the history has all of them, and the result's `method` names
-            the one that found x. Sparse matrices that are a compact stencil on a box of cells in its
-            natural order, x first, are then solved as such, which the result's `grid` says.
+        solver: the method, say `wl.MinimumMapNewton()`, or its name in `wl.METHODS` for its default
+            settings, say "psor". None: what `wl.recommend` names, and where that fails, its
+            alternatives, each from the same start. Their steps add up, no more than `stopping`
+            allows in all; the history has all of them, and the result's `method` names the one that
+            found x. Sparse matrices that are a compact stencil on a box of cells in its natural
+            order, x first, are then solved as such, which the result's `grid` says.
         stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that `wl.recommend` gives if there is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
         workspace: what `solver.init(problem)` returned, to use its memory again.
-        callback: called with each Record as it is made; where it raises StopIteration, the solve ends with STOPPED.
+        callback: called with each Record as it is made, say `wl.print_progress`; where it raises StopIteration,
+            the solve ends with STOPPED.
         misplaced: nothing; other options are refused.
 
     Returns:
@@ -88,11 +91,12 @@ def solve(
     if solver is None and isinstance(problem, ConvexSetProblem):
         raise ValueError(f"solver: a {type(problem).__name__} is solved by methods of its own, name one")
     check_criteria(stopping)
-    if solver is None and isinstance(problem, LCP):
+    method: Any = method_of(solver, "solver")
+    if method is None and isinstance(problem, LCP):
         return _solve_by_choice(problem, stopping, x0, callback)
-    if workspace is None and isinstance(problem, LCP) and solver is not None:
-        return _solve_in_order(problem, solver, stopping, x0, callback)
-    return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)  # type: ignore[arg-type]  # is refused
+    if workspace is None and isinstance(problem, LCP) and method is not None:
+        return _solve_in_order(problem, method, stopping, x0, callback)
+    return solve_by(problem, method, stopping=stopping, x0=x0, workspace=workspace, callback=callback)
 
 
 def _solve_by_choice(

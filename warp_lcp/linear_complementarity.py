@@ -18,7 +18,7 @@ from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
-from warp_lcp.solvers.registry import METHODS
+from warp_lcp.solvers.registry import method_of
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
@@ -61,9 +61,8 @@ def linear_complementarity(
         x0: a guess, of b's shape.
         tol: relative tolerance, in [0, 1): of the natural residual's norm, relative to that at the projection of 0 onto the bounds.
         atol: absolute tolerance of that norm, >= 0, in the units of b.
-        method: a method with its settings, say `wl.InteriorPoint()`, or a name in `wl.METHODS`, which stands for the method with the
-            settings it has if none are given; None: `wl.default_method`, and its
-            alternatives where it fails. (Names are for this function and the command line alone.)
+        method: a method with its settings, say `wl.InteriorPoint()`, or a name in `wl.METHODS`, which stands for the method with its
+            default settings; None: `wl.default_method`, and its alternatives where it fails.
         maxiter: the most iterations of the method, >= 0.
         preconditioner: of `wl.LCP`.
         callback: called after each iteration, of alternatives too: `callback(intermediate_result)`, an
@@ -216,11 +215,7 @@ def _bound(values: Any, name: str, wrong: float) -> Any:
 
 def _method(method: Any) -> Solver:
     """Return the method that a name stands for, or the one given."""
-    if isinstance(method, str):
-        if method not in METHODS:
-            meant = f"; {METHODS.nearest(method)}" if "did you mean" in METHODS.nearest(method) else ""
-            raise ValueError(f"method = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings or None{meant}")
-        return METHODS[method]()
+    method = method_of(method)
     if isinstance(method, type) or not isinstance(method, Solver):
         kind = f"the class {method.__name__}" if isinstance(method, type) else f"a {type(method).__name__}"
         raise ValueError(f"method is {kind}: expected a name in wl.METHODS, a method with its settings, say wl.MinimumMapNewton(), or None")

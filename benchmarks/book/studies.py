@@ -51,7 +51,7 @@ def measure(results: Results, scale: Scale, options: Options) -> None:
 def _cost(results: Results, scale: Scale, options: Options) -> None:
     """Time solves against the number of unknowns (figure C.5)."""
     panels = list[Lines]()
-    fluids = {int((splash(n).cells == wl.FLUID).sum()): splash(n).problem("everywhere", options.device) for n in scale.grids}
+    fluids = {int((splash(n).cells == wl.FLUID).sum()): splash(n).lcp("everywhere", device=options.device) for n in scale.grids}
     contacts = {6 * k: contact(k, seed=SEED).lcp(device=options.device) for k in scale.rows}
     for what, problems, methods, least in (("splash, p >= 0", fluids, GRID, LEAST), ("contacts of rigid bodies", contacts, DENSE, 0)):
         rows, curves, sizes = list[list[str]](), dict[str, tuple[Sequence[float], Sequence[float]]](), np.array(list(problems), dtype=float)

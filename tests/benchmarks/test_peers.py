@@ -63,7 +63,7 @@ def dense_solution(question, rounds=200):
 
 
 def test_question_is_the_problem(question):
-    problem = question.scene.problem("walls", "cpu")
+    problem = question.scene.lcp("walls", device="cpu")
     result = wl.solve(problem, stopping=wl.StoppingCriteria(rtol=1e-5))
     x = result.x.numpy().ravel()[question.where]
     assert question.residual(x) == pytest.approx(result.relative_residual, rel=1e-6)

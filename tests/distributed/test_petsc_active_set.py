@@ -19,7 +19,7 @@ WITH_OPTIONS = """
     from warp_lcp.distributed.petsc_active_set import PetscActiveSet
     from warp_lcp.gallery.fluid import splash
 
-    problem, stopping = splash(16).problem("walls", "cpu"), wl.StoppingCriteria(rtol=1e-9)
+    problem, stopping = splash(16).lcp("walls", device="cpu"), wl.StoppingCriteria(rtol=1e-9)
     plain = wl.solve(problem, PetscActiveSet(prefix="plain_"), stopping=stopping)
     method = PetscActiveSet()
     work = method.init(problem)

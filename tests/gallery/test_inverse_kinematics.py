@@ -68,7 +68,7 @@ def test_the_two_forms_of_a_step_are_the_minimum_of_its_quadratic_program():
     for _ in range(10):
         R = rng.standard_normal((5, 5))
         model = StepProblem(R @ R.T + 0.1 * np.eye(5), 3 * rng.standard_normal(5), -rng.uniform(0, 1, 5), rng.uniform(0, 1, 5))
-        d = wl.solve(model.boxed(device="cpu"), wl.MinimumMapNewton(), stopping=TIGHT).x.numpy()
+        d = wl.solve(model.lcp(device="cpu"), wl.MinimumMapNewton(), stopping=TIGHT).x.numpy()
         lemke = wl.solve(model.multipliers(device="cpu"), wl.Lemke(), stopping=TIGHT)
         root = np.linalg.cholesky(model.H).T  # |root d + root^-T c|^2 / 2 is the model but for a constant
         oracle = scipy.optimize.lsq_linear(root, -np.linalg.solve(root.T, model.c), (model.lower, model.upper), method="bvls", tol=1e-14).x

@@ -142,7 +142,7 @@ def test_a_soft_start_reaches_tight_tolerances_on_grids(shape, device):
 def test_iterations_do_not_grow_with_the_grid():
     """Warm from projected cycles, at most two steps more from 65^2 to 257^2 on the ball, and from 16^3 to 48^3 on the splash."""
     counts = [wl.solve(ball_obstacle(n).lcp(device="cpu"), wl.Penalty()).iterations for n in (65, 257)]
-    steps = [wl.solve(splash(n).problem("walls", "cpu"), wl.Penalty()).iterations for n in (16, 48)]
+    steps = [wl.solve(splash(n).lcp("walls", device="cpu"), wl.Penalty()).iterations for n in (16, 48)]
     assert counts[1] <= counts[0] + 2, counts
     assert steps[1] <= steps[0] + 2, steps
 

@@ -84,7 +84,7 @@ def test_a_warm_solve_is_read_once() -> None:
 
 def test_criteria_of_the_mean_are_known_once_unknowns_are_counted() -> None:
     scene = splash(16)
-    problem, asked = scene.problem("walls", "cpu"), []
+    problem, asked = scene.lcp("walls", device="cpu"), []
     n = int((scene.cells == wl.FLUID).sum())
     mean = MeanCriteria(rtol=0.0, atol=1e-3, max_iterations=50, count=lambda: asked.append(1) or float(n))
     from warp_lcp.problem.solve import solve

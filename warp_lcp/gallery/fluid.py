@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,23 +37,27 @@ class Splash:
     wall: np.ndarray
     faces: dict[str, Any] = field(default_factory=dict)
 
-    def __getattr__(self, name: str) -> Any:
-        """Say what makes the problem, to those who know it from other members of the gallery."""
-        if name in ("lcp", "A"):
-            raise AttributeError(
-                f"a Splash has no {name}, its bounds are open: take splash.named('everywhere').{name}, or 'walls', 'linear'"
-            )
-        raise AttributeError(f"a Splash has no {name}")
-
     def lower(self, bounds: str) -> float | np.ndarray:
         """Return the lower bound: -inf (linear), 0 on wall cells (walls) or 0 (everywhere)."""
         if bounds == "walls":
             return np.where(self.wall, 0.0, -np.inf)
         return {"linear": -np.inf, "everywhere": 0.0}[bounds]
 
+    def lcp(self, bounds: str, *, device: Any = None, b: Any = None) -> LCP:
+        """Return the problem for a solver, with float32 coefficients.
+
+        Args:
+            bounds: one of BOUNDS; "walls" lets the liquid separate from walls, "everywhere" from all.
+            device: Warp device of the operator; the default device if None.
+            b: net outflow of each FLUID cell, shape (n, n, n); that of the splash if None.
+        """
+        A = GridPoisson(self.cells, device=device, **self.faces)
+        return LCP(A, self.b if b is None else b, self.lower(bounds))
+
     def problem(self, bounds: str, device: str, b: Any = None) -> LCP:
-        """Build the operator and the problem."""
-        return LCP(GridPoisson(self.cells, device=device, **self.faces), self.b if b is None else b, self.lower(bounds))
+        """Return `lcp(bounds, device=device, b=b)`; the name until version 0.1."""
+        warnings.warn("Splash.problem is now Splash.lcp(bounds, device=...)", DeprecationWarning, stacklevel=2)
+        return self.lcp(bounds, device=device, b=b)
 
     def matrix(self) -> scipy.sparse.csr_array:
         """Assemble A on the FLUID cells, in their order, for solvers that want a matrix."""

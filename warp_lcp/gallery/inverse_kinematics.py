@@ -39,7 +39,7 @@ class StepProblem:
     lower: Vector
     upper: Vector
 
-    def boxed(self, *, device: Any = None) -> LCP:
+    def lcp(self, *, device: Any = None) -> LCP:
         """Return the boxed LCP in the step itself: y = H d + c, l <= d <= u."""
         return LCP(DenseOperator(self.H, device=device), self.c, self.lower, self.upper)
 
@@ -201,7 +201,7 @@ class InverseKinematics(Settings):
 
     def _step(self, model: StepProblem) -> tuple[Vector, bool, float]:
         """Return a step within its bounds, whether its LCP converged, and by how much its solution left the bounds."""
-        problem = model.multipliers(device=self.device) if self.multipliers else model.boxed(device=self.device)
+        problem = model.multipliers(device=self.device) if self.multipliers else model.lcp(device=self.device)
         result = solve(problem, self.method, stopping=INNER)
         x = result.x.numpy().astype(np.float64)
         d = model.step(x) if self.multipliers else x

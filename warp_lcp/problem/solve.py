@@ -220,7 +220,7 @@ def solve(
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
     if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
         kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"
-        raise ValueError(f"solver is {kind}: expected a method with its settings, say MinimumMapNewton()")
+        raise ValueError(f"solver is {kind}: expected a name in wl.METHODS or a method with its settings, say wl.MinimumMapNewton()")
     check_criteria(stopping)
     taken: type = getattr(solver, "problems", LCP)
     if not isinstance(problem, taken):

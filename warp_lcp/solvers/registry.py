@@ -85,6 +85,24 @@ METHODS = Methods(
 )
 
 
+def method_of(method: Any, name: str = "method") -> Any:
+    """Return the method that a name in METHODS stands for, with its default settings, or the method given.
+
+    Args:
+        method: a name, or a method with its settings.
+        name: of the argument, for messages.
+
+    Raises:
+        ValueError: no method has this name.
+    """
+    if not isinstance(method, str):
+        return method
+    if method not in METHODS:
+        meant = f"; {METHODS.nearest(method)}" if "did you mean" in METHODS.nearest(method) else ""
+        raise ValueError(f"{name} = {method!r}: must be one of {', '.join(METHODS)}, a method with its settings or None{meant}")
+    return METHODS[method]()
+
+
 def grid_methods() -> tuple[str, ...]:
     """Return the names of the methods that take a grid of any size and a precision: what a scene may name."""
     grids = [(name, method) for name, method in METHODS.items() if "grid" in families(method) and not hasattr(method, "most_unknowns")]
