@@ -36,14 +36,14 @@ STOPPING = wl.StoppingCriteria(rtol=1e-7, max_iterations=12)
 OTHER_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {  # that take other paths
     "accelerated-projected-gradient": ({"lipschitz": 20.0},),
     "fischer-newton": (
-        {"share": 0.9},
+        {"fischer_weight": 0.9},
         {"safeguard": False},
         {"kink": "zero"},
         {"kink": "random"},
         {"kink": "approximation"},
         {"warm_start": 2},
     ),
-    "gradient-descent": ({"map": "penalized", "share": 0.9}, {"map": "natural"}),
+    "gradient-descent": ({"map": "penalized", "fischer_weight": 0.9}, {"map": "natural"}),
     "interior-point": ({"mehrotra": False}, {"monotone_cycles": 0}),
     "minimum-map-newton": ({"monotone_cycles": 0},),
     "mprgp": ({"monotone_cycles": 0}, {"gamma": 0.1}),

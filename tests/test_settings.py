@@ -110,12 +110,12 @@ def test_precisions_may_be_members_of_their_enumeration():
         (lambda: wl.CycleSettings(gamma=1.5), "gamma = 1.5: must be an integer >= 1"),
         (lambda: wl.CycleSettings(interval=(2.0, 0.5)), "interval = (2.0, 0.5): must be in order"),
         (lambda: wl.CycleSettings(interval=(0.0, 0.5)), "interval = (0.0, 0.5): must be a tuple, each a finite number > 0"),
-        (lambda: wl.CycleSettings(semi=1.1), "semi = 1.1: must be in [0, 1]"),
+        (lambda: wl.CycleSettings(semicoarsening_threshold=1.1), "semicoarsening_threshold = 1.1: must be in [0, 1]"),
         (lambda: wl.MPRGP(cycle={"gamma": 1}), "cycle = {'gamma': 1}: must be a CycleSettings"),
         (lambda: wl.MinimumMapNewton(direct=1), "direct = 1: must be True or False"),
         (lambda: wl.ProjectedSOR(omega=2), "omega = 2: must be in (0, 2) or None"),
         (lambda: wl.ProjectedJacobi(omega=0), "omega = 0: must be a finite number > 0 or None"),
-        (lambda: wl.FischerNewton(share=0.0), "share = 0.0: must be in (0, 1] or None"),
+        (lambda: wl.FischerNewton(fischer_weight=0.0), "fischer_weight = 0.0: must be in (0, 1] or None"),
         (lambda: wl.InteriorPoint(crossover=1.0), "crossover = 1.0: must be in [0, 1)"),
         (lambda: wl.SubspaceMinimization(backtracks=-2), "backtracks = -2: must be an integer >= -1"),
         (lambda: wl.StoppingCriteria(max_seconds=0), "max_seconds = 0: must be > 0 or inf"),
@@ -136,8 +136,8 @@ def test_the_limits_themselves():
     assert repr(taken) == (
         "StoppingCriteria(rtol=0.0, atol=0.0, max_iterations=10000, patience=1, divergence=inf, max_seconds=inf, merits=False)"
     )
-    assert wl.CycleSettings(gamma=1, semi=1.0, one_launch_cuda=0).gamma == 1
-    assert wl.FischerNewton(share=1.0, warm_start=0, monotone_cycles=0).share == 1.0
+    assert wl.CycleSettings(gamma=1, semicoarsening_threshold=1.0, one_launch_cuda=0).gamma == 1
+    assert wl.FischerNewton(fischer_weight=1.0, warm_start=0, monotone_cycles=0).fischer_weight == 1.0
     assert wl.BlockedGaussSeidel(blocks=[[0, 1], [2]]).blocks == [[0, 1], [2]]
     assert wl.BlockedGaussSeidel(blocks=wl.GridLines.Y).blocks is wl.GridLines.Y
 
@@ -149,3 +149,16 @@ def test_pydantic_is_imported_with_the_first_settings_only():
 
 def test_methods_keep_their_signature():
     assert str(inspect.signature(wl.MPRGP)).startswith("(*, precision:")
+
+
+def test_old_names_are_taken_with_a_warning_that_gives_the_new_one():
+    for kind, old, new, value in (
+        (wl.FischerNewton, "share", "fischer_weight", 0.5),
+        (wl.GradientDescent, "share", "fischer_weight", 0.5),
+        (wl.CycleSettings, "semi", "semicoarsening_threshold", 0.25),
+        (wl.CycleSettings, "excess", "dirichlet_scaling", 1.25),
+    ):
+        with pytest.warns(DeprecationWarning, match=rf"{kind.__name__}\({old}=\.\.\.\) is now {kind.__name__}\({new}=\.\.\.\)"):
+            assert kind(**{old: value}) == kind(**{new: value})
+        with pytest.raises(TypeError, match=f"{old} or {new}, its new name, and not both"):
+            kind(**{old: value, new: value})

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import warnings
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from enum import StrEnum
-from functools import cache
+from functools import cache, wraps
 from reprlib import repr as short
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
@@ -35,6 +36,7 @@ ShareOrAll = Annotated[float, Gt(0), Le(1)]
 Part = Annotated[float, Ge(0), Le(1)]
 Relaxation = Annotated[float, Gt(0), Lt(2)]
 
+Kind = TypeVar("Kind")
 KINDS = {int: "an integer", float: "a finite number", bool: "True or False", str: "text", NoneType: "None"}
 ENDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
@@ -82,6 +84,32 @@ class Settings:
         """
         for name, annotation in ranges(type(self)).items():  # type: ignore[arg-type]  # a class has a hash
             object.__setattr__(self, name, checked(name, getattr(self, name), annotation))
+
+
+def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
+    """Let a dataclass take old names of its fields, with a DeprecationWarning that gives the new name.
+
+    Args:
+        names: old="new".
+    """
+
+    def wrap(kind: type[Kind]) -> type[Kind]:
+        init: Any = kind.__init__
+
+        @wraps(init)
+        def init_by_either_name(self: Any, *args: Any, **settings: Any) -> None:
+            for old, new in names.items():
+                if old in settings:
+                    if new in settings:
+                        raise TypeError(f"{kind.__name__} takes {old} or {new}, its new name, and not both")
+                    warnings.warn(f"{kind.__name__}({old}=...) is now {kind.__name__}({new}=...)", DeprecationWarning, stacklevel=2)
+                    settings[new] = settings.pop(old)
+            init(self, *args, **settings)
+
+        kind.__init__ = init_by_either_name  # type: ignore[method-assign]
+        return kind
+
+    return wrap
 
 
 def checked(name: str, given: object, annotation: Any) -> Any:

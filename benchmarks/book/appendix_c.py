@@ -17,7 +17,7 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, splash
 
 # the book's methods: monotone searches, no cycles first, linear systems solved
-FISCHER = wl.FischerNewton(share=1.0, safeguard=False, monotone_cycles=0, eta=1e-8)
+FISCHER = wl.FischerNewton(fischer_weight=1.0, safeguard=False, monotone_cycles=0, eta=1e-8)
 APPROXIMATION = replace(FISCHER, kink="approximation", max_linear_iterations=50)
 MINIMUM_MAP = wl.MinimumMapNewton(monotone_cycles=0, eta=1e-8, memory=1)
 INTERIOR = wl.InteriorPoint(mehrotra=False, monotone_cycles=0, precision="double")
@@ -166,7 +166,7 @@ def _lambda(results: Results, problems: dict[str, list[Problem]], options: Optio
             options.say(f"book: lambda, {kind}, {label}")
             row, name = [kind, label], f"{kind}, {label}"
             for share in SHARES:
-                found = outcome(f"lambda: {name}: {share:g}", few, replace(solver, share=share), Merit.FISCHER, options.device)
+                found = outcome(f"lambda: {name}: {share:g}", few, replace(solver, fischer_weight=share), Merit.FISCHER, options.device)
                 results.records.append(found.record())
                 row.append(found.share)
                 solved.setdefault(name, (SHARES, []))[1].append(100 * len(found.solved) / len(few))

@@ -62,7 +62,7 @@ def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
         face = rng.uniform(0.1, 1.0, (*shape[:-1], shape[-1] + 1))
         face[..., -1] = face[..., 0]
         faces["face_x"] = face
-    settings = CycleSettings(coarsest_cpu=1, coarsest_cuda=1, excess=1.0, semi=0.0)
+    settings = CycleSettings(coarsest_cpu=1, coarsest_cuda=1, dirichlet_scaling=1.0, semicoarsening_threshold=0.0)
     _, hierarchy = masked_hierarchy(cells, free, periodic, device, settings, **faces)
     p = (free & (cells == wl.FLUID)).ravel()
     expected = assemble(cells, [faces.get("face_x", 1.0), 1.0, 1.0], periodic=periodic) * np.outer(p, p)

@@ -107,7 +107,7 @@ def test_matrix_free_steps_are_those_of_the_algorithm(kink, share, safeguard, de
         assert plain.rows(x0)[3].sum() >= 3
         expected = plain_newton(plain, x0, 5, shifted_direction, drops=kink == "zero", memory=8 if safeguard else 1)
         lengths += [t for _, t in expected]
-        method = FischerNewton(kink=kink, share=share, safeguard=safeguard, precision="double", eta=1e-14)
+        method = FischerNewton(kink=kink, fischer_weight=share, safeguard=safeguard, precision="double", eta=1e-14)
         for operator in operators(A, device):
             problem = wl.LCP(operator, b, lower, upper)
             np.testing.assert_allclose(method.init(problem).residual.diagonal.numpy(), plain.d)  # the map's unit
@@ -262,7 +262,7 @@ def test_steps_on_a_grid_are_those_of_the_algorithm(kink, share, safeguard):
     for field, values in zip(fields, (b, x0), strict=True):
         field[fluid] = values
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), fields[0].reshape(cells.shape))
-    method = FischerNewton(kink=kink, share=share, safeguard=safeguard, precision="double", eta=1e-14, monotone_cycles=0)
+    method = FischerNewton(kink=kink, fischer_weight=share, safeguard=safeguard, precision="double", eta=1e-14, monotone_cycles=0)
     place = problem.layout.places()[fluid]
     for x, (y, _) in zip(steps_of(problem, method, fields[1].reshape(cells.shape), 5), expected, strict=True):
         np.testing.assert_allclose(x[place], y, rtol=1e-6, atol=1e-6)
@@ -276,7 +276,7 @@ def test_slope_is_the_derivative_of_the_merit_along_any_direction(device):
     plain = PlainMap("penalized", A, b, lower, upper, share=0.6)
     for operator in operators(A, device)[:1]:
         problem = wl.LCP(operator, b, lower, upper)
-        work = FischerNewton(share=0.6).init(problem)
+        work = FischerNewton(fischer_weight=0.6).init(problem)
         assert isinstance(work.map, NonsmoothMap)
         work.x.assign(x)
         work.residual.evaluate(work.x)
@@ -331,7 +331,7 @@ def test_a_minimum_of_the_merit_that_is_no_solution_is_called_one(kind):
     assert np.linalg.norm(plain.jacobian(at).T @ plain.rows(at)[0]) < 1e-8
     assert plain.merit(at) > 0.3
     for share in (1.0, 0.999999):
-        result = wl.solve(wl.LCP(of_kind(kind, A), b), FischerNewton(safeguard=False, share=share), x0=at)
+        result = wl.solve(wl.LCP(of_kind(kind, A), b), FischerNewton(safeguard=False, fischer_weight=share), x0=at)
         assert result.status is wl.SolveStatus.LOCAL_MINIMUM
         np.testing.assert_allclose(result.x.numpy(), at, atol=1e-4)
 
@@ -340,7 +340,7 @@ def test_a_minimum_of_the_merit_that_is_no_solution_is_called_one(kind):
 def test_a_bound_may_make_the_minimum(kind):
     """y = -x - 1 with x >= 0: the merit would fall beyond x = 0 alone; plain iterates keep to the bounds."""
     problem = wl.LCP(of_kind(kind, np.array([[-1.0]])), np.array([-1.0]))
-    assert wl.solve(problem, FischerNewton(safeguard=False, share=1.0)).status is wl.SolveStatus.LOCAL_MINIMUM
+    assert wl.solve(problem, FischerNewton(safeguard=False, fischer_weight=1.0)).status is wl.SolveStatus.LOCAL_MINIMUM
 
 
 def test_a_minimum_is_not_told_from_products_alone():
@@ -354,7 +354,9 @@ def test_a_failed_search_elsewhere_is_no_minimum():
     statuses = []
     for seed in (13, 15, 17, 23):
         p = contact(20, seed=seed)
-        statuses.append(wl.solve(wl.LCP(wl.DenseOperator(p.A, device="cpu"), p.b), FischerNewton(safeguard=False, share=0.95)).status)
+        statuses.append(
+            wl.solve(wl.LCP(wl.DenseOperator(p.A, device="cpu"), p.b), FischerNewton(safeguard=False, fischer_weight=0.95)).status
+        )
     assert wl.SolveStatus.NON_DESCENT in statuses
     assert wl.SolveStatus.LOCAL_MINIMUM not in statuses
 

@@ -19,6 +19,7 @@ from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=300)
 KINKS = [k.value for k in Kink]
+PENALIZED = FischerNewton(fischer_weight=0.95)
 PERIOD_THREE = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
 
 
@@ -39,7 +40,7 @@ METHODS = [
     InteriorPoint(),
     InteriorPoint(mehrotra=False),
     InteriorPoint(crossover=1e-2),
-    *(FischerNewton(kink=k, safeguard=s, share=c) for k in KINKS for s, c in ((True, 0.95), (False, 1.0))),
+    *(FischerNewton(kink=k, safeguard=s, fischer_weight=c) for k in KINKS for s, c in ((True, 0.95), (False, 1.0))),
     FischerNewton(warm_start=3),
 ]
 
@@ -86,7 +87,9 @@ def test_finite_differences_step_on_a_grid_with_walls_as_on_the_matrix_of_its_un
     np.testing.assert_allclose(grid.x.numpy().ravel()[fluid], unknowns.x.numpy(), atol=1e-8)
 
 
-@pytest.mark.parametrize("method", [InteriorPoint(), InteriorPoint(precision="double"), FischerNewton(), FischerNewton(share=0.95)])
+@pytest.mark.parametrize(
+    "method", [InteriorPoint(), InteriorPoint(precision="double"), FischerNewton(), FischerNewton(fischer_weight=0.95)]
+)
 @pytest.mark.parametrize("upper", [np.inf, 0.4])
 def test_grid_against_a_dense_matrix(method, upper, device):
     rng = np.random.default_rng(2213)
@@ -202,7 +205,9 @@ def test_safeguarded_fischer_solves_frictional_contacts(contacts):
 
 
 def test_plain_fischer_fails_on_some_contacts_and_says_so():
-    results = [wl.solve(dense(p.A, p.b), FischerNewton(safeguard=False, share=0.95)) for p in (contact(20, seed=s) for s in range(12))]
+    results = [
+        wl.solve(dense(p.A, p.b), FischerNewton(safeguard=False, fischer_weight=0.95)) for p in (contact(20, seed=s) for s in range(12))
+    ]
     failed = [r for r in results if not r]
     assert 0 < len(failed) < 12
     assert {r.status for r in failed} <= {wl.SolveStatus.NON_DESCENT, wl.SolveStatus.LOCAL_MINIMUM, wl.SolveStatus.MAX_ITERATIONS}
@@ -293,7 +298,7 @@ def test_nonmonotone_search_remembers():
     [
         (lambda: InteriorPoint(backoff=1.0), "backoff"),
         (lambda: InteriorPoint(horizon=0), "horizon"),
-        (lambda: FischerNewton(share=0.0), "share"),
+        (lambda: FischerNewton(fischer_weight=0.0), "fischer_weight"),
         (lambda: FischerNewton(kink="none"), "none"),
         (lambda: GradientDescent(map="none"), "none"),
         (lambda: GradientDescent(memory=0), "memory"),

@@ -138,7 +138,7 @@ def test_systems_over_the_rows_of_a_grid_are_those_of_the_definition(bounds, kin
     """The one pass that moves x, evaluates y there and condenses: D on top of A's diagonal, in units of `scale`."""
     cells, fluid, A, b, lower, upper, x = grid_at_kinks(4013, bounds)
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), _on(fluid, b, cells.shape), *bounds)
-    work = FischerNewton(kink=kink, share=share, precision="double").init(problem)
+    work = FischerNewton(kink=kink, fischer_weight=share, precision="double").init(problem)
     layout, place = problem.layout, problem.layout.places()[fluid]
     field, move = (layout.load(_on(fluid, v, cells.shape), wp.float64) for v in (x - 0.5, np.full(len(x), 2.0)))
     finest, scale = work.system.hierarchy.finest, 0.125

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, SettingError, Settings, ShareOrZero
+from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, SettingError, Settings, ShareOrZero, renamed
 
 
 class Smoothing(Settings):
@@ -27,6 +27,7 @@ class Smoothing(Settings):
         return 1 / points[0], 1 / points[1]
 
 
+@renamed(excess="dirichlet_scaling", semi="semicoarsening_threshold")
 @dataclass(frozen=True, kw_only=True)
 class CycleSettings(Smoothing):
     """How a cycle goes. The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
@@ -38,8 +39,8 @@ class CycleSettings(Smoothing):
             once.
         revisited_cuda: the same on a GPU, where small levels take as long as large ones: a W-cycle doubles their launches with each level.
         over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
-        excess: factor on what AIR and held unknowns add to an aggregate's diagonal: they are nearer than the next aggregate, so the
-            over-correction applies to them in part only.
+        dirichlet_scaling: factor on what AIR and unknowns at their bounds add to an aggregate's diagonal.
+            They are nearer than the next aggregate, so the over-correction applies to them in part only.
         interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
         coarsest_cuda: the same on a GPU; without `one_launch_cuda` one thread factors it, which is quick for 16 cells only.
@@ -47,7 +48,8 @@ class CycleSettings(Smoothing):
             launches cost next to nothing, and its legs that stream through a level are faster.
         one_launch_cuda: the same on a GPU, in one block of threads: 8^3 cells; with 16^3 one multiprocessor
             works longer than launches would take, 2 ms of a solve on an H200.
-        semi: axes whose mean weight is below this share of the strongest one's are not coarsened until they have caught up.
+        semicoarsening_threshold: an axis is coarsened once its mean weight is at least this fraction
+            of the strongest axis's mean weight.
         projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
     """
 
@@ -55,13 +57,13 @@ class CycleSettings(Smoothing):
     revisited_cpu: CountOrZero = 64
     revisited_cuda: CountOrZero = 3
     over_correction: Positive = 1.8
-    excess: Positive = 1.5
+    dirichlet_scaling: Positive = 1.5
     interval: tuple[Positive, Positive] = (0.5, 2.0)
     coarsest_cpu: Count = 64
     coarsest_cuda: Count = 64
     one_launch_cpu: CountOrZero = 0
     one_launch_cuda: CountOrZero = 512
-    semi: Part = 0.3
+    semicoarsening_threshold: Part = 0.3
     projected_sweeps: Count = 8
 
 

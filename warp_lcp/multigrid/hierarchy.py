@@ -135,7 +135,7 @@ class Level:
 
     def coarsened(self, coarse: Level, settings: CycleSettings) -> Iterator[Stage]:
         """Yield the making of the next level."""
-        yield self.coarsening(coarse, settings.over_correction, settings.excess)
+        yield self.coarsening(coarse, settings.over_correction, settings.dirichlet_scaling)
         for w in coarse.stencil.weights or ():
             yield from coarse.stencil.fillings(w)
 
@@ -460,7 +460,7 @@ class Hierarchy:
         """Return by how many cells x, y and z are aggregated."""
         long = [n > 1 for n in reversed(counts)]
         strongest = max(w for w, more in zip(self._strength, long, strict=True) if more)
-        chosen = [more and w >= self.settings.semi * strongest for w, more in zip(self._strength, long, strict=True)]
+        chosen = [more and w >= self.settings.semicoarsening_threshold * strongest for w, more in zip(self._strength, long, strict=True)]
         # an axis of one cell may be aggregated with its ghost: it changes nothing, and keeps isotropic grids in one form
         return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
 

@@ -17,7 +17,7 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import NoTranspose
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
-from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll
+from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll, renamed
 from warp_lcp.solvers.descent import DECREASE, NonmonotoneSearch
 from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
 from warp_lcp.solvers.fischer_newton_dense import STATIONARY, FischerDenseWorkspace
@@ -30,6 +30,7 @@ from warp_lcp.solvers.principal_system import GridSystem, principal_system
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 
 
+@renamed(share="fischer_weight")
 @dataclass(frozen=True, kw_only=True)
 class FischerNewton(Settings):
     """Solve f(x) = 0 for the Fischer-Burmeister map, plain or penalized, by a nonsmooth Newton method ([Book] 2.4.2-3, algorithm 12).
@@ -49,7 +50,8 @@ class FischerNewton(Settings):
 
     Args:
         kink: what stands for the derivative at a kink: "random", "zero", "perturbation" or "approximation" (see `Kink`).
-        share: lambda, in (0, 1]; 1 is the plain map. None: 0.95 for dense matrices, 1 for others, where the penalty made the steps
+        fischer_weight: lambda, the weight of the Fischer-Burmeister function in the penalized map, in
+            (0, 1]; 1 is the plain map. None: 0.95 for dense matrices, 1 for others, where the penalty made the steps
             grow with the grid (ball obstacle, 65^2 to 1025^2: 6 to 11 steps with 0.95, 6 to 7 with 1).
         safeguard: False: monotone Armijo search along the projected path, and an end with NON_DESCENT or LOCAL_MINIMUM where that
             fails: the book's method. True: what is described above.
@@ -72,7 +74,7 @@ class FischerNewton(Settings):
     needs: ClassVar[str] = "a P0-matrix for plain steps; the safeguarded chain also solves copositive contact problems"
 
     kink: KinkName = "perturbation"
-    share: ShareOrAll | None = None
+    fischer_weight: ShareOrAll | None = None
     safeguard: bool = True
     precision: PrecisionName = "mixed"
     warm_start: CountOrZero = 0
@@ -84,9 +86,9 @@ class FischerNewton(Settings):
 
     def descent(self, problem: LCP) -> GradientDescent:
         """Return the gradient descent whose map is this method's for the problem: the only one consistent with it as a warm start."""
-        share = self.share if self.share is not None else SHARE if isinstance(problem.A, DenseOperator) else 1.0
-        map_ = MapForm.FISCHER if share == 1 else MapForm.PENALIZED
-        return GradientDescent(map=map_.value, share=share, precision="single" if self.precision == "single" else "double")
+        weight = self.fischer_weight if self.fischer_weight is not None else SHARE if isinstance(problem.A, DenseOperator) else 1.0
+        map_ = MapForm.FISCHER if weight == 1 else MapForm.PENALIZED
+        return GradientDescent(map=map_.value, fischer_weight=weight, precision="single" if self.precision == "single" else "double")
 
     def init(self, problem: LCP) -> FischerWorkspace | FischerDenseWorkspace:
         """Return a workspace: on the host for dense matrices, unless the Jacobian is to be approximated."""
@@ -120,7 +122,7 @@ class FischerWorkspace(IterateMemory):
         self._from, self._shift = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self.free = layout.zeros(wp.uint8)
         self._descent = settings.descent(problem)
-        map_, share = MapForm(self._descent.map), self._descent.share
+        map_, share = MapForm(self._descent.map), self._descent.fischer_weight
         self.system: Any = (
             FiniteDifferenceSystem(problem, self.residual, map_, share)
             if self.kink is Kink.APPROXIMATION

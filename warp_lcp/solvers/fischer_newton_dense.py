@@ -134,7 +134,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         data, self.units = self.data.scaled()
         lower, upper = without_far(data.lower, data.upper, INFINITY)  # squares of what is larger overflow
         data = replace(data, lower=lower, upper=upper)
-        self.map = FischerMap(data, self._descent.share, Kink(s.kink), np.random.default_rng(2015))
+        self.map = FischerMap(data, self._descent.fischer_weight, Kink(s.kink), np.random.default_rng(2015))
         self._identity = np.eye(len(data.b))
         self._search.forget()
         self.descents_left, self.stage, self.steps, self.target = s.warm_start, 0, 0, tolerance

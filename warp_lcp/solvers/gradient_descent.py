@@ -13,7 +13,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
-from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll
+from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll, renamed
 from warp_lcp.solvers.descent import NonmonotoneSearch
 from warp_lcp.solvers.nonsmooth_map import MapForm, MapName, NonsmoothMap
 
@@ -21,6 +21,7 @@ LEAST = 1e-12  # relative decrease of the merit without which a step is none
 LONGEST = 1e6  # length tried
 
 
+@renamed(share="fischer_weight")
 @dataclass(frozen=True, kw_only=True)
 class GradientDescent(Settings):
     """Descend on the merit f.f / 2 of a reformulation ([Book] 2.4.4, eq. 2.199, algorithm 13).
@@ -36,7 +37,7 @@ class GradientDescent(Settings):
 
     Args:
         map: "natural", "fischer" or "penalized".
-        share: lambda of the penalized map, in (0, 1].
+        fischer_weight: lambda of the penalized map, the weight of the Fischer-Burmeister function, in (0, 1].
         relative: of the relative test, >= 0.
         stagnation: of the stagnation test, >= 0.
         gradient: of the test for a local minimum, >= 0.
@@ -47,7 +48,7 @@ class GradientDescent(Settings):
     needs: ClassVar[str] = "products with A'"
 
     map: MapName = "fischer"
-    share: ShareOrAll = 0.95
+    fischer_weight: ShareOrAll = 0.95
     relative: NonNegative = 1e-12
     stagnation: NonNegative = 1e-14
     gradient: NonNegative = 1e-10
@@ -77,7 +78,7 @@ class DescentWorkspace(IterateMemory):
         super().__init__(problem, settings.precision, x=x, residual=residual)
         self.settings = settings
         self._from = problem.layout.zeros(wp.float64)
-        self._map = NonsmoothMap(problem, self.residual, MapForm(settings.map), settings.share)
+        self._map = NonsmoothMap(problem, self.residual, MapForm(settings.map), settings.fischer_weight)
         self._search = NonmonotoneSearch(memory=settings.memory, least=1e-18)
         self.length, self._square = 1.0, 0.0
 
