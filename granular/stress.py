@@ -91,7 +91,7 @@ class Velocity:
         p.strained.run(passes.edge_strain, launch=launch, spans=p.spans, **share, **self.fields)
 
 
-class Stress(wl.ConvexSetProblem):
+class Stress(wl.VariationalInequality):
     """Pressure and friction of sand under a packing.
 
     With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of

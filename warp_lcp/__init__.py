@@ -1,5 +1,6 @@
 """Matrix-free solvers for large linear complementarity problems, as NVIDIA Warp kernels on CPU and CUDA."""
 
+import warnings
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -26,7 +27,7 @@ from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve import ConvexSetProblem, Precision, Step
+from warp_lcp.problem.solve import Precision, Step, VariationalInequality
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.recommend import Budget, Recommendation, recommend
 from warp_lcp.rows.kernel_messages import hear_kernels
@@ -71,6 +72,9 @@ def __getattr__(name: str) -> Any:
         return import_module("warp_lcp.frames.read_frame").read_frame
     if name == "Run":
         return import_module("warp_lcp.run.driven").Run
+    if name == "ConvexSetProblem":
+        warnings.warn("wl.ConvexSetProblem is now wl.VariationalInequality", DeprecationWarning, stacklevel=2)
+        return VariationalInequality
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
@@ -87,7 +91,6 @@ __all__ = [
     "BatchResult",
     "BlockedGaussSeidel",
     "Budget",
-    "ConvexSetProblem",
     "CoupledBlock",
     "CoupledResult",
     "CycleSettings",
@@ -126,6 +129,7 @@ __all__ = [
     "StoppingCriteria",
     "SubspaceMinimization",
     "SumOperator",
+    "VariationalInequality",
     "advised_omega",
     "default_method",
     "enumerate_batch",

@@ -19,7 +19,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import version_of
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve import EPS, ConvexSetProblem, Solver, Workspace
+from warp_lcp.problem.solve import EPS, Solver, VariationalInequality, Workspace
 from warp_lcp.problem.solve import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.recommend import Recommendation, method_for, recommend, steps_allowed
@@ -53,7 +53,7 @@ def default_method(problem: LCP) -> Solver:
 
 
 def solve(
-    problem: LCP | ConvexSetProblem, solver: Solver | str | None = None, *, stopping: StoppingCriteria | MeanCriteria | None = None,
+    problem: LCP | VariationalInequality, solver: Solver | str | None = None, *, stopping: StoppingCriteria | MeanCriteria | None = None,
     x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None, **misplaced: Never,
 ) -> SolveResult:  # fmt: skip
     """Solve a problem by a method.
@@ -88,7 +88,7 @@ def solve(
         raise TypeError(f"solve takes no {name}: settings are the method's own, say wl.ProjectedSOR(omega=1.5)")
     if solver is None and workspace is not None:
         raise ValueError("workspace: name the solver that made it")
-    if solver is None and isinstance(problem, ConvexSetProblem):
+    if solver is None and isinstance(problem, VariationalInequality):
         raise ValueError(f"solver: a {type(problem).__name__} is solved by methods of its own, name one")
     check_criteria(stopping)
     method: Any = method_of(solver, "solver")

@@ -73,7 +73,7 @@ class QuadraticProgramData:
 
 
 @dataclass(frozen=True, eq=False)
-class VariationalInequality:
+class BoxVariationalInequality:
     """Find x in K with F(x)'(z - x) >= 0 for all z in K ([Book] eq. 1.49); here F(x) = A x + b.
 
     Args:
@@ -257,9 +257,9 @@ def quadratic_program_to_boxed(program: QuadraticProgramData, *, device: Any = N
     return _made(matrix, np.concatenate(r), np.concatenate(lower), upper, lambda z: z[:n], device)
 
 
-def boxed_to_variational_inequality(A: Any, b: Vector, lower: Vector, upper: Vector) -> VariationalInequality:
+def boxed_to_variational_inequality(A: Any, b: Vector, lower: Vector, upper: Vector) -> BoxVariationalInequality:
     """Return the variational inequality of a boxed LCP ([Book] 1.1.4): the two have the same solutions."""
-    return VariationalInequality(lambda x: A @ x + b, lower, upper)
+    return BoxVariationalInequality(lambda x: A @ x + b, lower, upper)
 
 
 def boxed_to_proximal(A: Any, b: Vector, lower: Vector, upper: Vector, *, r: float | Vector | None = None) -> ProximalFixedPoint:

@@ -79,16 +79,17 @@ class Step:
     final: bool = False
 
 
-class ConvexSetProblem:
-    """Base of problems over a convex set K that is no box: find x in K with y(x)'(z - x) >= 0 for all z in K (a variational inequality).
+class VariationalInequality:
+    """Base of variational inequalities: find x in a convex set K with y(x)'(z - x) >= 0 for all z in K.
 
-    x solves it where it is the nearest point of K to x - y/d, for any d > 0, and how far that projection moves x is the natural residual.
-    K = [l, u], where the projection is a clip, and y = A x + b make an `LCP`; K may depend on x. Of another set the loop needs no more
-    than the residual: K, y and the projection are between the problem, its methods and their workspaces, which may compute gradient and
-    projection in one pass. The stresses of sand (`granular.stress.Stress`) are such a problem.
+    Equivalently, x = P_K(x - y/d) for any d > 0, where P_K is the projection onto K. The natural residual is the
+    distance from x to that projection. For a box K = [l, u] and y = A x + b use `LCP`. K may depend on x.
 
-    The workspace of such a problem has the iterate, which starts as it is unless an x0 is assigned to it and which a result has in place,
-    and a `Residual`. A method names the class of problems that it takes as `problems`.
+    A subclass holds the data of y and K. `wl.solve` asks for the residual alone: a method and its workspace evaluate y
+    and P_K, together in one kernel if they can. The stresses of sand (`granular.stress.Stress`) are such a problem.
+
+    The workspace holds the iterate and a `Residual`. The iterate starts as it is unless `x0` is given, and the result's x
+    is that array. A method names the class of problems that it solves as `problems`.
     """
 
 
@@ -212,11 +213,11 @@ class Solver(Protocol):
 
 
 def solve(
-    problem: LCP | ConvexSetProblem, solver: Solver, *, stopping: StoppingCriteria | MeanCriteria | None = None, x0: Array | None = None,
-    workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None,
+    problem: LCP | VariationalInequality, solver: Solver, *, stopping: StoppingCriteria | MeanCriteria | None = None,
+    x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None,
 ) -> SolveResult:  # fmt: skip
     """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
-    if not isinstance(problem, (LCP, ConvexSetProblem)):
+    if not isinstance(problem, (LCP, VariationalInequality)):
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
     if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
         kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"

@@ -21,7 +21,7 @@ def onto_cones(x: np.ndarray) -> np.ndarray:
     return np.where(inside[:, None], x, np.where(polar[:, None], 0.0, onto))
 
 
-class Contacts(wl.ConvexSetProblem):
+class Contacts(wl.VariationalInequality):
     """y = A x + b over a product of friction cones, A symmetric positive definite."""
 
     def __init__(self, count: int, seed: int) -> None:
@@ -147,3 +147,8 @@ def test_methods_and_problems_that_do_not_go_together() -> None:
         wl.solve(problem)
     with pytest.raises(ValueError, match="ProjectedGradient takes problems of the class Contacts: this is a LCP"):
         wl.solve(wl.LCP(np.eye(3), np.ones(3)), ProjectedGradient())
+
+
+def test_the_old_name_is_deprecated() -> None:
+    with pytest.warns(DeprecationWarning, match=r"wl\.ConvexSetProblem is now wl\.VariationalInequality"):
+        assert wl.ConvexSetProblem is wl.VariationalInequality
