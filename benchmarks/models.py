@@ -61,7 +61,7 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
         "moving solids": Offer({"solid": [swaying]}, {"solid": [ball]}),
         "rigid bodies": Offer({"solid": bodies}, {"solid": [swaying]}, count=len(bodies)),  # which move too
         "density correction": Offer({"density_correction": {}}),
-        "crowding": Offer({"density_correction": None}),
+        "automatic density correction": Offer({"density_correction": None}),
         "reseeding": Offer({"particles": {"reseed": {"every": 1}}}, unit="particle"),
         "diagnostics": Offer({"output": {}}),
         "surface mesh": Offer({"output": QUIET | {"surface": True}}, frames=True),

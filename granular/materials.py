@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-AngleOf = Literal["repose", "plane-strain", "triaxial-compression"]
+FrictionAngleTest = Literal["repose", "plane-strain", "triaxial-compression"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ MATERIALS = {
 }
 
 
-def slope(angle: float, test: AngleOf, dimension: int) -> float:
+def slope(angle: float, test: FrictionAngleTest, dimension: int) -> float:
     """Return k of the yield set |s|_F / sqrt(2) <= k p of an angle [degrees] by the test that it is of.
 
     Repose: layers stop at it, k = tan. What slides along a slope shears alone, under equal normal stresses: its shear stress over its

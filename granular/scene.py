@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from warp_lcp.granular.materials import MATERIALS, AngleOf, Material, slope
+from warp_lcp.granular.materials import MATERIALS, FrictionAngleTest, Material, slope
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene import PRESET_KEY, Complaint, Domain, Table, Time
@@ -69,8 +69,11 @@ class SandDomain(Domain):
 class MaterialTable(Table):
     """[material]: what kind of grains."""
 
+    renamed: ClassVar = {"angle_of": "friction_angle_test"}
     name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="gives what the table does not")
-    friction_angle: Angle | None = Field(default=None, description="degrees: the slope at which sand that runs stops; see angle_of")
+    friction_angle: Angle | None = Field(
+        default=None, description="degrees: the slope at which sand that runs stops; see friction_angle_test"
+    )
     density: Positive | None = Field(default=None, description="at the densest, air included [kg/m^3]")
     max_fraction: Share | None = Field(default=None, description="of space that grains fill at the densest")
     wall_friction: WallFriction | None = Field(default=None, description=f"against solids: {FRICTIONS}")
@@ -78,11 +81,11 @@ class MaterialTable(Table):
         default=0.0, description="the shear stress it bears without pressure [Pa]; over cos(friction_angle) unless that is of repose"
     )
     tensile_strength: NonNegative = Field(default=0.0, description="the tension it bears where it is densely packed [Pa]")
-    angle_of: AngleOf = Field(
+    friction_angle_test: FrictionAngleTest = Field(
         default="repose",
-        description="what friction_angle is of: repose, the slope at which layers stop (k = tan); sand at rest holds up to asin(k), so"
-        " heaps poured slowly lie up to 5 degrees steeper; or a test of soil mechanics, plane-strain (k = sin: layers of 30 degrees stop"
-        " at 26.6, heaps lie at 30) or triaxial-compression",
+        description="the test that friction_angle comes from: repose, the slope at which layers stop (k = tan); sand at rest holds"
+        " up to asin(k), so heaps poured slowly lie up to 5 degrees steeper; or a test of soil mechanics, plane-strain (k = sin: layers"
+        " of 30 degrees stop at 26.6, heaps lie at 30) or triaxial-compression",
     )
 
 
@@ -263,7 +266,7 @@ class SandScene(ParticleScene):
         return self._slope_of(self.friction_angle)
 
     def _slope_of(self, angle: float) -> float:
-        return slope(angle, self.material.angle_of, self.dimension)
+        return slope(angle, self.material.friction_angle_test, self.dimension)
 
     @property
     def intercept(self) -> float:
@@ -356,8 +359,8 @@ class SandScene(ParticleScene):
 
     def _at_most(self) -> str:
         """Return what is said of an angle that is too steep."""
-        test, most = self.material.angle_of, STEEPEST_ANGLE[self.material.angle_of][self.dimension]
-        return f'must be at most {most:g} where material.angle_of = "{test}": a steeper cone would bear tension'
+        test, most = self.material.friction_angle_test, STEEPEST_ANGLE[self.material.friction_angle_test][self.dimension]
+        return f'must be at most {most:g} where material.friction_angle_test = "{test}": a steeper cone would bear tension'
 
     def _rate_complaints(self) -> list[Complaint]:
         """Return what is wrong with friction that grows with the rate of shear."""

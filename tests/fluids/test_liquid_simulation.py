@@ -310,7 +310,7 @@ def test_a_step_marks_its_stages() -> None:
     assert watched.step(0.01) == plain.step(0.01)
     assert watched.watch.found == [
         "diagnostics", "sort", "particles-to-grid", "surface", "pressure set-up", "pressure solve", "projection", "diagnostics",
-        "extrapolation", "bodies in flight", "grid-to-particles", "crowding", "advection", "bodies in flight",
+        "extrapolation", "bodies in flight", "grid-to-particles", "density monitor", "advection", "bodies in flight",
         "diagnostics",
     ]  # fmt: skip
 

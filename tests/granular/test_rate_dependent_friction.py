@@ -89,7 +89,10 @@ def test_both_methods_find_the_same_velocity() -> None:
         ({"grain_size": 1e-3}, "friction.grain_size = 0.001: goes with friction.dynamic_angle, which is missing"),
         ({"inertial_number": 0.3}, "friction.inertial_number = 0.3: goes with friction.dynamic_angle, which is missing"),
         (GROWS | {"dynamic_angle": 30.0}, "friction.dynamic_angle = 30.0: must be above the friction angle, 30 degrees"),
-        (GROWS | {"dynamic_angle": 50.0}, 'friction.dynamic_angle = 50.0: must be at most 45 where material.angle_of = "repose"'),
+        (
+            GROWS | {"dynamic_angle": 50.0},
+            'friction.dynamic_angle = 50.0: must be at most 45 where material.friction_angle_test = "repose"',
+        ),
         (GROWS | {"model": "box"}, 'friction.model = "box": must be "cone" with friction.dynamic_angle'),
         (GROWS | {"grain_size": 0.0}, "friction.grain_size = 0.0: must be greater than 0"),
     ],

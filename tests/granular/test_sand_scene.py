@@ -49,9 +49,12 @@ def complaint(tmp_path: Any, *overrides: str) -> str:
         ("material.cohesion=-5", "material.cohesion = -5: must be at least 0"),
         ("material.tensile_strength=-5", "material.tensile_strength = -5: must be at least 0"),
         ("material.tensile_strength=100", "material.tensile_strength = 100.0: must be at most 0"),
-        ("material.angle_of=shear", "material.angle_of = \"shear\": must be 'repose', 'plane-strain' or 'triaxial-compression'"),
+        (
+            "material.friction_angle_test=shear",
+            "material.friction_angle_test = \"shear\": must be 'repose', 'plane-strain' or 'triaxial-compression'",
+        ),
         ("material.wall_friction=-0.1", 'material.wall_friction = -0.1: must be a number from 0 to 10, or "stick" (against solids'),
-        ("material.colour=red", "material.colour: unknown key; choose from angle_of, cohesion"),
+        ("material.colour=red", "material.colour: unknown key; choose from cohesion, density"),
         ("friction.model=sphere", "friction.model = \"sphere\": must be 'cone' or 'box'"),
         ("domain.friction=rough", 'domain.friction = "rough": must be a number from 0 to 10, or "stick" (of the domain\'s walls'),
         ("domain.friction=11", "domain.friction = 11: must be a number from 0 to 10"),
@@ -131,10 +134,10 @@ def test_the_slope_of_the_yield_set() -> None:
     sand = [box([0.0, 0.0], [0.2, 0.2])]
     assert scene(size=[1.0, 0.5], resolution=16, sand=sand).slope == pytest.approx(math.tan(math.radians(30.0)))
     for test, factor in (("repose", 1.0), ("plane-strain", math.sqrt(0.75))):
-        material = {"angle_of": test, "cohesion": 10.0}
+        material = {"friction_angle_test": test, "cohesion": 10.0}
         assert scene(size=[1.0, 0.5], resolution=16, sand=sand, material=material).intercept == pytest.approx(10.0 * factor)
-    assert scene(size=[1.0, 0.5], resolution=16, sand=sand, material={"angle_of": "plane-strain"}).slope == pytest.approx(0.5)
-    triaxial = {"material": {"angle_of": "triaxial-compression"}}
+    assert scene(size=[1.0, 0.5], resolution=16, sand=sand, material={"friction_angle_test": "plane-strain"}).slope == pytest.approx(0.5)
+    triaxial = {"material": {"friction_angle_test": "triaxial-compression"}}
     assert scene(size=[1.0, 0.5], resolution=16, sand=sand, **triaxial).slope == pytest.approx(0.5)
     deep = [box([0.0] * 3, [0.2] * 3)]
     assert scene(size=[1.0, 0.5, 0.5], resolution=16, sand=deep, **triaxial).slope == pytest.approx(math.sqrt(3.0) / 2.5)
@@ -143,10 +146,10 @@ def test_the_slope_of_the_yield_set() -> None:
 def test_a_cone_that_would_bear_tension_is_refused() -> None:
     """The least principal stress is below 0 beyond |s|_F = sqrt(2) sqrt(3) / 2 p where a sample is pulled; in 2-D beyond sqrt(2) p."""
     flat = [box([0.0, 0.0], [0.2, 0.2])]
-    with pytest.raises(ValueError, match=r"must be at most 45 where material.angle_of = \"repose\""):
+    with pytest.raises(ValueError, match=r"must be at most 45 where material.friction_angle_test = \"repose\""):
         scene(size=[1.0, 0.5], resolution=16, sand=flat, material={"friction_angle": 46.0})
     sand = [box([0.0] * 3, [0.2] * 3)]
-    steep = {"material": {"angle_of": "triaxial-compression", "friction_angle": 37.0}}
+    steep = {"material": {"friction_angle_test": "triaxial-compression", "friction_angle": 37.0}}
     with pytest.raises(ValueError, match=r"must be at most 36\.8"):
         scene(size=[1.0, 0.5, 0.5], resolution=16, sand=sand, **steep)
     k = scene(size=[1.0, 0.5, 0.5], resolution=16, sand=sand, material={**steep["material"], "friction_angle": 36.8}).slope

@@ -180,11 +180,15 @@ def test_a_phase_in_radians_is_told(phase: float, told: str | None, tmp_path: Pa
     [
         ({"friction_angle": 50.0}, {}, r"sand\[0\]\.friction_angle = 50\.0: must be at most 45"),
         ({}, {"friction_angle": 50.0}, r"material\.friction_angle = 50\.0: must be at most 45"),
-        ({}, {"name": "gravel", "angle_of": "triaxial-compression"}, r'material\.name = "gravel": has a friction angle of 40 degrees'),
+        (
+            {},
+            {"name": "gravel", "friction_angle_test": "triaxial-compression"},
+            r'material\.name = "gravel": has a friction angle of 40 degrees',
+        ),
     ],
 )
 def test_a_friction_angle_is_refused_under_its_own_key(sand: dict[str, Any], material: dict[str, Any], key: str, tmp_path: Path) -> None:
-    domain = {"size": [1.0, 1.0, 1.0]} if "angle_of" in material else {}
+    domain = {"size": [1.0, 1.0, 1.0]} if "friction_angle_test" in material else {}
     box = {**LIQUID, "min": [0.0] * 3, "max": [1.0, 0.3, 1.0]} if domain else LIQUID
     with pytest.raises(SceneError, match=key):
         load_scene(written(tmp_path / "scene.toml", [{**box, **sand}], simulator="granular", domain=domain, material=material))

@@ -36,7 +36,7 @@ from warp_lcp.run.terminal import Commands, Terminal, say, table_lines, tell
 from warp_lcp.run.trial import step_seconds
 from warp_lcp.run.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.scene.presets import PresetName
-from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, load_scene
+from warp_lcp.scene.scene_file import built_in_scenes, fix_file, installed_simulators, load_scene
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 from warp_lcp.solvers.registry import METHODS
@@ -192,12 +192,15 @@ def check(
     scene: SceneArgument,
     device: Annotated[str | None, typer.Option(help="cpu or cuda:N, whose memory counts.", show_default=False)] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="Also take a few steps, and say how long a step takes.")] = False,
+    fix: Annotated[bool, typer.Option("--fix", help="First rewrite old names of keys in the scene file.")] = False,
     force_memory: ForceMemory = False,
     overrides: SetOption = None,
 ) -> None:
     """Say whether a scene is valid and fits into memory, what a run of it would do, and what it would say at its start."""
     with wrong_input():
         chosen = choose_device(device)
+        if fix:
+            _print_pairs([("fixed", line) for line in fix_file(scene) or ["nothing: every key has today's name"]])
         loaded, lines = check_scene(scene, overrides or ())
         _print_pairs(lines)
         if not force_memory:

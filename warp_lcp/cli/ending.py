@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import errno
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn, TextIO
 
 import typer
 
 from warp_lcp.run.interruption import Interrupted
 from warp_lcp.run.terminal import tell
+from warp_lcp.scene.renamed_keys import RenamedKeyWarning
 from warp_lcp.simulation import InputError
 
 FAILED = 1
 WRONG_INPUT = 2
+_SHOW: Any = warnings.showwarning
 
 
 @contextmanager
 def wrong_input() -> Iterator[None]:
-    """Tell of wrong input, and end."""
+    """Report wrong input and end the command; report old names of scene keys and go on."""
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", RenamedKeyWarning)
+            warnings.showwarning = _show_renamed_keys
+            yield
     except InputError as error:
         end(str(error), WRONG_INPUT)
     except OSError as error:
@@ -30,6 +36,16 @@ def wrong_input() -> Iterator[None]:
         end(f"{error.filename}: {error.strerror}", WRONG_INPUT)
     except Interrupted as error:
         end(f"stopped: interrupted by {error} before the run began", FAILED)
+
+
+def _show_renamed_keys(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None, line: str | None = None
+) -> None:
+    """Print a warning about a renamed key as one line; all others as Python does."""
+    if issubclass(category, RenamedKeyWarning):
+        tell(str(message), error=True)
+    else:
+        _SHOW(message, category, filename, lineno, file, line)
 
 
 def end(message: str, code: int) -> NoReturn:

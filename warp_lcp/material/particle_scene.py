@@ -115,13 +115,14 @@ class ParticleScene(Scene):
         moving = [number for number, solid in enumerate(self.solid) if solid.moves]
         bodies = [number for number, solid in enumerate(self.solid) if solid.is_body]
         settings, output = self.particles, self.output
+        automatic = self.density_correction is None and self.correction is not None
         used = {
             "cut cells": _solids(range(len(self.solid)), "reaches through cells") if self.cuts_cells else "",
             "moving solids": _solids(moving, "moves") if moving else "",
             "rigid bodies": _solids(bodies, "has a mass") if bodies else "",
             "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
             "density correction": "[density_correction]" if self.density_correction is not None and self.correction is not None else "",
-            "crowding": "too much in a cell is moved apart" if self.density_correction is None and self.correction else "",
+            "automatic density correction": "crowded particles are moved apart" if automatic else "",
             "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
             "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
             "sources": "[[source]]" if self.source else "",

@@ -341,7 +341,7 @@ class ParticleSimulation(ParticleCheckpoints):
         Raises:
             SimulationFailed: something is not finite, or a particle has left the domain.
         """
-        with self.watch.stage("crowding", self.particles.position):
+        with self.watch.stage("density monitor", self.particles.position):
             self.rearrangement.look(self.step_count, self.known_density(), self.particles, window)
         with self.watch.stage("advection", self.particles.position, *self.velocity):
             self.carry(dt)

@@ -14,6 +14,8 @@ from typing import Any, get_args, get_origin
 import numpy as np
 import tomli_w
 
+from warp_lcp.files.atomic import write_text
+from warp_lcp.scene.renamed_keys import fix_text, rename_keys
 from warp_lcp.scene.scene import Scene, file_name
 from warp_lcp.scene.shapes import BUILTIN
 from warp_lcp.scene.simulator import Simulator, simulators
@@ -65,6 +67,7 @@ def load_scene(source: SceneSource, overrides: Sequence[str] = ()) -> Scene:
     _refuse_extremes(data, label)
     _resolve_paths(data, folder)
     model = _scene_model(data, label)
+    rename_keys(data, model, label)
     about = data["scene"]
     data["scene"] = {**about, "name": about.get("name") or name}
     scene = validate(model, data, label)
@@ -136,6 +139,22 @@ def single_tables(source: SceneSource) -> dict[str, set[str]]:
         if kinds and get_origin(field.annotation) is not list:
             found[name] = {inner.alias or key for key, inner in kinds[0].model_fields.items()}
     return found
+
+
+def fix_file(source: str) -> list[str]:
+    """Replace old names of keys in a scene file; return a line for each, such as "material.angle_of is now ...".
+
+    Raises:
+        SceneError: the source is no file, cannot be read, or cannot be rewritten.
+    """
+    file = Path(source)
+    if not file.is_file() or source in built_in_scenes():
+        raise SceneError(source, [KeyFault("", "--fix rewrites scene files: this is none")])
+    model = _scene_model(_parse(file, source), source)
+    text, renamed = fix_text(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"), model, source)
+    if renamed:
+        write_text(file, text)
+    return renamed
 
 
 def check_shapes(scene: Scene, source: str) -> None:

@@ -65,6 +65,8 @@ class Table(BaseModel):
     later: ClassVar[Mapping[str, frozenset[object]]] = {}
     #: those among them that other simulators have already, with the simulator's name; and more keys that only those have.
     elsewhere: ClassVar[Mapping[str, str]] = {}
+    #: old names of keys, each with today's name; scene files may still have them (see `warp_lcp.scene.renamed_keys`).
+    renamed: ClassVar[Mapping[str, str]] = {}
 
 
 @dataclass(frozen=True)
