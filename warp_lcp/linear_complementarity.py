@@ -44,7 +44,10 @@ def linear_complementarity(
     A: Any, b: Array, *, bounds: Any = None, x0: Array | None = None, tol: float = 1e-6, atol: float = 0.0,
     method: str | Solver | None = None, maxiter: int = 1000, preconditioner: Any = None, callback: Callable[..., Any] | None = None,
 ) -> OptimizeResult:  # fmt: skip
-    """Find x with lo <= x <= hi and y = A x + b: y_i >= 0 where x_i = lo_i, y_i <= 0 where x_i = hi_i, and y_i = 0 in between.
+    """Solve a complementarity problem in the manner of scipy.optimize.
+
+    Find x with lo <= x <= hi and y = A x + b: y_i >= 0 where x_i = lo_i, y_i <= 0 where x_i = hi_i,
+    and y_i = 0 in between.
 
     For bounds 0 and inf that is the linear complementarity problem, 0 <= x, y >= 0, x'y = 0 ([Book] 1.2); if A is symmetric positive
     semi-definite, x minimizes x'Ax / 2 + b'x within its bounds. This is `wl.solve` in SciPy's manner, for arrays on the host: problems

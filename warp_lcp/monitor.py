@@ -20,7 +20,9 @@ X_AXES = {  # of plot_convergence: the attribute of Record and the axis label
 
 
 def print_progress(record: Record) -> None:
-    """Print a line for each iteration of a solve: `wl.solve(problem, callback=wl.print_progress)`.
+    """Print a line for each iteration of a solve.
+
+    Use it as `wl.solve(problem, callback=wl.print_progress)`.
 
     A line has the iteration, the norm of the natural residual in the units of y, the wall time in
     seconds and the kind of the last step. It is like the output of PETSc's `-snes_monitor`.
@@ -38,7 +40,9 @@ def plot_convergence(
     relative: bool = True,
     axes: Any = None,
 ) -> Any:
-    """Plot residuals over iterations or seconds, one line a solve, on a logarithmic axis.
+    """Plot residuals over iterations or seconds, on a logarithmic axis.
+
+    There is one line for each solve.
 
     Args:
         results: one result of `wl.solve`, a sequence of results, or a mapping from labels to results.

@@ -31,7 +31,7 @@ LEAN = ("psor", "accelerated-projected-gradient", "projected-jacobi")  # hold fi
 
 @dataclass(frozen=True, kw_only=True)
 class Budget(Settings):
-    """What a solve may cost; what is None does not matter.
+    """Limits of a solve for `wl.recommend`; None is no limit.
 
     Args:
         seconds: wall time on this machine, > 0 [s].

@@ -73,7 +73,11 @@ class ContactSystem:
         return np.arange(self.dim * self.contacts, len(self.q))
 
     def blocks(self, most: int = 5) -> list[np.ndarray]:
-        """Return the rows of each contact, then joints' rows: equations that follow each other, at most `most`, bounded ones alone."""
+        """Return the rows of each contact, then blocks of the joints' rows.
+
+        Equations that follow each other share a block of at most `most` rows; bounded rows stand
+        alone.
+        """
         blocks = list(np.arange(self.dim * self.contacts).reshape(self.contacts, self.dim))
         free = np.isinf(self.lower) & np.isinf(self.upper)
         for equations, group in groupby(zip(self.joints, free, strict=True), key=lambda entry: entry[1]):
@@ -82,12 +86,17 @@ class ContactSystem:
         return blocks
 
     def staggered(self) -> list[np.ndarray]:
-        """Return the rows of normal impulses and joints, and those of friction: two blocks, or one where there is no contact."""
+        """Return two blocks of rows: normal impulses with joints, and friction.
+
+        There is one block if there is no contact.
+        """
         blocks = [np.concatenate([self.normals, self.joints]), self.tangents.ravel()]
         return [block for block in blocks if block.size]
 
     def residual(self, r: np.ndarray) -> float:
-        """Return the norm of the proximal map's defect at r with the circular cone, in m/s.
+        """Return the norm of the proximal map's defect at r, in m/s.
+
+        The map projects onto the circular cone.
 
         With u = B r + q and d a contact's mean diagonal of B: d (r_n - max(0, r_n - u_n / d)), and for friction the same with the
         projection onto |r_t| <= mu r_n ([Book] 1.1.4, 1.3.5; the disk of the true normal impulse). 0 exactly where Coulomb's law holds:
@@ -129,7 +138,9 @@ class ContactModel(Protocol):
 
 @dataclass(frozen=True)
 class BoxedModel:
-    """The interactive model: |r_t| <= mu r_n for each tangent alone, bounds affine in r_n ([Book] 1.3.5).
+    """Boxed friction model: |r_t| <= mu r_n for each tangent alone.
+
+    Bounds are affine in r_n ([Book] 1.3.5).
 
     The cone has four sides and its friction up to sqrt(2) mu along diagonals, and friction does not oppose the slip exactly. The problem
     is symmetric positive semi-definite, with n = dim k + m unknowns, and for methods that take affine bounds.
@@ -162,7 +173,9 @@ class BoxedModel:
 
 @dataclass(frozen=True, eq=False)
 class FrozenBoxModel(BoxedModel):
-    """|r_t| <= mu s with normal impulses s that are given: bounds are constants, and any method for boxed problems may solve it.
+    """Boxed friction model with given normal impulses s: |r_t| <= mu s.
+
+    Bounds are constants, so any method for boxed problems may solve it.
 
     Args:
         normal: s of each contact [N s], shape (k,).
@@ -181,7 +194,9 @@ class FrozenBoxModel(BoxedModel):
 
 @dataclass(frozen=True)
 class StewartTrinkleModel:
-    """The LCP of Stewart and Trinkle with a cone of K sides ([Book] 1.3.5, eqs. 1.146-1.147).
+    """The LCP of Stewart and Trinkle with a cone of K sides.
+
+    [Book] 1.3.5, eqs. 1.146-1.147.
 
     Friction is a sum of non-negative impulses along K unit vectors evenly around the normal; with beta, the slip speed, a contact has the
     rows y_n = u_n, y_t = u_t + beta, y_beta = mu x_n - sum of x_t, each complementary to its x >= 0. The last sign makes it
@@ -204,14 +219,17 @@ class StewartTrinkleModel:
             raise ValueError(f"directions = {self.directions}: must be an even number >= 2")
 
     def spread(self, dim: int) -> np.ndarray:
-        """Return normal and the K vectors as rows in a contact's frame, shape (1 + K, dim)."""
+        """Return normal and K tangent vectors in a contact's frame, shape (1 + K, dim)."""
         K = self.directions if dim == 3 else 2
         angles = 2 * np.pi * np.arange(K) / K
         around = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, : dim - 1]
         return np.block([[np.ones((1, 1)), np.zeros((1, dim - 1))], [np.zeros((K, 1)), around]])
 
     def unfold(self, system: ContactSystem) -> scipy.sparse.csr_array:
-        """Return T: impulses are r = T'x of the unknowns x, velocities along the vectors T u; shape (unknowns, rows of B)."""
+        """Return the matrix T of r = T'x; shape (unknowns, rows of B).
+
+        Impulses are r = T'x of the unknowns x, velocities along the vectors T u.
+        """
         each = np.vstack([self.spread(system.dim), np.zeros(system.dim)])
         blocks = [scipy.sparse.kron(scipy.sparse.eye_array(system.contacts), each), scipy.sparse.eye_array(len(system.lower))]
         return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
@@ -238,7 +256,10 @@ class StewartTrinkleModel:
         return np.asarray(self.unfold(system).T @ x)
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
-        """Return unknowns whose impulses are near r: friction split onto the two nearest vectors, beta from the slip at r."""
+        """Return unknowns whose impulses are near r.
+
+        Friction is split onto the two nearest vectors; beta comes from the slip at r.
+        """
         k, dim, spread = system.contacts, system.dim, self.spread(system.dim)
         rows, own = dim * k, r[: dim * k].reshape(k, dim)
         u = (system.B @ r + system.q)[:rows].reshape(k, dim)
@@ -261,7 +282,9 @@ class StewartTrinkleModel:
 def proximal_sweeps(
     system: ContactSystem, *, tolerance: float = 1e-9, most: int = 1000, r0: np.ndarray | None = None
 ) -> tuple[np.ndarray, float, int]:
-    """Solve the proximal-map form with the circular cone by Gauss-Seidel sweeps over contacts, on the host ([Book] 1.1.4, 1.3.5).
+    """Solve the proximal form with the circular cone by Gauss-Seidel sweeps.
+
+    Over contacts, on the host ([Book] 1.1.4, 1.3.5).
 
     r_n <- max(0, r_n - u_n / B_nn), then r_t <- proj(r_t - u_t / rho) onto |r_t| <= mu r_n with rho the largest eigenvalue of the
     contact's B_tt; joint rows <- clip(r - u / B_ii). No proof of convergence for mu > 0; the reference for the polyhedral cones here, in

@@ -271,7 +271,9 @@ def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
 
 
 def contact(contacts: int, *, directions: int = 4, bodies: int | None = None, friction: float = 0.5, seed: int = 2015) -> Problem:
-    """Return the impulse problem of random bodies that touch, in the model of Stewart and Trinkle ([Book] 1.3.5).
+    """Return the impulse problem of random bodies in contact.
+
+    In the model of Stewart and Trinkle ([Book] 1.3.5).
 
     Bodies are balls of radius 1 with velocities v; each contact joins one to another or to the ground at a random point of its surface, the
     tangents turned at random. Whatever v is there is a solution (Anitescu, Potra), which Lemke's method finds; impulses need not be unique.

@@ -45,7 +45,9 @@ class StepReport:
 
 
 class ContactStepper:
-    """Advance a world: detect contacts, solve for impulses, change velocities, then move with them.
+    """Time stepper of rigid bodies with contacts.
+
+    A step detects contacts, solves for impulses, changes velocities, and moves the bodies.
 
     v' = v + dt g + M^-1 J'r, x' = x + dt v'. Overlaps are removed by what is added to the normal velocity: "baumgarte" adds a part of
     the overlap over dt in the problem itself, which bodies keep as velocity; "split" moves bodies by a second, frictionless problem's

@@ -26,7 +26,7 @@ UNWRITTEN = 2**24  # bytes of a dataset that was never written, up to which it i
 
 @dataclass(frozen=True, eq=False)
 class FclibProblem:
-    """What a file holds.
+    """Content of an FCLib file.
 
     Args:
         system: velocities at contacts for impulses; equations of l are its joint rows.
@@ -40,7 +40,9 @@ class FclibProblem:
 
 
 def read_fclib(path: Path | str) -> FclibProblem:
-    """Read a local or a global problem; a global one is reduced to its contacts by M's factors.
+    """Read a local or a global problem from an FCLib file.
+
+    A global problem is reduced to its contacts by the factors of M.
 
     Raises:
         ImportError: h5py is missing.

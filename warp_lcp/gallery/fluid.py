@@ -38,7 +38,10 @@ class Splash:
     faces: dict[str, Any] = field(default_factory=dict)
 
     def lower(self, bounds: str) -> float | np.ndarray:
-        """Return the lower bound: -inf (linear), 0 on wall cells (walls) or 0 (everywhere)."""
+        """Return the lower bound, a number or a field.
+
+        -inf ("linear"), 0 on wall cells ("walls") or 0 ("everywhere").
+        """
         if bounds == "walls":
             return np.where(self.wall, 0.0, -np.inf)
         return {"linear": -np.inf, "everywhere": 0.0}[bounds]
@@ -93,7 +96,9 @@ class SplashPart:
 
 
 def splash(n: int, *, phase: float = 0.0) -> Splash:
-    """Return liquid with a column, a pool, a film on a wall and a blob on the ceiling, around a solid sphere, in a closed box.
+    """Return the pressure problem of a splash in a closed box.
+
+    A column, a pool, a film on a wall and a blob on the ceiling, around a solid sphere.
 
     Args:
         n: cells along a side.
@@ -143,7 +148,10 @@ def splash_part(n: int, part: tuple[slice, ...], *, phase: float = 0.0) -> Splas
 
 
 def basin(n: int) -> Splash:
-    """Return a closed box full of liquid but for a layer of AIR under its lid, with random b: every row of the grid is in use."""
+    """Return a closed box full of liquid under a layer of AIR, with random b.
+
+    Every row of the grid is in use.
+    """
     cells = np.full((n, n, n), FLUID, dtype=np.int8)
     cells[-1] = AIR
     wall = np.zeros(cells.shape, dtype=bool)

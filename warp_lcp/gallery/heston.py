@@ -42,7 +42,10 @@ def differences(x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray) -> tupl
 
 @dataclass(frozen=True, kw_only=True)
 class Heston:
-    """A put in Heston's model: dS = r S dt + sqrt(v) S dW1, dv = kappa (theta - v) dt + sigma sqrt(v) dW2, with correlated dW1 and dW2.
+    """American or European put in Heston's model of stochastic volatility.
+
+    dS = r S dt + sqrt(v) S dW1, dv = kappa (theta - v) dt + sigma sqrt(v) dW2, with correlated dW1
+    and dW2.
 
     Its price u(S, v) at time t before expiry obeys u_t + L u >= 0, u >= max(K - S, 0), one of them with equality, where L u =
     -(v S^2 u_SS / 2 + rho sigma v S u_Sv + sigma^2 v u_vv / 2 + r S u_S + kappa (theta - v) u_v - r u). The defaults are the test
@@ -80,7 +83,10 @@ class Heston:
             raise ValueError(f"correlation = {self.correlation}: must be in (-1, 1)")
 
     def nodes(self, ns: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes of S from 0 to about 3 K, dense around K, which is halfway between two, and of v from 0 to 1 or 6 theta, dense at 0.
+        """Return the nodes of S and v.
+
+        S from 0 to about 3 K, dense around K, which is halfway between two nodes; v from 0 to 1 or
+        6 theta, dense at 0.
 
         Args:
             ns: intervals of S.
@@ -94,7 +100,9 @@ class Heston:
         return S, v * max(1.0, 6 * self.mean)
 
     def coefficients(self, S: np.ndarray, v: np.ndarray) -> Coefficients:
-        """Return L as a stencil of 7 points, {(dv, dS): array of shape (v, S)}, of second order on smooth grids but where v is next to 0.
+        """Return the differential operator as a stencil of 7 points.
+
+        {(dv, dS): array of shape (v, S)}, of second order on smooth grids but where v is next to 0.
 
         The mixed derivative is the mean of those of the two squares in whose direction it is positive, which keeps A an M-matrix
         where the ratio of spacings lets it. Above the last v the price does not change, beyond the last S it is 0.
@@ -122,7 +130,9 @@ class Heston:
         return a
 
     def put(self, ns: int, nv: int, steps: int, *, american: bool = True, device: Any = None) -> Prices:
-        """Return the prices today: a complementarity problem each time step, begun with the last one's solution.
+        """Return the prices today.
+
+        Each time step is a complementarity problem, which starts from the last one's solution.
 
         Time steps grow like their number, since the price is smooth later on and its free boundary moves slower.
 
@@ -166,7 +176,9 @@ class Heston:
         return Prices(S, v, u)
 
     def extrapolated(self, spot: Any, variance: float, ns: int, nv: int, steps: int, **options: Any) -> np.ndarray:
-        """Return prices from two grids, this one and one twice as fine in everything: 4/3 of the fine one's less 1/3 of this one's.
+        """Return Richardson-extrapolated prices from this grid and one twice as fine.
+
+        4/3 of the fine grid's prices less 1/3 of this grid's.
 
         Args:
             spot: S, a number or an array.

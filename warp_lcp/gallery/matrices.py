@@ -38,7 +38,9 @@ def definite(n: int, *, condition: float = 100.0, plant: Plant | None = None, se
 
 
 def semidefinite(n: int, *, zeros: float = 0.5, plant: Plant | None = None, seed: int = 2015) -> Problem:
-    """Return a planted, hence solvable, problem with a dense symmetric positive semi-definite matrix B B' of rank n - zeros n.
+    """Return a planted problem with a dense semidefinite matrix.
+
+    B B' of rank n - zeros n, symmetric; planted, hence solvable.
 
     y is the same for all its solutions, x need not be.
 
@@ -61,7 +63,9 @@ def semidefinite(n: int, *, zeros: float = 0.5, plant: Plant | None = None, seed
 
 
 def skewed(n: int, *, skew: float = 1.0, plant: Plant | None = None, seed: int = 2015) -> Problem:
-    """Return a planted problem with a positive definite matrix that is not symmetric: a P-matrix B B' + I/2 + skew (C - C').
+    """Return a planted problem with an unsymmetric positive definite matrix.
+
+    A P-matrix B B' + I/2 + skew (C - C').
 
     Args:
         n: unknowns.
@@ -76,7 +80,9 @@ def skewed(n: int, *, skew: float = 1.0, plant: Plant | None = None, seed: int =
 
 
 def period_three(blocks: int = 1, *, plant: Plant | None = None, seed: int | None = None) -> Problem:
-    """Return P-matrices of size 3 on which Newton's method on the minimum map cycles with period 3 from some starts (Ben Gharbia, Gilbert).
+    """Return P-matrices on which the minimum-map Newton method cycles.
+
+    Size 3; from some starts the period is 3 (Ben Gharbia, Gilbert).
 
     Each block is [[1, 0, a], [a, 1, 0], [0, a, 1]], whose principal minors are 1, 1 and 1 + a^3. Without a plant b = -1.
 
@@ -119,7 +125,9 @@ def banded_matrix(n: int, bands: int, rng: np.random.Generator) -> scipy.sparse.
 
 
 def banded(n: int, *, bands: int = 3, plant: Plant | None = None, seed: int = 2015) -> Problem:
-    """Return a planted problem with a random banded, symmetric positive definite M-matrix.
+    """Return a planted problem with a random banded matrix.
+
+    A symmetric positive definite M-matrix.
 
     Args:
         n: unknowns.

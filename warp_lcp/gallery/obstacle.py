@@ -28,7 +28,9 @@ def membrane_height(r: np.ndarray) -> np.ndarray:
 
 
 def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
-    """Return -Laplace u >= 0, u >= psi on [-2, 2]^2, with the exact solution's values on the border (Bueler's test problem).
+    """Return Bueler's ball obstacle problem on [-2, 2]^2.
+
+    -Laplace u >= 0, u >= psi, with the exact solution's values on the border.
 
     The operator is h^2 times the 5-point one, h = 4 / (n - 1); border nodes are AIR and their values part of b. `solution` is the exact
     one at the nodes, not that of the discrete problem: the difference is the discretization's error, O(h^2) away from the free boundary
@@ -58,7 +60,9 @@ def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
 
 
 def torsion(n: int, load: float = 5.0, *, border: float = 1.0, device: Any = None, dtype: Any = wp.float32) -> Problem:
-    """Return the elastic-plastic torsion of a square bar: -Laplace u = load where |u| is less than the distance to the border.
+    """Return the elastic-plastic torsion of a square bar.
+
+    -Laplace u = load where |u| is less than the distance to the border.
 
     The unit square has n nodes a side, the border not included; u is Prandtl's stress function, whose slope is 1 at most. Where |u| is the
     distance, the bar has yielded: along the diagonals it never does. With n = 2 Q - 2 it is CUTEst's TORSIONA to F, that of MINPACK-2,
@@ -98,7 +102,9 @@ def _faces(cells: np.ndarray, x: float, y: float, border: float) -> dict[str, An
 
 
 def sine_obstacle(nx: int, ny: int, *, between: bool = False, device: Any = None, dtype: Any = wp.float32) -> Problem:
-    """Return the membrane of Dembo and Tulowitzki: -Laplace u >= 1 above a hill, or between four hills and holes; CUTEst's OBSTCLA., B.
+    """Return the membrane of Dembo and Tulowitzki: -Laplace u >= 1 over an obstacle.
+
+    Above a hill, or between four hills and holes; CUTEst's OBSTCLA and OBSTCLB.
 
     u >= sin(3.2 y) sin(3.3 x), or s^3 <= u <= s^2 + 0.02 with s = sin(9.2 y) sin(9.3 x), on the unit square; u = 0 on the border, whose
     differences have half the weight of others in the energy, as in CUTEst.
@@ -128,7 +134,9 @@ def sine_obstacle(nx: int, ny: int, *, between: bool = False, device: Any = None
 def journal_bearing(
     nx: int, ny: int, eccentricity: float = 0.1, *, half_width: float = 10.0, device: Any = None, dtype: Any = wp.float64
 ) -> Problem:
-    """Return the pressure u >= 0 of the film in a journal bearing (Reynolds' equation), which cavitates where u = 0.
+    """Return the pressure u >= 0 of the film in a journal bearing.
+
+    Reynolds' equation; the film cavitates where u = 0.
 
     u minimizes the integral of h^3 |grad u|^2 / 2 - e sin(x) u over [0, 2 pi] x [0, 2 half_width], with the film's thickness
     h = 1 + e cos x and u = 0 on the border, by linear elements on right triangles whose h^3 is the mean of their corners'. It is problem
@@ -168,7 +176,9 @@ def journal_bearing(
 def dam(
     nx: int, ny: int, *, width: float = 16.0, high: float = 24.0, low: float = 4.0, device: Any = None, dtype: Any = wp.float32
 ) -> Problem:
-    """Return the seepage of water through a dam from a full reservoir to water of depth `low`.
+    """Return the seepage of water through a dam.
+
+    From a full reservoir to water of depth `low`.
 
     By Baiocchi's transform, w(x, y) is the integral of the pressure's head from y up: w >= 0, -Laplace w + 1 >= 0, and w has its values
     on the border. Where w > 0 the dam is wet. `b` holds hx hy and the border's values, which are AIR.

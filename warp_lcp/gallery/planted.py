@@ -17,7 +17,7 @@ from warp_lcp.settings import Part, Positive, Settings
 
 @dataclass(frozen=True, kw_only=True)
 class Plant(Settings):
-    """How a solution is chosen.
+    """Settings of a planted solution.
 
     Args:
         active: share of the unknowns with a bound that sit at it.

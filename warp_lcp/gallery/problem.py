@@ -75,7 +75,9 @@ class Problem:
         return "sparse" if scipy.sparse.issparse(self.A) else "dense"
 
     def lcp(self, *, device: Any = None, dtype: Any = wp.float64) -> LCP:
-        """Return the problem for a solver; a grid's operator is on its device, of its type, already.
+        """Return the problem for a solver.
+
+        The operator of a grid has its device and type already.
 
         Args:
             device: Warp device of a matrix; the default device if None.
@@ -86,7 +88,9 @@ class Problem:
         return LCP(A, self.b, _number_or_field(self.lower), _number_or_field(self.upper))
 
     def energy(self, x: Any) -> float:
-        """Return x'A x / 2 + b'x, in float64: what a solution minimizes within the bounds if A is symmetric.
+        """Return x'A x / 2 + b'x, in float64.
+
+        A solution minimizes it within the bounds if A is symmetric.
 
         Args:
             x: a field like b, numpy or wp.array.
@@ -97,7 +101,10 @@ class Problem:
         return float((host * (Ax / 2 + b)).sum())
 
     def sparse(self) -> Problem:
-        """Return the problem of a grid's FLUID cells, in their order, with a scipy.sparse matrix; any other as it is."""
+        """Return the problem of a grid's FLUID cells with a scipy.sparse matrix.
+
+        Rows have the cells' order; a problem that is no grid's is returned as it is.
+        """
         if not isinstance(self.A, GridPoisson):
             return self
         rows = np.flatnonzero(self.A.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == FLUID)

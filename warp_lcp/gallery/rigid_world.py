@@ -30,7 +30,7 @@ SLOP = 0.002  # of the smallest body's reach: overlap that is left alone, so tha
 
 @dataclass(eq=False)
 class World:
-    """What a scene consists of.
+    """State of a contact scene: bodies, shapes, joints, gravity.
 
     Args:
         name: the scene, with its parameters.
@@ -83,7 +83,9 @@ class World:
         return np.array([body.velocities(3) for body in self.bodies])
 
     def contacts(self, dt: float = 0.0, *, margin: float | None = None) -> Contacts:
-        """Return where bodies touch now, or may within dt [s] if two of them meet at the largest speed of all.
+        """Return the contacts of now, or those possible within dt [s].
+
+        dt assumes that two bodies meet at the largest speed of all.
 
         Args:
             dt: time step [s].

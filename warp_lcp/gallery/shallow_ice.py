@@ -26,7 +26,9 @@ CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 
 @dataclass(frozen=True, kw_only=True)
 class IceDome:
-    """A radial dome of ice on a flat bed, whose thickness H is known: div q = m where H > 0, q = -Gamma H^(n+2) |grad H|^(n-1) grad H.
+    """Radial dome of ice on a flat bed with a known thickness H.
+
+    div q = m where H > 0, q = -Gamma H^(n+2) |grad H|^(n-1) grad H.
 
     The surface mass balance m is what keeps the dome as it is; outside, more melts than flows in. Discretized by the control volumes of
     Bueler (2016) on bilinear elements with two fluxes a side, as his program p4pdes/ice.c does: F(H) >= 0, H >= 0, H'F(H) = 0, F the
@@ -73,7 +75,7 @@ class IceDome:
 
     @property
     def distance(self) -> np.ndarray:
-        """Of the nodes from the center, in radii, shape (nodes, nodes)."""
+        """Distance of the nodes from the center, in radii, shape (nodes, nodes)."""
         s = np.linspace(-self.side / 2, self.side / 2, self.nodes) / self.radius
         return np.hypot(*np.meshgrid(s, s))
 
@@ -84,7 +86,10 @@ class IceDome:
         return self.height * (np.maximum(shape, 0) / (1 - 1 / n)) ** (n / (2 * n + 2))
 
     def balance(self) -> np.ndarray:
-        """Return m at the nodes [m/s], shape (nodes, nodes): not finite at center and margin, where it is taken 1 cm beside."""
+        """Return the mass balance m at the nodes [m/s], shape (nodes, nodes).
+
+        m is not finite at center and margin; its value 1 cm beside stands there.
+        """
         n = self.exponent
         s = np.clip(self.distance, 0.01 / self.radius, 1 - 0.01 / self.radius)
         scale = self.gamma * self.height ** (2 * n + 2) / (2 * self.radius * (1 - 1 / n)) ** n
@@ -93,7 +98,9 @@ class IceDome:
         return scale / (self.radius * s) * rise ** (n - 1) * fall
 
     def outflow(self, H: np.ndarray, share: float) -> tuple[np.ndarray, scipy.sparse.csr_array]:
-        """Return what flows out of each volume [m^3/s], shape (nodes, nodes), and its derivative by H, a matrix of the nodes.
+        """Return the outflow of each volume [m^3/s] and its derivative by H.
+
+        Shape (nodes, nodes), and a matrix of the nodes.
 
         Args:
             H: thickness at the nodes [m], shape (nodes, nodes).
@@ -128,7 +135,9 @@ class IceDome:
         return F.reshape(N, N), J.tocsr()
 
     def solve(self, *, device: Any = None) -> np.ndarray:
-        """Return the discrete H at the nodes [m], shape (nodes, nodes), by Newton's method: each step is a linear problem, H >= 0.
+        """Return the discrete H at the nodes [m] by Newton's method.
+
+        Shape (nodes, nodes). Each step is a linear complementarity problem, H >= 0.
 
         The share of the constant diffusivity falls from 1, where the problem is linear, by a third of a decade each time, to
         `regularization`.

@@ -57,7 +57,9 @@ CHANGED = 2.0  # times the result's residual: a larger one is that of another pr
 
 @dataclass(frozen=True)
 class Gradients:
-    """Derivatives of a scalar of x with respect to what the problem was made of; true only if the linear solve converged.
+    """Derivatives of a scalar function of x by the data of the problem.
+
+    True only if the linear solve converged.
 
     Attributes:
         b: of the shape of the result's x, float64; 0 where x is held.
@@ -90,12 +92,17 @@ class Gradients:
 
     @property
     def by_name(self) -> dict[Any, Any]:
-        """All of them by the names of what they belong to; those of a stencil's offset by pairs, ("coefficients", (0, 1))."""
+        """All gradients by name.
+
+        Those of a stencil's offset have pairs as names, such as ("coefficients", (0, 1)).
+        """
         return flat({"b": self.b, "lower": self.lower, "upper": self.upper, **self.coefficients})
 
 
 def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | None = None, allow_inexact: bool = False) -> Gradients:
-    """Return the gradients of a scalar L(x) through the solution x of a problem, by one linear solve on the free unknowns.
+    """Return the gradients of a scalar L(x) through the solution x of a problem.
+
+    They cost one linear solve on the free unknowns.
 
     An unknown is free if it is off its bounds by more than the largest entry of the natural residual, in units of y, and what rounding
     leaves; the others are held. Where y is 0 at a bound too, that is a choice: an element of the B-subdifferential of the solution map, if

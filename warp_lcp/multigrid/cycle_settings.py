@@ -30,7 +30,9 @@ class Smoothing(Settings):
 @renamed(excess="dirichlet_scaling", semi="semicoarsening_threshold")
 @dataclass(frozen=True, kw_only=True)
 class CycleSettings(Smoothing):
-    """How a cycle goes. The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
+    """Settings of a multigrid cycle on a grid.
+
+    The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
 
     Args:
         gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle. Where one axis is coarsened at a time, every second level

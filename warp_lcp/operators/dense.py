@@ -83,7 +83,10 @@ class DenseOperator(Pickled):
         return self.shape[0]
 
     def update(self, values: Any) -> None:
-        """Take other entries, shape (n, n), finite; `symmetric` and `row_sizes` stay as they are."""
+        """Replace the entries: shape (n, n), finite.
+
+        `symmetric` and `row_sizes` keep their values.
+        """
         self.matrix.assign(values)
         self._rounding = relative_rounding(real_array(values, "values"), self.dtype)
 
@@ -117,7 +120,10 @@ class DenseOperator(Pickled):
         return {"matrix": wp.array(np.outer(multiplier.numpy(), x.numpy()), dtype=wp.float64, device=self.device)}
 
     def masked(self, free: Any, shift: Any = None) -> DenseOperator:
-        """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
+        """Return P A P + P D P with P the restriction to `free` and D = diag(shift).
+
+        `free` has non-zero entries on the rows that stay.
+        """
         p = self.layout.load(free, wp.uint8, "free").numpy() != 0
         matrix = self.matrix.numpy() * np.outer(p, p)
         if shift is not None:
@@ -125,7 +131,7 @@ class DenseOperator(Pickled):
         return DenseOperator(matrix, device=self.device, dtype=self.dtype)
 
     def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
-        """Sweep x once in row order (forward) or backwards, each unknown projected onto its bounds."""
+        """Sweep x once in row order, forward or backward, projected onto the bounds."""
         given = {"b": b, "lower": lower, "upper": upper, "x": x, "omega": omega, "forward": forward}
         RELAX.bind(Rows.flat(x.size, self.device, serial=True), a=self.matrix.flatten(), **given).launch()
 

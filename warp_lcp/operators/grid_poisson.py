@@ -49,7 +49,9 @@ AXES = "xyz"
 
 
 class GridPoisson(GridOperator):
-    """Negative Laplacian on the FLUID cells of a grid ([Book] 1.3.1), with general face coefficients.
+    """Negative Laplacian on the FLUID cells of a grid, with face coefficients.
+
+    [Book] 1.3.1.
 
     (A x)_i = sum over i's open faces of c_f (x_i - x_neighbor) + shift_i x_i, with x = 0 in AIR and in SOLID. A face with SOLID on a side
     is closed; outside the array is SOLID unless the axis is periodic. Numbers as coefficients keep the fast kernels: equal ones and no
@@ -148,7 +150,7 @@ class GridPoisson(GridOperator):
 
     @property
     def component_finder(self) -> ComponentFinder:
-        """What finds floating components."""
+        """Finder of floating components."""
         if self._finder is None:
             self._finder = self._component_finder()
         return self._finder

@@ -21,7 +21,9 @@ ASYMMETRY = 1e-5  # of ||u|| ||A v||: above what products in float32 leave of u'
 
 
 class LinearOperator(Pickled, Operator):
-    """A x by a function, or by `A @ x` of a scipy.sparse.linalg.LinearOperator: products are all that there is of A.
+    """Operator given by products alone: a function or a SciPy LinearOperator.
+
+    A x comes from the function, or from `A @ x`; rows and entries are not available.
 
     Products are made on the host, from copies of x in float64, whatever the device. Every method that needs products only takes it
     (docs "Operators of your own"); `MinimumMapNewton` is the default. Two products check what is given, two more that A is symmetric
@@ -93,7 +95,10 @@ class LinearOperator(Pickled, Operator):
         return wp.array(d.reshape(self.shape), dtype=wp.float64, device=self.device)
 
     def scale(self) -> np.ndarray:
-        """Return the natural residual's d, estimated by 16 products, the first time that it is asked for."""
+        """Return the natural residual's d, estimated by 16 products.
+
+        The estimate is made at the first call.
+        """
         if self._scale is None:
             self._scale = estimated_scale(self, self.layout, np.ones(self.layout.size, dtype=bool), self._diagonal)
         return self._scale

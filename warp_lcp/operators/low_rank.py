@@ -141,7 +141,9 @@ class BlockColumns:
 
 
 class LowRankOperator(Pickled):
-    """U W U' x, with a few columns U and a small matrix W; usually a term of a SumOperator, A + U W U'.
+    """Low-rank operator U W U' with few columns U and a small matrix W.
+
+    Usually a term of a SumOperator, A + U W U'.
 
     Only the rows of U that are not 0 are stored, and a product costs no more than they do. Where ranks share the fields each has its rows
     of U, and products are collective.
@@ -179,7 +181,7 @@ class LowRankOperator(Pickled):
 
     @classmethod
     def of_blocks(cls, A: Any, columns: BlockColumns, weights: Any) -> LowRankOperator:
-        """Return the operator of columns that are stored already, as the fields of an operator A are.
+        """Return the operator of columns that are stored as fields of A are.
 
         Its entries may be rewritten in place; `update` says so.
 
@@ -223,7 +225,9 @@ class LowRankOperator(Pickled):
         self.version += 1
 
     def stored_like(self, A: Any) -> LowRankOperator:
-        """Return the same operator for fields that are stored as A's are; itself if its are.
+        """Return the same operator for fields stored as A's are.
+
+        It is the operator itself if its fields are stored so already.
 
         Raises:
             ValueError: A's fields have another shape.
@@ -251,7 +255,10 @@ class LowRankOperator(Pickled):
         self, x: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None, transposed: bool = False,
         launch: Launch = wp.launch,
     ) -> None:  # fmt: skip
-        """out = base + U W U' x on U's rows where `mask` (uint8) is not 0; other rows of `out` stay. All are flat stored fields."""
+        """Evaluate out = base + U W U' x on U's rows where `mask` is not 0.
+
+        Other rows of `out` keep their values. `mask` is uint8; all are flat stored fields.
+        """
         W = self._transposed if transposed else self.weights
         launch(weigh_kernel, self.rank, [W, self.columns.gather(x, launch=launch), self._weighed], device=self.device)
         self.columns.scatter(self._weighed, base, out, mask=mask, launch=launch)

@@ -165,7 +165,10 @@ class SparseOperator(Pickled):
         return out
 
     def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
-        """Return A' x. The transpose is stored when this is first called, unless A is symmetric."""
+        """Return A' x.
+
+        The first call stores the transpose, unless A is symmetric.
+        """
         if self.symmetric:
             return self.apply(x, out)
         out = self._result(x, out)
@@ -185,7 +188,10 @@ class SparseOperator(Pickled):
         PRODUCT.bind(Rows.flat(x.size, self.device), **self._rows, x=x, plus=plus, y=out).launch(launch)
 
     def diagonal(self) -> wp.array[Any]:
-        """Return the diagonal of A, shape (n,): the operator's own memory, which `update` keeps current."""
+        """Return the diagonal of A, shape (n,).
+
+        It is the operator's own memory, which `update` keeps current.
+        """
         return self._diagonal
 
     def rows(self) -> CompressedRows:
@@ -203,7 +209,10 @@ class SparseOperator(Pickled):
         return self._rounding
 
     def renumbered(self) -> tuple[Renumbering, SparseOperator] | None:
-        """Return A as it is now in a numbering in which neighbors lie together in memory; None where its own is as good, and on CUDA."""
+        """Return A in a numbering whose neighbors lie together in memory, or None.
+
+        None where its own numbering is as good, and on CUDA.
+        """
         found = self._numbering
         if found is None:
             return None
@@ -226,12 +235,18 @@ class SparseOperator(Pickled):
         return next((size for size in BLOCKS if self.unknowns % size == 0 and pattern.tobsr((size, size)).data.size <= FILL * self.nnz), 1)
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return mu_i x_j as `matrix`, for the entries in the order of `indices`, shape (nnz,), float64."""
+        """Return mu_i x_j as `matrix`, for the entries in the order of `indices`.
+
+        Shape (nnz,), float64.
+        """
         entries = np.repeat(multiplier.numpy(), np.diff(self._indptr)) * x.numpy()[self._indices]
         return {"matrix": wp.array(entries, dtype=wp.float64, device=self.device)}
 
     def masked(self, free: Any, shift: Any = None) -> SparseOperator:
-        """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
+        """Return P A P + P D P with P the restriction to `free` and D = diag(shift).
+
+        `free` has non-zero entries on the rows that stay.
+        """
         p = scipy.sparse.diags_array((self.layout.load(free, wp.uint8, "free").numpy() != 0).astype(np.float64))
         matrix = p @ self.matrix() @ p
         if shift is not None:
@@ -242,7 +257,9 @@ class SparseOperator(Pickled):
         self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True, colored: bool | None = None,
         launch: Launch = wp.launch,
     ) -> None:  # fmt: skip
-        """Sweep x once, each unknown projected onto its bounds; rows with a zero diagonal are passed over.
+        """Sweep x once, each unknown projected onto its bounds.
+
+        Rows with a zero diagonal are skipped.
 
         Args:
             x: field, moved in place.

@@ -43,7 +43,9 @@ __all__ = ["Stencil"]
 
 
 class Stencil(GridOperator):
-    """Operator of a compact stencil on the FLUID cells of a grid: finite differences, volumes or elements of a user's own.
+    """Operator of a compact stencil on the FLUID cells of a grid.
+
+    Finite differences, finite volumes or finite elements of your own.
 
     (A x)_i = sum over offsets o of a_o(i) x_(i + o) + shift_i x_i, with x = 0 in AIR, and x_(i + o) = x_i where i + o is SOLID (a closed
     side: no flux). With other values in AIR cells, see `boundary_term`. Nothing is assembled: numbers are numbers in
@@ -134,7 +136,10 @@ class Stencil(GridOperator):
         return {"coefficients": self.given, "shift": self.shift if self.shift.size else None, "outside": self.outside}
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; of functions, too, by their values.
+        """Return the derivatives by each offset's coefficients and by the shift.
+
+        mu_i x_(i + o) of each offset, under `coefficients`, and mu_i x_i of the shift; of
+        functions, too, by their values.
 
         Where the neighbor is SOLID, that is mu_i x_i; x = 0 in AIR.
         """
@@ -155,7 +160,10 @@ class Stencil(GridOperator):
         return {"coefficients": found, "shift": None if given is None else of(CENTER, given)}
 
     def transposed(self) -> Stencil:
-        """Return A' as a stencil of arrays, without SOLID cells: its diagonal has what closed sides add."""
+        """Return A' as a stencil of arrays, without SOLID cells.
+
+        Its diagonal has what closed sides add.
+        """
         fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
         found: dict[tuple[int, ...], Any] = {(0,) * len(self.shape): np.where(fluid.reshape(self.shape), self.diagonal().numpy(), 1.0)}
         for offset, here in self._full().items():
@@ -272,7 +280,9 @@ class Stencil(GridOperator):
         TRANSPOSED.bind(self.stencil.rows, stencil=self.stencil, x=x, y=out).launch()
 
     def boundary_term(self, values: Any) -> wp.array[Any]:
-        """Return what given values in AIR cells, in place of 0, add to b: the sums of a_o(i) value_(i + o), float64, shape of `cells`.
+        """Return what given values in AIR cells, in place of 0, add to b.
+
+        The sums of a_o(i) value_(i + o), float64, shape of `cells`.
 
         Args:
             values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2, nx + 2), with what lies outside; what
@@ -293,7 +303,10 @@ class Stencil(GridOperator):
         return self.layout.unload(out)
 
     def floating_components(self, scratch: Any = None) -> FloatingComponents | None:
-        """Return the components on which rows sum to 0, so that a symmetric A is singular there; None if there are none."""
+        """Return the components on which rows sum to 0, or None.
+
+        A symmetric A is singular there.
+        """
         if self._finder is None or self._finder[0] != self.version:
             self._finder = self.version, self._find_floating()
         found: FloatingComponents | None = self._finder[1]

@@ -84,7 +84,7 @@ class SumOperator(Pickled):
 
     @property
     def version(self) -> int:
-        """How often a term has changed."""
+        """Number of changes of all terms."""
         return sum(version_of(A) or 0 for A in (self.first, self.second))
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
@@ -101,7 +101,10 @@ class SumOperator(Pickled):
         return wp.array(d, dtype=self.dtype, device=self.device)
 
     def scale(self) -> np.ndarray | None:
-        """Return the natural residual's d: the diagonal of a grid and a symmetric term of low rank; None for other sums."""
+        """Return the natural residual's d, or None.
+
+        The diagonal of a grid and a symmetric term of low rank; None for other sums.
+        """
         return None if grid_and_low_rank(self) is None else self.layout.load(self.diagonal(), self.dtype).numpy()
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
@@ -116,7 +119,9 @@ class SumOperator(Pickled):
         ADD.bind(rows_of(out), z=b, x=out).launch()
 
     def floating_components(self, scratch: Any = None) -> Any:
-        """Return the components on which the sum is singular; None if there are none, or a term does not know its own.
+        """Return the components on which the sum is singular, or None.
+
+        None too if a term does not know its own.
 
         The constants of a component are a null space as long as no column of a LowRankOperator feels them: a body that closes off a
         chamber as a piston does is moved by the pressure in it.
@@ -136,7 +141,10 @@ class SumOperator(Pickled):
         return max((A.storage_rounding() for A in (self.first, self.second) if has(A, StoresRounded)), default=0.0)
 
     def masked(self, free: Any, shift: Any = None) -> SumOperator:
-        """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift); of terms that have that."""
+        """Return P (A + B) P + P D P with P the restriction to `free`, D = diag(shift).
+
+        `free` has non-zero entries on the rows that stay; all terms need `masked`.
+        """
         first: Any = self.first
         second: Any = self.second
         if isinstance(self.first, LowRankOperator):  # it cannot take a shift

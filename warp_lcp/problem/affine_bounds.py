@@ -47,7 +47,9 @@ SIDES = ("lower", "upper")
 
 @dataclass(frozen=True, eq=False)
 class AffineBounds:
-    """One side of bounds: constant_i + coefficient_i x_j with j = index_i, and constant_i where index_i = -1.
+    """Bounds on one side that depend on x: c_i + k_i x_j with j = index_i.
+
+    Where index_i = -1 the bound is the constant c_i.
 
     Given to `LCP` as `lower` or `upper`. The unknown x_j that a bound depends on must itself have constant bounds. Methods that evaluate
     their bounds at the iterate take such problems (sweeps, NNCG, SubspaceMinimization, Staggering); others refuse.
@@ -86,7 +88,9 @@ class AffineBounds:
 
     @classmethod
     def friction(cls, normal: Any, mu: Any, lower: Any = 0.0, upper: Any = np.inf) -> tuple[AffineBounds, AffineBounds]:
-        """Return both sides for friction: |x_i| <= mu_i x_j with j = normal_i, and [lower_i, upper_i] where normal_i = -1.
+        """Return the bounds of a friction box: |x_i| <= mu_i x_j with j = normal_i.
+
+        Where normal_i = -1 they are [lower_i, upper_i].
 
         Args:
             normal: for each tangential unknown the flat index of its normal one; -1 for others.

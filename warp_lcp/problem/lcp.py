@@ -124,7 +124,10 @@ class LCP(Pickled):
         return self.bounds.as_field(1)
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """out = A x + b, flat stored fields of one type: in one pass where the operator has it."""
+        """Evaluate out = A x + b on flat stored fields of one type.
+
+        One kernel does it where the operator has a fused product.
+        """
         if has(self.A, AppliesPlus):
             self.A.apply_plus(x, b, out)
             return
@@ -136,7 +139,10 @@ class LCP(Pickled):
         return self._faults(field, Bounds(self.layout, *INFINITE))[0]
 
     def look_at(self, field: wp.array[Any]) -> Callable[[], int]:
-        """Launch what `not_finite` does for a problem in one process; return what tells, and waits for the device."""
+        """Launch the check of `not_finite`; return a function that waits and reads it.
+
+        For a problem in one process.
+        """
         self._counts.launch(CHECK, bounds=Bounds(self.layout, *INFINITE).operands, b=field, unknown=self.unknown)
         return lambda: int(self._counts.reading.numpy()[0])
 

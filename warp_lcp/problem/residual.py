@@ -113,7 +113,10 @@ class NaturalResidual:
         return self.problem.A.row_sizes if has(self.problem.A, HasRows) else None
 
     def settle_isolated(self, x: wp.array[Any]) -> None:
-        """Set x where A's row is empty, so that y = b, to the bound that b's sign asks for; methods move coupled unknowns only."""
+        """Set x where A's row is empty to the bound that the sign of b asks for.
+
+        There y = b. Methods move coupled unknowns only.
+        """
         p, sizes = self.problem, self.row_sizes
         zero_if_empty = self.diagonal if sizes is None else sizes  # of grids, only an empty row has a zero diagonal
         fields = {"d": zero_if_empty, "b": p.b, "unknown": p.unknown, "x": x}
@@ -121,7 +124,10 @@ class NaturalResidual:
         self.current = False
 
     def unattainable(self) -> float:
-        """Return the norm of b where a matrix has an empty row and b's sign asks for a bound that is infinite: no x will do."""
+        """Return the norm of b on empty rows whose solution would be infinite.
+
+        There the sign of b asks for an infinite bound, so no x solves the problem.
+        """
         p, sizes = self.problem, self.row_sizes
         if sizes is None:
             return 0.0
@@ -143,7 +149,9 @@ class NaturalResidual:
         self._sums.launch(UNKNOWN_SQUARE, b=self.problem.b, unknown=self.problem.unknown)
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
-        """Return an estimate of the residual's norm that rounding x to `epsilon` leaves, units of y.
+        """Return an estimate of the residual that rounding x to `epsilon` leaves.
+
+        In the units of y.
 
         r_i = min(max(y_i, d_i (x_i - u_i)), d_i (x_i - l_i)) has the error e_i = epsilon (2 |d_i x_i| + |b_i|) of y_i where it is y_i
         or could be y_i within that error, and only the error epsilon |d_i x_i| of x_i where a bound decides: the size of b in a row that
@@ -156,7 +164,10 @@ class NaturalResidual:
         return math.sqrt(self._total(float(errors @ errors)))
 
     def is_rounding(self, x: wp.array[Any]) -> bool:
-        """Return whether |r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|) in every row: x then solves the problem as well as float64 can tell.
+        """Return whether the residual of every row is rounding error.
+
+        |r_i| <= 4 eps (|b_i| + sum_j |a_ij x_j|): x then solves the problem as well as float64 can
+        tell.
 
         Where an operator shows no rows, |d_i x_i| stands for the sum, which is no larger.
         """

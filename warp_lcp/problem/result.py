@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 
 class SolveStatus(Enum):
-    """How a solve ended. The value says what it means and what to try next."""
+    """Exit status of a solve.
+
+    The value says what it means and what to try next.
+    """
 
     CONVERGED = "the recomputed residual meets the criteria"
     MAX_ITERATIONS = (
@@ -75,7 +78,7 @@ class Record:
 
 @dataclass(frozen=True)
 class SolveResult(FieldsOnHost):
-    """The outcome of `wl.solve`; true only if the recomputed residual meets the criteria.
+    """Result of `wl.solve`; true if the recomputed residual meets the criteria.
 
     Attributes:
         x: the best iterate found, shape of the problem's fields, float64 unless the solver's precision is "single".

@@ -29,7 +29,10 @@ FLOOR_MARGIN = 8.0  # a stagnated residual within this multiple of the rounding 
 
 
 class Precision(StrEnum):
-    """Types of iterate and corrections: `mixed` keeps the iterate in float64 and computes corrections in float32."""
+    """Types of iterate and corrections.
+
+    `mixed` keeps the iterate in float64 and computes corrections in float32.
+    """
 
     MIXED = "mixed"
     SINGLE = "single"
@@ -56,7 +59,7 @@ PrecisionName = Literal[tuple(map(str, Precision))]
 
 @dataclass(frozen=True)
 class Step:
-    """What one step of a method did.
+    """Report of one step of a method.
 
     Args:
         name: a word of the method.
@@ -80,7 +83,9 @@ class Step:
 
 
 class VariationalInequality:
-    """Base of variational inequalities: find x in a convex set K with y(x)'(z - x) >= 0 for all z in K.
+    """Base of variational inequalities over a convex set K that is no box.
+
+    Find x in K with y(x)'(z - x) >= 0 for all z in K.
 
     Equivalently, x = P_K(x - y/d) for any d > 0, where P_K is the projection onto K. The natural residual is the
     distance from x to that projection. For a box K = [l, u] and y = A x + b use `LCP`. K may depend on x.

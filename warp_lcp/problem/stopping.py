@@ -16,7 +16,9 @@ from warp_lcp.settings import Count, CountOrZero, NonNegative, OrInfinite, Setti
 
 @dataclass(frozen=True, kw_only=True)
 class StoppingCriteria(Settings):
-    """Say when a solve is done: ||r|| <= max(atol, rtol ||r(clip(0, l, u))||), r the natural residual in float64.
+    """Stopping criteria: ||r|| <= max(atol, rtol ||r(clip(0, l, u))||).
+
+    r is the natural residual in float64.
 
     Args:
         rtol: relative tolerance, in [0, 1).

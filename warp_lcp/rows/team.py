@@ -316,7 +316,9 @@ STATE = State()
 
 
 def get_threads() -> int:
-    """Return how many threads work on the CPU: those of `set_threads`, else of WARP_LCP_THREADS, else all that there are cores for.
+    """Return the number of threads on the CPU.
+
+    The number of `set_threads`, else WARP_LCP_THREADS, else the number of cores.
 
     Raises:
         ValueError: WARP_LCP_THREADS is no such number.
@@ -327,7 +329,9 @@ def get_threads() -> int:
 
 
 def set_threads(count: int | None) -> None:
-    """Let so many threads work on the CPU from now on. Results have the same bits for any number.
+    """Set the number of threads on the CPU.
+
+    Results have the same bits for any number.
 
     Args:
         count: from 1 to 1024; None: as many as at the start.

@@ -87,7 +87,9 @@ class Frame:
 
 
 class Run:
-    """Run a scene from Python: `for frame in run` takes the steps from one frame to the next.
+    """A run of a scene, stepped from Python.
+
+    `for frame in run` takes the steps from one frame to the next.
 
     The steps are those of `warp-lcp run`, and with a `folder` so are log, frames and checkpoints, bit for bit. Once the loop is left, with
     `break`, by an error in it or by Ctrl-C, the run ends as one that was stopped, with a checkpoint that `Run.resume` goes on from. Ctrl-C
@@ -140,7 +142,9 @@ class Run:
         overrides: Mapping[str, Any] | None = None,
         **keys: Any,
     ) -> Self:
-        """Return the run of a folder, to go on from its newest checkpoint with the next frame; arguments as of `Run`.
+        """Return the run of a folder, to continue from its newest checkpoint.
+
+        The next frame is the first one without a file; arguments as of `Run`.
 
         What callbacks have changed is in the checkpoint, but for gravity: that is the scene's again.
 
@@ -173,7 +177,10 @@ class Run:
     _loop: RunLoop | None
 
     def on_step(self, callback: Callable[[Run], object]) -> Callable[[Run], object]:
-        """Have a function called with the run after each step, before the frame and the checkpoint of that time; may decorate it.
+        """Register a function that is called with the run after each step.
+
+        It is called before the frame and the checkpoint of that time are written. It may be used as
+        a decorator.
 
         It may look (`run.row`, `run.time`, `run.simulation`), `push` a body, change `gravity`, `add` material and `stop` the run. An error
         that it raises ends the run with a checkpoint of the step; `Run.resume` goes on, first with the frame if the step was to end one.
@@ -250,7 +257,9 @@ class Run:
 
     @property
     def gravity(self) -> np.ndarray:
-        """Gravity [m/s^2], a copy, shape (3,); to be set with as many numbers as the scene has dimensions.
+        """Gravity [m/s^2], a copy, shape (3,).
+
+        Set it with as many numbers as the scene has dimensions.
 
         Bounds that the pressure of liquids takes from gravity, as for what rests on shelves of particles, stay those of the scene's.
         """
@@ -280,7 +289,9 @@ class Run:
         pushed.push(np.concatenate([given, np.cross(arm, given)]))
 
     def add(self, **shape: Any) -> int:
-        """Add material at rest or with a `velocity`, where there is none and no solid; return how many particles that took.
+        """Add material, at rest or with a `velocity`, outside material and solids.
+
+        Return the number of new particles.
 
         Args:
             shape: the keys of an entry of the scene's `[[liquid]]` or `[[sand]]`, such as shape="box", min=[0, 1], max=[1, 2].

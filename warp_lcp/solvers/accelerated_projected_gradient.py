@@ -34,7 +34,9 @@ NOISE = 1e-20  # relative (squared) length of a step below which its curvature i
 
 @dataclass(frozen=True, kw_only=True)
 class AcceleratedProjectedGradient(Settings):
-    """Iterate the proximal map x = prox_K(x - r (A x + b)) of the box K with momentum ([Book] 1.1.4).
+    """Projected gradient method with Nesterov momentum.
+
+    It iterates the proximal map x = prox_K(x - r (A x + b)) of the box K ([Book] 1.1.4).
 
     With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z + b) / L, l, u), where z = x + beta
     (x - x before) with Nesterov's beta. The momentum starts anew where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows

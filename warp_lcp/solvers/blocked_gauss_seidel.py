@@ -38,7 +38,10 @@ SOLVE_LINE = RowPass(  # of each line's first cell
 
 
 class GridLines(Enum):
-    """Along which axis the cells of a block lie: that of the strongest coefficients is the one that pays."""
+    """Blocks of cells along one axis of a grid, for `BlockedGaussSeidel`.
+
+    The axis of the strongest coefficients is the one that pays.
+    """
 
     X = 0
     Y = 1

@@ -22,7 +22,9 @@ SHARE = 0.3  # of the coupled tolerance, which a block need not be solved beyond
 
 
 class CoupledBlock(Protocol):
-    """One of several problems that depend on each other: pressure and friction of sand, a liquid and its rigid bodies.
+    """One of several problems that depend on each other.
+
+    Examples: pressure and friction of sand, a liquid and its rigid bodies.
 
     The blocks share state that they know and the loop does not. Operators and devices may differ.
 
@@ -39,12 +41,15 @@ class CoupledBlock(Protocol):
         """Return the block's last solution, a field of its problem; called after `couple`."""
 
     def accept(self, result: SolveResult) -> None:
-        """Publish the block's new solution; `result.x` may be overwritten by the next solve."""
+        """Publish the block's new solution.
+
+        The next solve may overwrite `result.x`.
+        """
 
 
 @dataclass(frozen=True)
 class CoupledResult:
-    """The outcome of `solve_coupled`; true only if all blocks' residuals, at one state, meet the criteria together.
+    """Result of `solve_coupled`; true if all blocks converged at one state.
 
     Attributes:
         status: how the loop ended.
@@ -92,7 +97,10 @@ class StaggeredRound:
         return tuple(self._residual(k) for k in range(len(self.blocks)))
 
     def run(self, target: float, *, forward: bool = True) -> int:
-        """Solve each block once, from first to last or back; `target` is the residual asked for of all. Returns linear iterations."""
+        """Solve each block once, forward or backward; return linear iterations.
+
+        `target` is the residual asked for of all blocks.
+        """
         count, linear = len(self.blocks), 0
         for k in range(count) if forward else reversed(range(count)):
             check_time()
@@ -118,7 +126,9 @@ def solve_coupled(
     blocks: Sequence[CoupledBlock], solvers: Sequence[Solver], *, stopping: StoppingCriteria | None = None, eta: float = 1e-2,
     max_block_iterations: int = 100, staggered: StaggeredRound | None = None,
 ) -> CoupledResult:  # fmt: skip
-    """Solve coupled problems in turn until all are solved at once ([Book] 2.2.4, staggering).
+    """Solve coupled problems in turn until all are solved at one state.
+
+    Staggering ([Book] 2.2.4).
 
     Converges where the coupling is weak or comes from one symmetric positive definite matrix; there is no proof for friction.
 

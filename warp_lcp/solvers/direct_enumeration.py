@@ -24,7 +24,9 @@ SAME = 1e-9  # relative difference below which two solutions are one
 
 @dataclass(frozen=True, kw_only=True)
 class DirectEnumeration:
-    """Solve a problem of at most 4 unknowns by trying its active sets ([Book] 2.1.1, eqs. 2.10-2.12, algorithm 1).
+    """Enumerate the active sets of a problem of at most 4 unknowns.
+
+    [Book] 2.1.1, eqs. 2.10-2.12, algorithm 1.
 
     Each unknown is at l, at u or free with y = 0, which makes 2^n complementarity cones for the LCP and 3^n for a box; the set that solves
     the problem most exactly wins. A may be anything: unsymmetric, indefinite, singular. A free block that is singular contributes its basic
@@ -60,7 +62,9 @@ class DirectEnumeration:
         return work.result("sets", int(np.count_nonzero(measures <= 1)))
 
     def solutions(self, problem: LCP) -> np.ndarray:
-        """Return all solutions that some active set determines, shape (k, n), k = 0 where there is none.
+        """Return all solutions that an active set determines, shape (k, n).
+
+        k = 0 if there is none.
 
         Where the solutions form a continuum, its corners are among them.
 
@@ -101,7 +105,9 @@ class BatchResult(FieldsOnHost):
 def enumerate_batch(
     A: Array, b: Array, lower: Any = 0.0, upper: Any = np.inf, *, device: Any = None, out: BatchResult | None = None
 ) -> BatchResult:
-    """Solve many LCPs of at most 4 unknowns in one launch, a problem a thread ([Book] 2.1.1).
+    """Solve many LCPs of at most 4 unknowns in one launch, one a thread.
+
+    [Book] 2.1.1.
 
     Rows may be in units of their own: each problem is equilibrated symmetrically first, exactly, by powers of 2. Device arrays of one type
     are used without a copy, and nothing is allocated if `out` is given besides.

@@ -33,7 +33,9 @@ SHARE = 0.95  # lambda of the penalized map for dense problems: measured on fric
 @renamed(share="fischer_weight")
 @dataclass(frozen=True, kw_only=True)
 class FischerNewton(Settings):
-    """Solve f(x) = 0 for the Fischer-Burmeister map, plain or penalized, by a nonsmooth Newton method ([Book] 2.4.2-3, algorithm 12).
+    """Nonsmooth Newton method on the Fischer-Burmeister map, plain or penalized.
+
+    It solves f(x) = 0 ([Book] 2.4.2-3, algorithm 12).
 
     f_i = lambda psi(a_i, y_i) + (1 - lambda) a_i+ y_i+ / scale, psi(a, b) = a + b - sqrt(a^2 + b^2), a = d (x - l) with d of the
     natural residual; two-sided rows take psi(a, -psi(-y, d (u - x))) ([Book] eq. 1.48), rows without bounds y. The step solves
@@ -85,19 +87,28 @@ class FischerNewton(Settings):
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
     def descent(self, problem: LCP) -> GradientDescent:
-        """Return the gradient descent whose map is this method's for the problem: the only one consistent with it as a warm start."""
+        """Return the gradient descent on this method's map for a problem.
+
+        No other gradient descent is consistent with the method as a warm start.
+        """
         weight = self.fischer_weight if self.fischer_weight is not None else SHARE if isinstance(problem.A, DenseOperator) else 1.0
         map_ = MapForm.FISCHER if weight == 1 else MapForm.PENALIZED
         return GradientDescent(map=map_.value, fischer_weight=weight, precision="single" if self.precision == "single" else "double")
 
     def init(self, problem: LCP) -> FischerWorkspace | FischerDenseWorkspace:
-        """Return a workspace: on the host for dense matrices, unless the Jacobian is to be approximated."""
+        """Return a workspace, on the host for dense matrices.
+
+        With kink="approximation" it is on the device for all matrices.
+        """
         if isinstance(problem.A, DenseOperator) and Kink(self.kink) is not Kink.APPROXIMATION:
             return FischerDenseWorkspace(problem, self)
         return FischerWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle or a gradient step while the start is cold, else a Newton step."""
+        """Take a monotone cycle, a gradient step or a Newton step.
+
+        Cycles and gradient steps come first, while the start is cold.
+        """
         if work.cycles_left > 0:
             work.cycles_left -= 1
             return work.monotone_step()

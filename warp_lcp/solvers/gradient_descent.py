@@ -24,7 +24,9 @@ LONGEST = 1e6  # length tried
 @renamed(share="fischer_weight")
 @dataclass(frozen=True, kw_only=True)
 class GradientDescent(Settings):
-    """Descend on the merit f.f / 2 of a reformulation ([Book] 2.4.4, eq. 2.199, algorithm 13).
+    """Descend on the merit function f.f / 2 of a reformulation.
+
+    [Book] 2.4.4, eq. 2.199, algorithm 13.
 
     x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized Jacobian and the natural residual's
     d, which makes the direction independent of x's units. t comes from a backtracking search along the projected path that starts at

@@ -25,7 +25,9 @@ OPEN, FREE, LOW, HIGH = 0, 1, 2, 3  # not held yet; y = 0; x = l and y >= 0; x =
 
 @dataclass(frozen=True, kw_only=True)
 class IncrementalPivoting(Settings):
-    """Solve a dense symmetric problem by Baraff's incremental pivoting ([Book] 2.1.2, algorithm 2; eqs. 2.20-2.27).
+    """Baraff's incremental pivoting for dense symmetric problems.
+
+    [Book] 2.1.2, algorithm 2; eqs. 2.20-2.27.
 
     The most violated row j is driven to y_j = 0 or to its bound while all rows that hold keep holding: dx_F = -A_FF^-1 A_Fj, dy = A dx, and
     the longest step is taken that keeps x_F within its bounds and the signs of y at bounds; what blocks it changes sides. Each change

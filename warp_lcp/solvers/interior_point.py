@@ -71,7 +71,9 @@ NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the resid
 
 @dataclass(frozen=True, kw_only=True)
 class InteriorPoint(Settings):
-    """Follow the central path to the solution ([Book] 2.3, eq. 2.105-2.114, algorithm 9; Mehrotra 1992 for the default).
+    """Primal-dual interior-point method: follow the central path to the solution.
+
+    [Book] 2.3, eq. 2.105-2.114, algorithm 9; by default Mehrotra's predictor-corrector (1992).
 
     With w = x - l, v = u - x and multipliers s, t >= 0, the solution has A x + b = s - t, W s = 0, V t = 0. A step is Newton's for
     W s = V t = tau: (A + D) dx = -(A x + b) + tau / w - tau / v with D = s / w + t / v, so that dx, ds and dt keep all of w, v, s and t
@@ -130,7 +132,10 @@ class InteriorPoint(Settings):
         return InteriorPointWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, a step along the path, or a Newton step after the crossover."""
+        """Take a monotone cycle, a path-following step, or a Newton step.
+
+        Cycles come first, while the start is cold; Newton steps come after the crossover.
+        """
         if isinstance(work, EquilibratedWorkspace):
             return work.step(self.step)
         if work.cycles_left > 0:

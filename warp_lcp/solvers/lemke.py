@@ -188,7 +188,9 @@ ACCEPTED = 1e-9  # relative error of the entering column after refinement with w
 
 @dataclass(frozen=True, kw_only=True)
 class Lemke(Settings):
-    """Solve a dense problem by Lemke's method with the lexicographic rule ([Book] 2.1, appendix C; LCP of w - M z - d z0 = q).
+    """Lemke's pivoting method with the lexicographic rule, for dense problems.
+
+    [Book] 2.1, appendix C; LCP of w - M z - d z0 = q.
 
     z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It processes every problem with a
     copositive-plus matrix, positive semi-definite ones among them, symmetric or not, and every P-matrix; for others it may end in a ray.

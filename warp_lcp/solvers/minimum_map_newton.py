@@ -62,7 +62,10 @@ REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its
 
 @dataclass(frozen=True, kw_only=True)
 class MinimumMapNewton(Settings):
-    """Solve on the unknowns that the minimum map calls free, hold the others at their bounds ([Book] 2.4.1, Schur-reduced).
+    """Nonsmooth Newton method on the minimum map, reduced to the free unknowns.
+
+    It solves the linear system on the unknowns that the minimum map calls free and holds the others
+    at their bounds ([Book] 2.4.1).
 
     Unknown i is held where x_i - y_i / d_i, with the natural residual's d, is outside [l_i, u_i]. Cold, the first steps on a grid are
     projected multigrid cycles, which find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a

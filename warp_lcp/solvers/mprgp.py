@@ -51,7 +51,9 @@ NOISE = 1e-14  # of the energy: falls of less, over as many steps as patience la
 
 @dataclass(frozen=True, kw_only=True)
 class MPRGP(Settings):
-    """Minimize 1/2 x'Ax + b'x on the bounds by projected, preconditioned conjugate gradients (Dostal; Takahashi and Batty 2023).
+    """Modified proportioning with reduced gradient projections, preconditioned.
+
+    It minimizes 1/2 x'Ax + b'x within the bounds (Dostal; Takahashi and Batty 2023).
 
     Unknowns at a bound are held. While the part of the residual on them, the chopped gradient, is small against the free part
     (||beta||^2 <= Gamma^2 phi~'phi), a step of conjugate gradients on the free set, preconditioned there by one multigrid cycle, is
@@ -97,7 +99,11 @@ class MPRGP(Settings):
         return work
 
     def step(self, problem: LCP, work: MPRGPWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a projected conjugate-gradient step, after a proportioning one if need be."""
+        """Take a monotone cycle or a projected conjugate-gradient step.
+
+        Cycles come first, while the start is cold. A proportioning step precedes the gradient step
+        where it is needed.
+        """
         if work.wants_monotone_cycle():
             return work.monotone_step(x)
         held = work.residual.active

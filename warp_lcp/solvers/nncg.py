@@ -29,7 +29,9 @@ CARRY_ON = RowPass(
 
 @dataclass(frozen=True, kw_only=True)
 class NNCG(Settings):
-    """Accelerate projected Gauss-Seidel by nonlinear conjugate gradients ([Book] 2.2.6, algorithm 8; Silcowitz-Hansen et al. 2010).
+    """Nonsmooth nonlinear conjugate gradients over projected Gauss-Seidel sweeps.
+
+    [Book] 2.2.6, algorithm 8; Silcowitz-Hansen et al. 2010.
 
     The change of a sweep is taken for the negative gradient, g = x - PGS(x), of a function whose minimum is the sweep's fixed point. With
     beta = |g|^2 / |g before|^2: x <- PGS(x) + beta p and p <- beta p - g without a line search; where beta > 1, p <- 0 and x <- PGS(x).

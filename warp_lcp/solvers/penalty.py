@@ -40,7 +40,9 @@ EARLY = 10  # steps in which the set may wander while the residual rises
 
 @dataclass(frozen=True, kw_only=True)
 class Penalty(Settings):
-    """Replace the bounds by springs, and solve the piecewise linear equations by policy iteration (Lai et al. 2020).
+    """Penalty method with policy iteration (Lai et al. 2020).
+
+    It replaces the bounds by springs and solves the piecewise linear equations.
 
     The equations are A z + b + rho D (min(z - l, 0) + max(z - u, 0)) = 0, D the diagonal of the natural residual's d. With V the unknowns
     beyond a bound, a step is Newton's: (A + rho D_V) z+ = -b + rho D_V g, g the bound that is passed. It depends on V alone, so it starts

@@ -31,7 +31,9 @@ SLACK = 1e-12  # of the largest magnitudes of x and y: violations below it are r
 
 @dataclass(frozen=True, kw_only=True)
 class PrimalDualActiveSet(Settings):
-    """Guess the active set from x and y, solve for the rest, repeat until the guess stays (Hintermueller, Ito, Kunisch 2003).
+    """Primal-dual active set method (Hintermueller, Ito, Kunisch 2003).
+
+    It guesses the active set from x and y, solves for the rest, and repeats until the guess stays.
 
     With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it is above, else free: y_i = 0 there. This
     is MinimumMapNewton's step without search or projection, and shares its implementation. Started anywhere it ends after finitely many
@@ -75,7 +77,10 @@ class PrimalDualActiveSet(Settings):
         return ActiveSetWorkspace(problem, self.as_newton())
 
     def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a full step; after a cycle what is safe."""
+        """Take a monotone cycle while the start is cold, else a full step.
+
+        After a cycle the step keeps what is safe.
+        """
         return work.step(x)
 
 

@@ -21,7 +21,9 @@ SHARE = 1.8  # of the 2 / lambda_max at which Jacobi's method stops converging; 
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectedJacobi(Settings):
-    """Solve each scalar problem from the same x ([Book] 2.2.1, table 2.1 and eq. 2.63 with M = D / omega).
+    """Projected Jacobi method: solve each scalar problem from the same x.
+
+    [Book] 2.2.1, table 2.1 and eq. 2.63 with M = D / omega.
 
     x <- clip(x - omega D^-1 (A x + b), l, u). Converges for symmetric positive definite A and 0 < omega < 2 / lambda_max(D^-1 A), which
     the book's omega = 1 exceeds for many matrices; the test of algorithm 4 then says DIVERGED (see `Contraction`). About half as fast as

@@ -19,7 +19,9 @@ from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectedMultigrid(Settings):
-    """Solve the LCP of a grid in about as many multigrid cycles as the linear system needs.
+    """Monotone multigrid for the LCP of a grid.
+
+    It takes about as many cycles as multigrid for the linear system.
 
     Cold, the first step is a projected (monotone) cycle, which moves whole aggregates on and off their bounds. Then each step evaluates
     y = A x + b in float64, takes the unknowns that sit at a bound with y of the right sign out of the hierarchy (they are *truncated*),
@@ -66,7 +68,11 @@ class ProjectedMultigrid(Settings):
         return CoupledWorkspace(problem, *terms, self)
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold or steps do not lead down, else a truncated one; on the matrix if these crawl."""
+        """Take a monotone cycle or a truncated one.
+
+        Monotone cycles come while the start is cold and where steps do not lower the energy;
+        truncated ones otherwise, on the matrix if they are slow.
+        """
         if work.crawls():
             return work.algebraic_step()
         if work.wants_monotone_cycle():

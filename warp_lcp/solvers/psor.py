@@ -22,7 +22,9 @@ Direction = Literal[tuple(DIRECTIONS)]
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectedSOR(Settings):
-    """Sweep the unknowns, solving each scalar problem in turn ([Book] 2.2.1, eq. 2.52).
+    """Projected successive over-relaxation: solve each scalar problem in turn.
+
+    [Book] 2.2.1, eq. 2.52.
 
     x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order otherwise. Converges for symmetric positive
     definite A and 0 < omega < 2 ([Book] 2.2.2). The iteration count grows with the grid: on 64^3 cells to 1e-3 and 1e-6 about 1,750 and
@@ -156,7 +158,7 @@ def grid_omega(problem: LCP, *, singular: bool) -> float:
 
 
 def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
-    """Return a relaxation factor for over-relaxation: Young's 2 / (1 + sqrt(1 - rho^2)).
+    """Return a relaxation factor: Young's 2 / (1 + sqrt(1 - rho^2)).
 
     rho = 1 - lambda_min(D^-1 A) is the spectral radius of Jacobi's method, estimated by Lanczos' method. The formula is exact for
     equations in two colors (grids), and a guide elsewhere. Only the free unknowns count in the end: where many are held at bounds, the

@@ -20,7 +20,9 @@ from warp_lcp.solvers.dense_problem import SEMIDEFINITE, DenseProblem, DenseWork
 
 @dataclass(frozen=True, kw_only=True)
 class QuadraticProgram(Settings):
-    """Minimize x'Ax / 2 + b'x over l <= x <= u by PIQP, a proximal interior-point solver ([Book] 2.2.2, eq. 2.56; extra `peers`).
+    """Convex quadratic program by PIQP, a proximal interior-point solver.
+
+    It minimizes x'Ax / 2 + b'x over l <= x <= u ([Book] 2.2.2, eq. 2.56; extra `peers`).
 
     The minimizers are the solutions of the problem, because A is symmetric and positive semi-definite and the gradient is y = A x + b.
     Sparse operators stay sparse; others are taken as dense matrices. x0 is not used; one step solves, and `linear_iterations` counts

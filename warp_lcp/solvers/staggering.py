@@ -21,7 +21,9 @@ from warp_lcp.solvers.sweep import Contraction
 
 @dataclass(frozen=True, kw_only=True)
 class Staggering(Settings):
-    """Solve the blocks of a problem in turn, the others held, each by its own method ([Book] 2.2.4).
+    """Staggering: solve the blocks of a problem in turn, the others held fixed.
+
+    Each block has its own method ([Book] 2.2.4).
 
     Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: a block Gauss-Seidel method, which converges for symmetric
     positive definite A. Bounds affine in x are constants of the block while it is solved, so that any method may solve it: normal

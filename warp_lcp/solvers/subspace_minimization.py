@@ -32,7 +32,10 @@ ROUNDING = 1e-14  # relative change of the energy that is none
 
 @dataclass(frozen=True, kw_only=True)
 class SubspaceMinimization(Settings):
-    """Sweep, then solve A_FF x_F = -(b_F + A_FH x_H) on the unknowns off their bounds and project ([Book] 2.2.5, algorithm 7, eq. 2.95).
+    """Subspace minimization after projected Gauss-Seidel sweeps.
+
+    It sweeps, then solves A_FF x_F = -(b_F + A_FH x_H) on the unknowns off their bounds and
+    projects ([Book] 2.2.5, algorithm 7, eq. 2.95).
 
     A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free set stays ([Book] eq. 2.98). Each solve
     is inexact, as far as the whole one still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the residual
