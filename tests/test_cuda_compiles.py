@@ -210,6 +210,8 @@ def family(name):
     package, module, *variant = name.split(".")
     if package == "granular":  # its switches are in the module's name; the longest variant has walls that cut and a rate, or a box
         module = re.sub("_(2d|3d|float32|float64|rate|cut)(?=_|$)", "", module)
+    if package == "fluids" and "_" in module:  # the longest variant of viscosity and pressure has all switches
+        module = re.sub("_(2d|cut|ghost|moving|drag|slip)(?=_|$)", "", module)
     return package, module, *(re.match("[a-z]*", word)[0] for word in variant)
 
 

@@ -71,6 +71,7 @@ def test_solvers(tmp_path):
     assert "[1.000, 1.000]    within noise" in again.stdout
 
 
+@pytest.mark.slow
 def test_devices(tmp_path):
     records = measured(tmp_path, "devices", "--size", 16)
     assert records["16^3: ProjectedMultigrid"]["status"] == "CONVERGED"

@@ -98,7 +98,7 @@ def test_drawn_scenes_are_checked(seed: int, tmp_path: Path) -> None:
     assert "whole run" in done("check", written(seed, tmp_path), "--device", "cpu")
 
 
-@pytest.mark.parametrize("seed", [2, 3, 4, 7])
+@pytest.mark.parametrize("seed", [3, 7, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 4))])
 def test_every_command_on_drawn_scenes(seed: int, tmp_path: Path, nobody_waits: None) -> None:
     every_command(written(seed, tmp_path), tmp_path)
 

@@ -129,6 +129,7 @@ def test_a_thousand_random_targets_beside_scipy():
         agree(counts, 1000, 0.95 if model == "Gauss-Newton" else 0.94)
 
 
+@pytest.mark.slow
 def test_the_price_of_damping():
     """Heavy damping takes many more steps to a goal in reach; curvature pays where goals are out of reach."""
 

@@ -165,6 +165,7 @@ def test_ice_balance_is_the_divergence_of_the_known_dome():
     assert (dome.balance()[r > 1] < 0).all()
 
 
+@pytest.mark.slow
 def test_ice_dome_converges_to_the_known_one():
     """Thickness at the center, mean error, radius: the margin, where the slope is infinite, keeps the largest error large."""
     center, mean, radius = [], [], []

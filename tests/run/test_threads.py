@@ -31,7 +31,10 @@ def digests(name: str, count: int, steps: int) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("name", particle_scenes())
+LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")  # scenes of more than three seconds, like shorter ones
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in particle_scenes()])
 def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):
     for module in ("team", "program", "row_pass"):
         monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 100)
