@@ -40,11 +40,11 @@ warp-lcp run dam-break --set output.surface=true
 warp-lcp render out/dam-break --sheet
 ```
 
-`output.surface=true` adds the surface of a liquid; leave it out for sand and 2-D scenes. `warp-lcp check NAME` estimates run time
+`output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `warp-lcp check NAME` estimates run time
 and memory; `--set domain.resolution=128` refines.
 
-Run time and peak memory (about {base} MB of it the program) are for one core of a shared {device}, {date}; scenes of bodies alone:
-a shared AMD EPYC. The first run also compiles for some seconds.
+Below each picture: run time, peak memory (the program alone takes {base} MB), particles at the start. Measured on one core of a
+shared {device}, {date}; bodies alone on an AMD EPYC. A first run also compiles for some seconds.
 """
 
 
@@ -104,9 +104,9 @@ def show(name: str, work: Path) -> dict[str, Any]:
 def entry(name: str, figures: dict[str, Any]) -> str:
     """Return what the page says of a scene."""
     about = tomllib.loads(scene_text(name))["scene"]
-    size = re.split(r" of [\d.]+", figures["note"])[0]  # cells without their length; bodies alone have none
+    size = re.match(r"\d+ (particles|rigid bodies)", figures["note"])
     description = about["description"][0].upper() + about["description"][1:]
-    took = f"{figures['seconds']:.0f} s, {figures['megabytes']} MB; {size}"
+    took = f"{figures['seconds']:.0f} s, {figures['megabytes']} MB, {size[0] if size else ''}"
     return f"## {name}\n\n![{name}](gallery/{name}.webp)\n\n{description}. {took}.\n"
 
 
