@@ -9,7 +9,7 @@ import argparse
 import gc
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -280,12 +280,36 @@ def price_list(records: list[Record]) -> Mapping[str, Any]:
     return listed
 
 
+def overview(records: Sequence[Record]) -> Table:
+    """Return the prices of all models side by side: what each adds to a step, as a share of `base`, and to memory."""
+    columns = {"fluids 3d": "liquid, 3-D", "fluids 2d": "liquid, 2-D", "granular 3d": "sand, 3-D", "granular 2d": "sand, 2-D"}
+    priced = {record.name: record for record in records if ": " in record.name}
+    names = list(dict.fromkeys(name.split(": ")[1] for name in priced))
+    rows = []
+    for model in names:
+        row = [model]
+        for place in columns:
+            record, base = priced.get(f"{place}: {model}"), priced[f"{place}: base"]
+            row.append("" if record is None else _price(record, base))
+        rows.append(row)
+    return Table("Prices", ["model", *columns.values()], rows)
+
+
+def _price(record: Record, base: Record) -> str:
+    """Return what a model adds to a step and to memory, or what `base` takes."""
+    step, unit = record.figures["step"].value, "particle" if "particle_bytes" in record.figures else "cell"
+    memory = f"{record.figures[f'{unit}_bytes'].value:.0f} B{' a particle' if unit == 'particle' else ''}"
+    if record is base:
+        return f"{1e3 * step:.1f} ms, {memory}"
+    return f"frames only, {memory}" if record.facts.get("frames") else f"{100.0 * step / base.figures['step'].value:.0f} %, {memory}"
+
+
 def write_page(page: Path, results: Results) -> None:
-    """Put the tables into the page of the documentation, between its two marks."""
+    """Put the table into the page of the documentation, between its two marks."""
     head, _, rest = page.read_text("utf-8").partition(BEGIN)
-    tables = "\n\n".join("\n".join([f"## {table.title}", "", *markdown(table)]) for table in results.tables)
-    told = f"The seconds are those of one core of {results.records[0].facts['hardware']['cpu']}."
-    page.write_text(f"{head}{BEGIN}\n{told}\n\n{tables}\n{END}{rest.partition(END)[2]}", "utf-8")
+    table = "\n".join(markdown(overview(results.records)))
+    told = f"One core of {results.records[0].facts['hardware']['cpu']}."
+    page.write_text(f"{head}{BEGIN}\n{told}\n\n{table}\n{END}{rest.partition(END)[2]}", "utf-8")
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -32,11 +33,18 @@ HEAD = """# Gallery
 
 <!-- Written by docs/generate/gallery.py from runs of the scenes; do not edit. -->
 
-Every built-in scene: what a run shows, the commands that make the picture, what the run took. `warp-lcp scenes` lists them, `warp-lcp run
-NAME` runs one, `warp-lcp check NAME` says before how large it is, `--set` changes a key. Times on one core of a shared
-{device}, {date}, frames included, kernels compiled before (a first run compiles for some seconds). Memory is the process's largest,
-about {base} MB of it the program itself. Pictures of liquids in 3-D are of their surface, the others of particles, or of bodies
-where there is nothing else. Times of bodies alone are of a shared AMD EPYC.
+All built-in scenes. `warp-lcp scenes` lists them. To run and draw one:
+
+```sh
+warp-lcp run dam-break --set output.surface=true
+warp-lcp render out/dam-break --sheet
+```
+
+`output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `warp-lcp check NAME` estimates run time
+and memory; `--set domain.resolution=128` refines.
+
+Below each picture: run time, peak memory (the program alone takes {base} MB), particles at the start. Measured on one core of a
+shared {device}, {date}; bodies alone on an AMD EPYC. A first run also compiles for some seconds.
 """
 
 
@@ -96,12 +104,10 @@ def show(name: str, work: Path) -> dict[str, Any]:
 def entry(name: str, figures: dict[str, Any]) -> str:
     """Return what the page says of a scene."""
     about = tomllib.loads(scene_text(name))["scene"]
-    run, draw = commands(name)
-    size = figures["note"].split(" m,")[0]  # of a grid; bodies alone have none
-    took = f"{figures['seconds']:.0f} s for {figures['steps']} steps and {figures['frames']} frames, {figures['megabytes']} MB; {size}"
+    size = re.match(r"\d+ (particles|rigid bodies)", figures["note"])
     description = about["description"][0].upper() + about["description"][1:]
-    block = f"```sh\n{' '.join(run)} --out out/{name}\n{' '.join(draw)}\n```"
-    return f"## {name}\n\n![{description}](gallery/{name}.webp)\n\n{description}. {took}.\n\n{block}\n"
+    took = f"{figures['seconds']:.0f} s, {figures['megabytes']} MB, {size[0] if size else ''}"
+    return f"## {name}\n\n![{name}](gallery/{name}.webp)\n\n{description}. {took}.\n"
 
 
 def page(figures: dict[str, Any]) -> str:

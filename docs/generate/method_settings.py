@@ -14,8 +14,8 @@ HEAD = """# Settings of methods
 
 <!-- Written by docs/generate/method_settings.py from the classes; do not edit. -->
 
-What each setting may be, and what it is unless given. Another value is refused when the object is made: a `ValueError` that names the
-setting, what was given and what is allowed. [Solvers](api/solvers.md) says what the settings mean.
+Allowed values and defaults. Other values raise a `ValueError` that names the setting, the value and the range.
+[Solvers](api/solvers.md) explains the settings.
 """
 
 

@@ -13,7 +13,7 @@ from importlib.metadata import distribution
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-NOTEBOOK = re.compile(r"\]\(([\w-]+)\.ipynb\)")  # a link to one
+NOTEBOOK = re.compile(r"\]\(((?:\.\./)?[\w-]+)\.ipynb\)")  # a link to one
 FONT = "STIXTwoMath-Regular.ttf"  # of ziamath; docs/site.css names it
 SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "iframe-worker.js"  # what the plug-in `offline` loads for the search, and our copy
 OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")  # a link from a page right under docs to a file of the repository
@@ -71,7 +71,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Make links out of docs, and to notebooks, links within the site."""
-    return NOTEBOOK.sub(r"](\1.md)", inside(markdown)) if "/" not in page.file.src_uri else markdown
+    return NOTEBOOK.sub(r"](\1.md)", markdown if "/" in page.file.src_uri else inside(markdown))
 
 
 def formula(found: re.Match[str]) -> str:
