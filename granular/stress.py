@@ -101,7 +101,8 @@ class Stress(wl.VariationalInequality):
 
     for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never
     denser than 1, and friction takes as much energy as it can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2.
-    On a face of a solid the shear stress is within mu times the normal load (Coulomb).
+    On a face of a solid the shear stress is within mu times the normal load (Coulomb), and within what the sand beside it bears there: a
+    rougher wall makes the sand fail (`headers/wall_bound.h`).
 
     So it is a quasi-variational inequality, over the product of x >= 0 and of the slices of the cones that hold each cell's s at its x; its
     natural residual is how far (x, s) - P((x, s) - y/d) lies from 0, y = (w, -E u), P onto x >= 0 first and then onto the slice at that x.

@@ -1,9 +1,9 @@
-// Coulomb friction of the wall in a cell, within mu times its load, against the sand's slip along it: the mean of its faces' velocities by
+// Friction of the wall in a cell, within `wall_bound` of its load, against the sand's slip along it: the mean of its faces' velocities by
 // what is open of them, without the part along the wall's normal n. A layer holds the traction times the wall's area over what is open of
 // the cell's two faces along an axis: so much a face takes of it for its own open part. The load is the pressure, which is all that keeps
-// sand from going into the wall, and the weight of what no face of the cell stands for: of all that a cell holds with no sand upon it. On
-// a wall rougher than sand it is the sand beside it that fails: a band of shear thinner than a cell, which no grid oblique to it has.
+// sand from going into the wall, and the weight of what no face of the cell stands for: of all that a cell holds with no sand upon it.
 #include "shape.h"
+#include "wall_bound.h"
 const float* inverse[3] = XYZ(inverse); const T* u[3] = XYZ(u);
 const float* weight = numbers + WEIGHT;
 const T omega = RESIDUAL ? (T)1 : (T)numbers[SHEAR_STEP], beta = RESIDUAL ? (T)0 : (T)momentum[NOW_S];
@@ -39,8 +39,7 @@ for (int m = first; m < last; ++m) {
         tau[a] = from[a] - omega/stiffest*(v[a] - across*n[a]);
         total += tau[a]*tau[a];
     }
-    const T normal = load > (T)0 ? load : (T)0, wall = (T)friction[numbers_of[m]]*normal;
-    const T sand = (T)numbers[FRICTION]*normal + (T)numbers[COHESION], bound = wall < sand ? wall : sand;
+    const T bound = wall_bound(friction[numbers_of[m]], load > (T)0 ? load : (T)0);
     const T keep = total > bound*bound ? bound/sqrt(total) : (T)1;
     for (int a = 0; a < DIM; ++a) {
         if (!(sum[a] > (T)0)) continue;

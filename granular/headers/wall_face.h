@@ -1,14 +1,15 @@
-// Coulomb friction on a wall face of a cell: the copies on its edges, two of each shear, within mu times the normal load, in the metric
+// Friction on a wall face of a cell: the copies on its edges, two of each shear, within `wall_bound` of the normal load, in the metric
 // sum b_q^2 / 2. The load is that of the face: x - n and the weight of the half cell before it, or of all of it where there is no
 // pressure. `rate` and `light` tell an edge's rate of shear and the sum of 1 / mass around it; `from` tells where a copy's step starts,
 // `store` gets its new value and the face's diagonal.
+#include "wall_bound.h"
 const float* shares[3] = XYZ(share);
 auto face = [&](int entry, auto from, const float* now, const float* weight, T omega, auto light, auto rate, auto store) {
     const long long cell = cells[entry];
     const int axis = sides[entry] >> 1, side = sides[entry] & 1;
     const float x = now[cell], n = DIM == 3 ? now[(1 + axis)*layer + cell] : (axis == 0 ? 1.0f : -1.0f)*now[layer + cell];
     const float toward = (side ? 1.0f : -1.0f)*weight[axis], load = x - n + (x > 0.0f ? 0.5f : 1.0f)*toward*fraction[cell];
-    const T bound = friction[walls[entry]]*(load > 0.0f ? load : 0.0f);
+    const T bound = wall_bound(friction[walls[entry]], load > 0.0f ? load : 0.0f);
     T b[2][2], most[2] = {0, 0}, sum[2] = {0, 0}, stiffest = 0, share[2][2]; long long slot[2][2], at[2][2]; int shear[2] = {0, 0};
     for (int t = 0; t < DIM - 1; ++t) {
         const int d = DIM == 2 ? 0 : (axis == 0 ? t : axis == 1 ? 2*t : 1 + t);

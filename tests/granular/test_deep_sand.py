@@ -40,7 +40,7 @@ def test_a_limit_of_the_momentum_leaves_less_of_the_residual_where_deep_sand_yie
     """Sand of 40 degrees that runs out of a silo: pressure and the friction's bound drive each other on."""
     medians = []
     for limits in ((), AcceleratedProjection().calm):
-        simulation = silo(16, 48, 6, material={"friction_angle": 40.0}, density_correction={})
+        simulation = silo(24, 48, 6, material={"friction_angle": 40.0}, density_correction={})
         simulation.method = AcceleratedProjection(calm=limits)
         rows = [simulation.step(min(simulation.stable_dt(), 0.01)) for _ in range(30)]
         medians.append(float(np.median([row["coupled_residual"] for row in rows[10:]])))

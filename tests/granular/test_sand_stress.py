@@ -18,7 +18,7 @@ from warp_lcp.operators.grid_poisson import SOLID
 DT, GRAVITY = 0.01, np.array([0.0, -9.81, 0.0])
 AXES = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # of the shears xy, xz, yz
 OPENING = np.array([0, 1, 3])  # bits of a copy's place: q & 1 along the first axis, q >> 1 along the second
-FRICTIONS = [0.3, 0.7]  # of the domain and of the solid
+FRICTIONS = [0.3, 1e6]  # of the domain and of the solid, which is rougher than sand
 Growth = Callable[[float], float]  # of a yield set's radius, by the multiplier of the projection onto it
 
 
@@ -241,7 +241,7 @@ def cell_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bo
 
 
 def wall_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], axis: int, side: int, friction: float) -> float:
-    """Return the squared natural residual of Coulomb's friction on a face of a cell with a solid."""
+    """Return the squared natural residual of friction on a face of a cell with a solid: Coulomb's, or the sand's own strength."""
     dimension, now, p = case.dimension, case.now, case.packing
     if p.flags.numpy()[cell] == 0:
         return 0.0
@@ -272,7 +272,8 @@ def wall_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], axis: int,
         return 0.0
     point = np.array(old) + 2.0 / stiffest * np.array(pulls)
     metric = np.full(len(point), 0.5)
-    new = nearest(point, groups, np.zeros(len(point)), metric, friction * max(load, 0.0))
+    most, bound = max(load, 0.0), case.bound
+    new = nearest(point, groups, np.zeros(len(point)), metric, min(friction * most, (bound.k + bound.gain) * most + bound.cohesion))
     return float(metric @ (new - np.array(old)) ** 2)
 
 

@@ -36,7 +36,7 @@ WallFriction = Annotated[
     Annotated[float, Field(ge=0, le=10)] | Literal["stick"], WrapValidator(_wall_friction, json_schema_input_type=float | Literal["stick"])
 ]
 FRICTIONS = "a number from 0 (free slip) to 10, or stick"
-STICKS = 1e6  # Coulomb's coefficient of a wall that holds what presses against it
+STICKS = 1e6  # Coulomb's coefficient of a wall that holds what presses against it: sand, as far as that holds itself
 BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
 
 
