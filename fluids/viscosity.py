@@ -4,7 +4,9 @@ With the rate of strain e of a velocity u, the step from u1 makes [Batty & Brids
 
     1/2 sum_f V_f |u_f - u1_f|^2 + tau sum_s V_s e_s : e_s,   tau = nu dt / dx^2,
 
-least: u on faces, e_aa at cells, e_ab on edges, differences in units of 1/dx, V the shares of their cubes that liquid fills. So faces have
+least: u on faces, e_aa at cells, e_ab on edges, differences in units of 1/dx, V the shares of their cubes that liquid fills, but 0 of faces
+between two cells of air: their u1 is the neighbors', and with a mass it would hold the surface back by a shear of mu d_t u_n, u_n the
+normal velocity and t along the surface, in steps of nu dt / dx^2 < 1. So faces have
 
     V u + tau K u = V u1,   K symmetric and positive semi-definite,
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from pydantic import ValidationError
+from scipy.integrate import solve_ivp
 
 import small_sands
 from small_liquids import GRAVITY, advance, box, create, random_tank, scene
@@ -96,6 +97,35 @@ def test_of_a_deep_flow_the_cells_beside_the_wall_slow_down() -> None:
     lowest = v[(x[:, 1] < 0.5 * DX) & (x[:, 0] > 1.2) & (x[:, 0] < 1.8)].mean()
     assert lowest == pytest.approx(1.0 / (1.0 + 0.05 * 0.3 / DX), rel=0.05), "as if these cells were alone"
     assert 0.8 < lost(simulation, 4.0, 0.1) < 1.0
+
+
+@pytest.mark.parametrize(("depth", "c"), [(4.0, 0.2), (8.0, 0.4)])
+def test_a_channel_keeps_what_the_cells_beside_its_wall_do_not_lose(depth: float, c: float) -> None:
+    """One of N cells slows down: with S = c/2 u0 t / h the mean is 1 - S / (1 + N S) of u0; by the law of the mean it were 1 / (1 + S)."""
+    simulation = sheet(depth, c, physics={"gravity": [0.0, -1.0]})
+    advance(simulation, 0.5)
+    share = 0.5 * c * (simulation.time - 0.5 * simulation.last_dt) / (depth * DX)
+    found = middle(simulation)
+    assert found == pytest.approx(1.0 - share / (1.0 + depth * share), rel=0.02)
+    assert found > 1.05 / (1.0 + share), "the limit that the documentation states"
+
+
+def test_a_viscous_channel_is_dragged_as_its_equation_says() -> None:
+    """du/dt = nu u_yy, nu u_y = c/2 u^2 at the floor and 0 at the surface: viscosity mixes what walls slow down with what flows above."""
+    cells, c, nu, fine = 4, 0.2, 0.05, 64
+    tables: dict[str, Any] = {"viscosity": {"value": 1000.0 * nu}, "wall": "free-slip", "physics": {"gravity": [0.0, -1.0]}}
+    simulation = sheet(cells, c, **tables)
+    advance(simulation, 0.5)
+    d = cells * DX / fine
+
+    def change(_time: float, u: np.ndarray) -> np.ndarray:
+        pull = 2.0 * nu / d  # between the lowest value and the floor: pull (u - u_floor) = c/2 u_floor^2
+        floor = (math.sqrt(pull**2 + 2.0 * c * pull * u[0]) - pull) / c
+        return np.diff(np.concatenate(([0.5 * c * floor**2], nu * np.diff(u) / d, [0.0]))) / d
+
+    exact = solve_ivp(change, (0.0, simulation.time - 0.5 * simulation.last_dt), np.ones(fine), method="BDF", rtol=1e-6).y[:, -1].mean()
+    assert exact < 0.9
+    assert middle(simulation) == pytest.approx(exact, rel=0.02)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 7.0, 20.0, 31.0, 45.0, 68.0])
