@@ -46,9 +46,14 @@ class Case:
         return self.label or type(self.solver).__name__
 
     @property
+    def size(self) -> str:
+        """Cells along a side to the number of axes."""
+        return f"{self.scene.n}^{self.scene.cells.ndim}"
+
+    @property
     def name(self) -> str:
         """Unique among the cases."""
-        return f"{self.scene.n}^3 {self.form} {self.bounds} {self.method}"
+        return f"{self.size} {self.form} {self.bounds} {self.method}"
 
     @property
     def cells(self) -> int:
