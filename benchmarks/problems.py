@@ -7,7 +7,9 @@ import numpy as np
 import warp_lcp as wl
 from warp_lcp.gallery.fluid import BOUNDS, SOLID_CENTER, SOLID_RADIUS, Splash, SplashPart, basin, splash, splash_part
 
-__all__ = ["BOUNDS", "Splash", "SplashPart", "anisotropic", "basin", "cut_cells", "natural", "plane", "splash", "splash_part", "warm_changes"]
+__all__ = [
+    "BOUNDS", "Splash", "SplashPart", "anisotropic", "basin", "cut_cells", "natural", "plane", "splash", "splash_part", "warm_changes",
+]  # fmt: skip
 
 
 def plane(n: int) -> Splash:
