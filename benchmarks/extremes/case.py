@@ -80,11 +80,11 @@ class Attempt:
     status: str  # of the result, or `refused`, or what a simulation says
     residual: float | None = None  # independent and relative; None where there is none
     seconds: float = 0.0  # wall time [s]
-    processor: float = math.inf  # processor time [s] with what is judged; unknown where a GPU does the work
     message: str = ""  # of a refusal or a failed step
     faults: list[str] = field(default_factory=list)  # what is wrong whatever was expected
     met: bool = False  # whether the independent residual meets the tolerance
     facts: dict[str, Any] = field(default_factory=dict)  # what else a record keeps
+    processor: float = math.inf  # processor time [s] with what is judged; unknown where a GPU does the work
 
     @property
     def spent(self) -> float:
