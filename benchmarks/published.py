@@ -30,6 +30,7 @@ FLAT = 4  # cells along a side in 2-D, in units of those in 3-D
 REPEATED = 3.0  # [s] of one solve, above which one sample is taken
 PATIENCE = 20.0  # [s] of one solve, above which a method is not run at larger sizes
 ENGINE = "multigrid, default"
+FIGURES = ("total", "iterations", "linear_iterations", "residual", "converged")  # that are kept of a case
 
 
 class ProductsOnly(wl.Operator):
@@ -166,7 +167,7 @@ def _measure_scene(scene: Splash, options: Options, slow: set[tuple[str, str]], 
 
 def _record(case: Case, source: str, linear: Case | None = None) -> Record:
     """Return the figures of a case, with ratios to the linear solves of the same rounds."""
-    figures = case.figures()
+    figures = {name: figure for name, figure in case.figures().items() if name in FIGURES}
     if linear is not None:
         of_linear = linear.samples["total"][: len(case.samples["total"])]
         figures["over_linear"] = ratios(case.samples["total"], of_linear)
