@@ -52,7 +52,7 @@ class Promise:
     names: str = ""  # what the message of a refusal must contain
 
     def __str__(self) -> str:
-        detail = "/".join(sorted(self.statuses)) or self.names
+        detail = "" if self.statuses == HONEST else "/".join(sorted(self.statuses)) or self.names
         return f"{self.expected.value} ({detail})" if detail else self.expected.value
 
 
