@@ -18,7 +18,8 @@ from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import Splash, warm_changes
 
 RTOL = 1e-6
-STOPPING = wl.StoppingCriteria(rtol=RTOL)
+# a method alone may creep for hundreds of steps, and its residual rise for more than the usual patience
+STOPPING = wl.StoppingCriteria(rtol=RTOL, max_iterations=1000, patience=1000)
 TOLERANCES = (1e-4, 1e-6, 1e-8)
 MIDST = 3  # iterations after which a method has made all of its buffers
 
@@ -46,9 +47,14 @@ class Case:
         return self.label or type(self.solver).__name__
 
     @property
+    def size(self) -> str:
+        """Cells along a side to the number of axes."""
+        return f"{self.scene.n}^{self.scene.cells.ndim}"
+
+    @property
     def name(self) -> str:
         """Unique among the cases."""
-        return f"{self.scene.n}^3 {self.form} {self.bounds} {self.method}"
+        return f"{self.size} {self.form} {self.bounds} {self.method}"
 
     @property
     def cells(self) -> int:

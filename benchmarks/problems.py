@@ -7,7 +7,16 @@ import numpy as np
 import warp_lcp as wl
 from warp_lcp.gallery.fluid import BOUNDS, SOLID_CENTER, SOLID_RADIUS, Splash, SplashPart, basin, splash, splash_part
 
-__all__ = ["BOUNDS", "Splash", "SplashPart", "anisotropic", "basin", "cut_cells", "natural", "splash", "splash_part", "warm_changes"]
+__all__ = [
+    "BOUNDS", "Splash", "SplashPart", "anisotropic", "basin", "cut_cells", "natural", "plane", "splash", "splash_part", "warm_changes",
+]  # fmt: skip
+
+
+def plane(n: int) -> Splash:
+    """Return the cells of a splash's plane y = 1/2, with their b, as a problem in 2-D on n^2 cells."""
+    whole = splash_part(n, (slice(0, n), slice(n // 2, n // 2 + 1), slice(0, n)))
+    cells = np.ascontiguousarray(whole.cells[1:-1, 1, 1:-1])
+    return Splash(n, cells, whole.b[:, 0].copy(), whole.wall[:, 0].copy())
 
 
 def cut_cells(scene: Splash) -> Splash:

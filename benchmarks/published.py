@@ -1,8 +1,8 @@
-"""Methods published for the pressure LCP from 2011 to 2023 on the splash, side by side: iterations and seconds to the same residual.
+"""Methods published for the pressure LCP from 2011 to 2023 on the splash: iterations and seconds to the same residual.
 
-Each runs as published as far as that is known (`docs/published-methods.md` says what was read and what is reconstructed), cold from p = 0,
-and then with what this library adds. All share kernels, precision, multigrid cycles and stopping criteria, so that methods are compared
-and not implementations.
+Each runs as published as far as that is known (`docs/published-methods.md` says what was read and what is reconstructed),
+cold from p = 0, and then with what this library adds. All share kernels, precision, multigrid cycles and stopping criteria,
+so that methods are compared and not implementations. `docs/generate/published_figures.py` puts the figures into that page.
 """
 
 from __future__ import annotations
@@ -20,12 +20,17 @@ from warp_lcp.benchmarks.cases import RTOL, Case
 from warp_lcp.benchmarks.harness.machine import COPIED, machine
 from warp_lcp.benchmarks.harness.record import Record, Results, Table, shown, spread
 from warp_lcp.benchmarks.harness.timing import Options, ratios
-from warp_lcp.benchmarks.problems import BOUNDS, splash
+from warp_lcp.benchmarks.problems import BOUNDS, Splash, plane, splash
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
 
 TITLE = "Published methods for the pressure LCP"
 SIZES = (64, 128)
-PATIENCE = 20.0  # [s] of one solve, after which a method is neither repeated nor asked at larger sizes
+FLAT = 4  # cells along a side in 2-D, in units of those in 3-D
+REPEATED = 3.0  # [s] of one solve, above which one sample is taken
+PATIENCE = 20.0  # [s] of one solve, above which a method is not run at larger sizes
 ENGINE = "multigrid, default"
+FIGURES = ("total", "iterations", "linear_iterations", "residual", "converged")  # that are kept of a case
 
 
 class ProductsOnly(wl.Operator):
@@ -53,6 +58,38 @@ class ProductsOnly(wl.Operator):
         return self._grid.diagonal()
 
 
+@dataclass(frozen=True, kw_only=True)
+class TruncatedMultigrid(wl.ProjectedMultigrid):
+    """Multigrid iterations whose coarse levels leave out the active set: neither conjugate directions nor projected cycles.
+
+    From x, unknowns at a bound with y = A x + b of the right sign are held; a linear cycle on the others, whose Galerkin
+    coarse levels and interpolation leave the held ones out, gives a correction z; x + t z is projected onto the bounds, t the
+    minimizer of the energy along z.
+    """
+
+    def init(self, problem: wl.LCP) -> TruncatedWorkspace:
+        """Return a workspace."""
+        assert has(problem.A, HasStencil)
+        return TruncatedWorkspace(problem, problem.A, self)
+
+
+class TruncatedWorkspace(MultigridWorkspace):
+    """Memory of the method for one problem."""
+
+    def crawls(self) -> bool:
+        """Return False: the method has cycles alone."""
+        return False
+
+    def wants_monotone_cycle(self) -> bool:
+        """Return False, and forget the direction, so that the next one is the cycle's correction."""
+        self._forget()
+        return False
+
+    def _creeps(self) -> bool:
+        self._judge()
+        return False
+
+
 @dataclass(frozen=True)
 class Entry:
     """A row of the tables."""
@@ -74,6 +111,7 @@ ENTRIES = (
     Entry("Macklin et al. 2019", "Fischer-Burmeister, r = A_ii", wl.FischerNewton(monotone_cycles=0)),
     Entry("Lai et al. 2020", "policy iteration", wl.PrimalDualActiveSet(monotone_cycles=0)),
     Entry("Lai et al. 2020", "penalty", wl.Penalty(monotone_cycles=0)),
+    Entry("Lai et al. 2020", "multigrid, active set off coarse levels", TruncatedMultigrid(monotone_cycles=0)),
     Entry("Takahashi and Batty 2023", "MPRGP, multilevel", wl.MPRGP(monotone_cycles=0)),
     Entry("here", "minimum map, default", wl.MinimumMapNewton()),
     Entry("here", "Fischer-Burmeister, default", wl.FischerNewton()),
@@ -85,21 +123,31 @@ ENTRIES = (
 
 
 def measure(options: Options, out: Path) -> Results:
-    """Measure every method at every size, with bounds at walls and everywhere."""
+    """Measure every method at every size in 3-D and 2-D, with bounds at walls and everywhere."""
     sizes = options.sizes or SIZES
     where = machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)
-    records, tables, slow = list[Record](), list[Table](), set[tuple[str, str]]()
-    for n in sizes:
-        found = _measure_size(n, options, slow)
-        records += found
-        tables += [_table(n, bounds, [r for r in found if r.facts["bounds"] == bounds]) for bounds in BOUNDS[1:]]
+    records, tables = list[Record](), list[Table]()
+    for make, scale in ((splash, 1), (plane, FLAT)):
+        slow = set[tuple[str, str]]()
+        for n in sizes:
+            found = _measure_scene(make(scale * n), options, slow, load=n == sizes[0])
+            records += found
+            for bounds in BOUNDS[1:]:
+                own = [r for r in found if r.facts["bounds"] == bounds]
+                tables += [_table(own, bounds)] if own else []
     failures = [f"{r.name}: not converged" for r in records if not r.figures["converged"].value]
     return Results([where, *records], tables, [], failures)
 
 
-def _measure_size(n: int, options: Options, slow: set[tuple[str, str]]) -> list[Record]:
-    """Measure one sample of every method in each round; who is slow is noted and left out from then on."""
-    scene = splash(n)
+def _measure_scene(scene: Splash, options: Options, slow: set[tuple[str, str]], *, load: bool) -> list[Record]:
+    """Measure one sample of every method in each round.
+
+    Args:
+        scene: what to solve.
+        options: device and number of rounds.
+        slow: methods with their bounds that are left out; those above PATIENCE are added.
+        load: whether a first round without samples loads the kernels.
+    """
     linear = Case("unit", scene, BOUNDS[0], wl.ProjectedMultigrid(), options.device, full=False, label="linear solve")
     cases = [
         (entry, Case("unit", scene, bounds, entry.solver, options.device, full=False, label=entry.label, operator=entry.operator))
@@ -107,31 +155,33 @@ def _measure_size(n: int, options: Options, slow: set[tuple[str, str]]) -> list[
         for entry in ENTRIES
         if (entry.label, bounds) not in slow
     ]
-    for turn in range(options.repeat + 1):  # the first one loads kernels
-        options.say(f"published methods at {n}^3, round {turn} of {options.repeat}")
+    for turn in range(0 if load else 1, options.repeat + 1):
+        options.say(f"published methods, {linear.size}, round {turn} of {options.repeat}")
         linear.cold(keep=turn > 0)
-        for entry, case in cases:
-            if (entry.label, case.bounds) not in slow or turn == 1:
+        for _, case in cases:
+            if all(seconds <= REPEATED for seconds in case.samples["total"]):
                 case.cold(keep=turn > 0)
-                last = case.samples["total"][-1:]
-                slow |= {(entry.label, case.bounds) for seconds in last if seconds > PATIENCE}
-    return [_record(n, linear, "here"), *(_record(n, case, entry.source, linear) for entry, case in cases)]
+    slow |= {(c.label, c.bounds) for _, c in cases if max(c.samples["total"]) > PATIENCE}
+    return [_record(linear, "here"), *(_record(case, entry.source, linear) for entry, case in cases)]
 
 
-def _record(n: int, case: Case, source: str, linear: Case | None = None) -> Record:
+def _record(case: Case, source: str, linear: Case | None = None) -> Record:
     """Return the figures of a case, with ratios to the linear solves of the same rounds."""
-    figures = case.figures()
+    figures = {name: figure for name, figure in case.figures().items() if name in FIGURES}
     if linear is not None:
-        figures["over_linear"] = ratios(case.samples["total"], linear.samples["total"][: len(case.samples["total"])])
-    return Record(case.name, figures, {"source": source, "bounds": case.bounds, "method": case.method, "n": n})
+        of_linear = linear.samples["total"][: len(case.samples["total"])]
+        figures["over_linear"] = ratios(case.samples["total"], of_linear)
+    facts = {"source": source, "bounds": case.bounds, "method": case.method, "size": case.size}
+    return Record(case.name, figures, facts)
 
 
-def _table(n: int, bounds: str, records: Sequence[Record]) -> Table:
+def _table(records: Sequence[Record], bounds: str) -> Table:
     columns = ["published", "method", "iterations", "linear iterations", "relative residual", "total [ms]", "range", "x linear solve"]
     rows = []
     for r in records:
-        counts = shown(r, ["iterations", "linear_iterations", "residual"])
+        counts = shown(r, ["iterations", "linear_iterations"], ".0f") + shown(r, ["residual"])
         rows.append([r.facts["source"], r.facts["method"], *counts, *shown(r, ["total"], ".1f", 1e3), spread(r.figures["total"], 1e3)])
         rows[-1] += shown(r, ["over_linear"], ".2f")
     remark = f"Cold solves to {RTOL:g}, set-up included; x linear solve: the default multigrid without bounds, same rounds."
-    return Table(f"p >= 0 {'at the walls' if bounds == 'walls' else bounds}, {n}^3", columns, rows, remark)
+    where = "at the walls" if bounds == "walls" else bounds
+    return Table(f"p >= 0 {where}, {records[0].facts['size']}", columns, rows, remark)

@@ -263,16 +263,21 @@ class SandSimulation(ParticleSimulation):
                 self.carried.place(self.solids.index.numpy(), centers, self.solids.walls)
 
     def _gains(self, scale: float) -> bool:
-        """Return whether the stresses leave sand faster than it, solids, sources and bodies were and gravity makes it (`scale`, m/s)."""
+        """Return whether the stresses leave sand faster than it, solids, sources and bodies were and gravity makes it (`scale`, m/s).
+
+        Walls turn velocities: a component may become as large as the magnitude of the velocity was, here that of the
+        largest components before the step.
+        """
         packing, own = self.packing, self._own
         moving = [own(inverse) > 0.0 for inverse in packing.inverse]
-        speeds = [
-            max(float(np.abs(own(component)[at]).max(initial=0.0)) for component, at in zip(velocity, moving, strict=True))
+        after, before = (
+            [float(np.abs(own(u)[at]).max(initial=0.0)) for u, at in zip(velocity, moving, strict=True)]
             for velocity in (self.stress.checked.u, packing.start)
-        ]
+        )
         others = max((float(np.abs(own(component)).max()) for component in self.solids.velocity), default=0.0)
-        after, before, others = self._largest([*speeds, others])
-        return after > before + scale + others + (self.bodies.top_speed(0.0) if self.bodies is not None else 0.0)
+        fastest, others, *before = self._largest([max(after), others, *before])
+        bodies = self.bodies.top_speed(0.0) if self.bodies is not None else 0.0
+        return fastest > math.hypot(*before) + scale + others + bodies
 
     def solve_stress(self, scale: float) -> wl.SolveResult:
         """Solve for the stresses, to the scene's tolerance in units of `scale` [m/s]: g dt is a pressure of rho g dx."""

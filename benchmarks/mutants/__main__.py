@@ -166,7 +166,7 @@ def report(results: list[dict[str, object]], out: Path, seed: int) -> None:
 def options() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.mutants", description=__doc__)
-    parser.add_argument("--count", type=int, default=50, help="how many mutants, spread over all modules")
+    parser.add_argument("--count", type=int, help="how many mutants: 50, spread over all modules, or all formulas, unless given")
     parser.add_argument("--seed", type=int, default=7, help="of which ones")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--out", type=Path, default=ROOT / "out/mutants", help="folder of the report; of a run that was stopped: go on")
@@ -177,6 +177,14 @@ def options() -> argparse.Namespace:
     parser.add_argument("--files", type=int, nargs=2, default=FILES, help="so many test files, then so many where a mutant survives")
     parser.add_argument("--seconds", type=float, default=5.0, help="of a file's tests on a processor: those that start later are left out")
     return parser.parse_args()
+
+
+def _drawn(formulas: bool, count: int | None, seed: int) -> list[Mutant]:
+    """Return `count` mutants of a seed: of the formulas, or of all modules."""
+    if not formulas:
+        return draw(ROOT, 50 if count is None else count, seed)
+    everyone = of_formulas(ROOT)
+    return everyone if count is None else random.Random(seed).sample(everyone, min(count, len(everyone)))
 
 
 def main() -> None:
@@ -190,7 +198,7 @@ def main() -> None:
     if given.again:
         drawn = [Mutant(*(r[name] for name in Mutant._fields)) for r in json.loads(given.again.read_text()) if r["verdict"] != "killed"]
     else:
-        drawn = of_formulas(ROOT) if given.formulas else draw(ROOT, given.count, given.seed)
+        drawn = _drawn(given.formulas, given.count, given.seed)
     results = json.loads(kept.read_text()) if kept.exists() else []
     done = {tuple(r[name] for name in Mutant._fields[:4]) for r in results}
     todo = [mutant for mutant in drawn if mutant[:4] not in done]
