@@ -102,13 +102,13 @@ class Rule:
 
 # fmt: off
 RULES: tuple[Rule, ...] = (
-    Rule("subspace-minimization", "Affine bounds, as in contact with friction, need sweeps; solves on the free unknowns speed them up",
+    Rule("subspace-minimization", "Affine bounds, as for friction, depend on x and need sweeps; solves on the free unknowns speed these up",
          lambda t: t.affine, 18, ("nncg", "blocked-gauss-seidel", "psor", "staggering")),
     Rule("projected-jacobi", "Affine bounds without access to rows leave one method",
          lambda t: t.affine, None, ()),
     Rule("lemke", "Negative diagonal entries with infinite bounds are usually a sign error in A; pivoting still works",
          lambda t: t.curved and t.unknowns <= PIVOTED, 5, ("minimum-map-newton",)),
-    Rule("minimum-map-newton", "Larger problems with such entries end with a status that asks for the sign of A",
+    Rule("minimum-map-newton", "Larger problems with such entries end with NEGATIVE_CURVATURE: check the sign of A",
          lambda t: t.curved, None, ()),
     Rule("fischer-newton", "The Fischer-Burmeister function tolerates a few negative diagonal entries",
          lambda t: t.diagonal == "negative" and t.kind in ("dense", "sparse") and t.unbounded, 20,
