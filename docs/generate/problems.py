@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/problems.md and computes the tables in it: `python docs/generate/problems.py [--tables]`."""
+"""Draws the pictures of docs/problems.md and computes the tables of its results: `python docs/generate/problems.py [--tables]`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from PIL import Image
 from warp_lcp.gallery import PUBLISHED, Heston, IceDome, ball_obstacle, dam, journal_bearing, sine_obstacle, torsion
 from warp_lcp.gallery.published import solution
 
-PAGE = Path(__file__).parents[1] / "problems.md"
-FOLDER = PAGE.parent / "problems"
+PAGE = Path(__file__).parents[2] / "benchmarks" / "results" / "amd-epyc" / "problems.md"
+FOLDER = Path(__file__).parents[1] / "problems"
 TABLE = re.compile(r"<!-- figures: (.*?) -->\n.*?(?=\n\n)", flags=re.S)
 DEVICE = "cpu"
 
