@@ -72,13 +72,11 @@ class MethodOfChoice:
             return ContactImpulses(np.zeros_like(start), 0.0, 0)
         system = contact_system(problem)
         lcp = self._model.problem(system).lcp(device=self._device)
-        first = np.zeros(0) if problem.joints is None else problem.joints.start
-        x0 = self._model.guess(system, np.concatenate([start.ravel(), first]))
+        x0 = self._model.guess(system, start.ravel())
         result = wl.solve(lcp, self._method(system), stopping=self._stopping, x0=x0)
         self.status = result.status
-        impulses = self._model.impulses(system, result.x.numpy())
-        contacts, joints = impulses[: start.size].reshape(start.shape), impulses[start.size :]
-        return ContactImpulses(contacts, float(result.relative_residual), result.iterations, joints)
+        impulses = self._model.impulses(system, result.x.numpy()).reshape(start.shape)
+        return ContactImpulses(impulses, float(result.relative_residual), result.iterations)
 
 
 def contact_system(problem: ContactProblem) -> ContactSystem:

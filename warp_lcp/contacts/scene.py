@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 from pydantic import Field, model_validator
 
-from warp_lcp.contacts.kinematics import Target
+from warp_lcp.contacts.kinematics import Target, tree_of
 from warp_lcp.contacts.methods import BOXED, DEFAULT, JOINTED, KINEMATIC, STEWART_TRINKLE
 from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.rigid.joints import WORLD, Joint, JointKind
@@ -204,6 +204,11 @@ class ContactScene(Scene):
         for index, table in enumerate(self.joint):
             if table.motor_torque is not None:
                 found.append(Complaint(("joint", index, "motor_torque"), table.motor_torque, "goes without targets, which move the bodies"))
+        if not found and not self._joint_complaints():
+            try:
+                tree_of(self.joints(), sum(solid.is_body for solid in self.solid))
+            except ValueError as error:
+                found.append(Complaint(("target",), None, str(error)))
         return found
 
     def _joint_complaints(self) -> list[Complaint]:

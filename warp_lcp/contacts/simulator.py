@@ -146,7 +146,7 @@ class ContactSimulator:
         method = MethodOfChoice(
             solver.method, directions=solver.directions, tolerance=solver.tolerance, most=solver.max_iterations, device=device
         )
-        bodies = make_bodies(scene, placed_solids(scene, folder), partial(RigidBodies, solver=method, joints=scene.joints()))
+        bodies = make_bodies(scene, placed_solids(scene, folder), partial(RigidBodies, solver=method))
         assert bodies is not None  # of which the scene has one
         if scene.target:
             solve = InverseKinematics(

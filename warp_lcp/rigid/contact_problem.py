@@ -42,16 +42,14 @@ class ContactImpulses(NamedTuple):
     """What a solve of a `ContactProblem` has found.
 
     Attributes:
-        impulses: [N s], shape (k, rows).
+        impulses: [N s], shape (k, rows); where there are joints, these flat and then those of joints [N s, N m s], shape (k rows + m,).
         residual: the largest of an island, relative to that of no impulses.
         iterations: the most of an island: sweeps, and steps of Newton's methods.
-        joints: of the joints' rows [N s, N m s], shape (m,).
     """
 
     impulses: np.ndarray
     residual: float
     iterations: int
-    joints: np.ndarray = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +59,10 @@ class JointPart:
     Args:
         rows: as those of contacts, times a factor of the inverse masses.
         b: velocities without impulses, with what removes errors [m/s, rad/s], shape (m,).
-        start: impulses to start from [N s, N m s], shape (m,).
     """
 
     rows: JointRows
     b: np.ndarray
-    start: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

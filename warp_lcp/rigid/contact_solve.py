@@ -228,7 +228,7 @@ class ContactSolve:
         if self.joints:
             impulses, pushes = self._hold_joints(problem, contacts, start, dt, kick_dt)
         else:
-            impulses, self.residual, self.iterations, _ = self._solver(problem, start)
+            impulses, self.residual, self.iterations = self._solver(problem, start)
             pushes = contacts.on_bodies(impulses, len(self.bodies))
         for body, push in zip(self.bodies, pushes, strict=True):
             body.push(push)
@@ -247,19 +247,21 @@ class ContactSolve:
         rows = JointRows.joined([joint.rows(self.bodies, kick_dt, self.dimension) for joint in self.joints])
         J, V, motors = rows.jacobian(n), self._velocities(), rows.motors
         bias, free = rows.bias(dt), J @ V.ravel()
-        x = self.joint_impulses
+        x = np.concatenate([start.ravel(), self.joint_impulses])
         for _ in range(ROUNDS):
-            found = self._solver(replace(problem, joints=JointPart(self._weighted(rows), free + bias, x)), start)
-            pushes = contacts.on_bodies(found.impulses, n) + (J.T @ found.joints).reshape(n, q)
+            found = self._solver(replace(problem, joints=JointPart(self._weighted(rows), free + bias)), x)
+            x = found.impulses
+            impulses, held = x[: start.size].reshape(start.shape), x[start.size :]
+            pushes = contacts.on_bodies(impulses, n) + (J.T @ held).reshape(n, q)
             after = rows.errors(self._moved(pushes, dt), self.dimension) / dt - J @ (V + self._answer(pushes)).ravel()
             after[motors] = bias[motors]
             off = dt * float(np.abs(after - bias).max())
-            start, x, bias = found.impulses, found.joints, after
+            bias = after
             self.residual, self.iterations = found.residual, self.iterations + found.iterations
             if off <= JOINED * min(1.0, float(self._size.min())):
                 break
-        self.joint_rows, self.joint_impulses = rows, x
-        return start, pushes
+        self.joint_rows, self.joint_impulses = rows, held
+        return impulses, pushes
 
     def motor_torques(self) -> dict[int, float]:
         """Return the torque of each motor in the last step [N m], by the number of its joint; 0 before the first step."""
@@ -308,10 +310,10 @@ class ContactSolve:
         rows = JointRows.joined([joint.rows(moved, dt, self.dimension) for joint in self.joints])
         rows = rows.where(rows.equations)
         gaps = np.column_stack([b, np.zeros((len(b), self.dimension - 1))])
-        part = JointPart(self._weighted(rows), rows.error, np.zeros(len(rows)))
-        problem = replace(self._problem(contacts, gaps, np.zeros(len(b))), joints=part)
-        found, n = self._solver(problem, np.zeros_like(gaps)), len(self.bodies)
-        return self._answer(contacts.on_bodies(found.impulses, n) + (rows.jacobian(n).T @ found.joints).reshape(n, -1))
+        problem = replace(self._problem(contacts, gaps, np.zeros(len(b))), joints=JointPart(self._weighted(rows), rows.error))
+        x, n = self._solver(problem, np.zeros(gaps.size + len(rows))).impulses, len(self.bodies)
+        apart = contacts.on_bodies(x[: gaps.size].reshape(gaps.shape), n)
+        return self._answer(apart + (rows.jacobian(n).T @ x[gaps.size :]).reshape(n, -1))
 
     def hold(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Let contacts that bear against walls and other solids take what impulses would move into them, for each body by itself.
