@@ -235,6 +235,7 @@ def page() -> str:
             own = {name: definition for name, definition in tables[simulator].items() if tables["fluids"].get(name) != definition}
             parts.append(f"## {material.capitalize()}\n\n{BODIES_ALONE}")
             parts += [section(3, name, definition) for name, definition in own.items()]
+            parts += [section(3, f"[{name}]", definition) for name, definition in lists_of(schema).items()]
             continue
         parts.append(f'## {material.capitalize()}\n\n`scene.simulator = "{simulator}"`.\n')
         parts += [section(3, name, definition) for name, definition in tables[simulator].items() if name not in shared]

@@ -7,9 +7,9 @@ import warp_lcp as wl
 from warp_lcp.gallery.contact_models import StewartTrinkleModel
 from warp_lcp.gallery.contact_scenes import SCENES, box, box_stack, driven_gears, hanging_snake, heavy_on_light, incline, sphere_stack, wall
 from warp_lcp.gallery.contact_stepper import ContactStepper
-from warp_lcp.gallery.hinges import WORLD, Hinge
 from warp_lcp.gallery.rigid_world import World
 from warp_lcp.grid.solids import Sphere
+from warp_lcp.rigid.joints import WORLD, Joint
 
 DT = 0.01
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=3000, patience=3000)
@@ -51,7 +51,7 @@ def collision():
     position = [[0, 0, 0], [1.05, 0.2, 0.1], [0.3, 1.1, -0.2], [-1.2, 0.1, 0.3]]
     halves = [(0.4, 0.4, 0.4), (0.5, 0.3, 0.4), None, (0.4, 0.5, 0.3)]
     solids = [box(x, half) if half else Sphere(center=x, radius=0.5) for x, half in zip(position, halves, strict=True)]
-    hinge = Hinge(0, 1, np.array([0.5, 0.1, 0.05]), AXIS)
+    hinge = Joint(0, 1, np.array([0.5, 0.1, 0.05]), AXIS)
     world = World("collision", solids, [1.0, 2.0, 0.5, 3.0], obstacles=(), hinges=(hinge,), gravity=(0.0, 0.0, 0.0))
     for body, spin in zip(world.bodies, rng.standard_normal((4, 3)), strict=True):
         body.momentum, body.angular_momentum = -2 * body.properties.mass * body.position, body.properties.inertia @ spin
@@ -120,7 +120,7 @@ def test_overlaps_are_removed_as_asked(stabilization):
 
 def test_a_pendulum_keeps_its_length_and_its_period():
     bob = Sphere(center=[np.sin(0.1), 0, -np.cos(0.1)], radius=0.1)
-    world = World("pendulum", [bob], [1.0], obstacles=(), hinges=(Hinge(0, WORLD, np.zeros(3), AXIS),))
+    world = World("pendulum", [bob], [1.0], obstacles=(), hinges=(Joint(0, WORLD, np.zeros(3), AXIS),))
     stepper, crossings, last = ContactStepper(world, wl.Lemke(), model=StewartTrinkleModel(4), dt=DT), [], 1.0
     while stepper.time < 1.7:
         stepper.step()

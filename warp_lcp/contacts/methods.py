@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 import warp_lcp as wl
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
@@ -15,6 +15,7 @@ from warp_lcp.rigid.contacts import jacobian
 from warp_lcp.solvers.registry import METHODS
 
 DEFAULT = "sweeps-and-newton"  # of `warp_lcp.rigid.contact_problem`: what bodies in liquids and in sand are solved by
+JOINTED = "lemke"  # in its place where there are joints, which are equations: sweeps are slow at them, pivots exact
 PIVOTING = 1e-8  # of the normal and the friction problem of a staggered iteration, solved by pivoting
 
 # |r_t| <= mu r_n along each tangent: bounds that are affine in x
@@ -34,6 +35,8 @@ STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
     "interior-point": lambda s: wl.InteriorPoint(precision="double"),
     "primal-dual-active-set": lambda s: wl.PrimalDualActiveSet(),
 }
+# of inverse kinematics, whose problems have small dense matrices and no blocks
+KINEMATIC = ("lemke", "fischer-newton", "minimum-map-newton", "interior-point", "primal-dual-active-set", "nncg", "psor")
 assert {*BOXED, *STEWART_TRINKLE} <= METHODS.keys()
 
 
@@ -65,7 +68,7 @@ class MethodOfChoice:
             if found.residual > self._stopping.rtol:
                 self.status = wl.SolveStatus.MAX_ITERATIONS
             return found
-        if not (problem.b[:, 0] < 0.0).any():  # nothing approaches: impulses are 0
+        if problem.joints is None and not (problem.b[:, 0] < 0.0).any():  # nothing approaches: impulses are 0
             return ContactImpulses(np.zeros_like(start), 0.0, 0)
         system = contact_system(problem)
         lcp = self._model.problem(system).lcp(device=self._device)
@@ -77,10 +80,16 @@ class MethodOfChoice:
 
 
 def contact_system(problem: ContactProblem) -> ContactSystem:
-    """Return u = B r + b with B = J J' + diag(yields) as a matrix, shape (rows of all contacts, the same)."""
-    J = jacobian(problem.first, problem.second, problem.one, problem.other, problem.bodies)
+    """Return u = B r + b with B = J J' + diag(yields) as a matrix, shape (rows of all contacts, then of joints, the same)."""
+    dim, joints, n = problem.one.shape[1], problem.joints, problem.bodies
+    parts = [jacobian(problem.first, problem.second, problem.one, problem.other, n)] if len(problem.friction) else []
+    parts += [joints.rows.jacobian(n)] if joints is not None else []
+    J = csr_array(vstack(parts))
     B = csr_array(J @ J.T)
     _, yields = problem.yields()
-    B.setdiag(B.diagonal() + yields)
+    B.setdiag(B.diagonal() + np.concatenate([yields, np.zeros(J.shape[0] - len(yields))]))
     B = csr_array(0.5 * (B + B.T))  # rounding must not make it unsymmetric
-    return ContactSystem("contacts", B, problem.b.ravel(), problem.friction, dim=problem.one.shape[1])
+    if joints is None:
+        return ContactSystem("contacts", B, problem.b.ravel(), problem.friction, dim=dim)
+    b = np.concatenate([problem.b.ravel(), joints.b])
+    return ContactSystem("contacts and joints", B, b, problem.friction, joints.rows.lower, joints.rows.upper, dim=dim)

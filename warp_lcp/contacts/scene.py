@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, get_args
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, model_validator
 
-from warp_lcp.contacts.methods import BOXED, DEFAULT, STEWART_TRINKLE
+from warp_lcp.contacts.kinematics import Target, tree_of
+from warp_lcp.contacts.methods import BOXED, DEFAULT, JOINTED, KINEMATIC, STEWART_TRINKLE
 from warp_lcp.problem.solve import PrecisionName
+from warp_lcp.rigid.joints import WORLD, Joint, JointKind
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene import MOST_CELLS, Domain, Output, Scene
-from warp_lcp.scene.table import Complaint, Table
-from warp_lcp.settings import Count, Share
+from warp_lcp.scene.table import Complaint, Table, Vector, counted
+from warp_lcp.settings import Count, Positive, Share
 
 NO_MATERIAL = "there is no material: bodies are all that moves"
 
@@ -31,7 +35,7 @@ class ContactSolver(Table):
     method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE] = Field(
         default=DEFAULT,
         description="sweeps-and-newton is that of bodies in liquids; of the others those from nncg to staggering take friction in boxes, "
-        "those from lemke on the model of Stewart and Trinkle",
+        f"those from lemke on the model of Stewart and Trinkle; with joints {JOINTED}, unless given, and not {DEFAULT}",
     )
     directions: int = Field(default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle, in 3-D")
     tolerance: Share = Field(default=1e-5, description="the residual to reach, relative to that of no impulses")
@@ -46,6 +50,92 @@ class ContactOutput(Output):
     grid: bool = Field(default=False, description="there is none")
 
 
+class JointTable(Table):
+    """[[joint]]: what holds two bodies together at a point, or a body in space. Bodies of a joint do not collide."""
+
+    kind: JointKind = Field(description="a ball lets them turn about the anchor, a hinge about an axis through it, fixed not at all")
+    solids: list[int] = Field(
+        min_length=1,
+        max_length=2,
+        description="a rigid body by its number among the [[solid]]s, from 0, and another or what stands; one: in space",
+    )
+    anchor: Vector = Field(description="the point where they are held, as they are placed [m]")
+    axis: Vector | None = Field(default=None, description="of a hinge in 3-D; z in 2-D")
+    limits: list[float] | None = Field(
+        default=None,
+        min_length=2,
+        max_length=2,
+        description="of a hinge: least and largest angle of one to the other, 0 as placed [degrees]",
+    )
+    motor_speed: float | None = Field(default=None, description="of a hinge: what its motor wants [degrees/s]")
+    motor_torque: Positive | None = Field(default=None, description="the most that the motor does [N m]")
+
+    def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
+        """Return what is wrong with the joint among these solids in a scene of 2 or 3 dimensions."""
+        found, hinge = [], self.kind == "hinge"
+        for number in self.solids:
+            if not 0 <= number < len(solids):
+                found.append(Complaint(("solids",), self.solids, f"must be numbers of [[solid]]s, from 0 to {len(solids) - 1}"))
+            elif solids[number].motion is not None:
+                found.append(Complaint(("solids",), self.solids, f"solid[{number}] has a motion: what bodies are joined to stands"))
+        if not found and not solids[self.solids[0]].is_body:
+            found.append(Complaint(("solids",), self.solids, "the first must be a rigid body: give it a density or a mass"))
+        if len(set(self.solids)) < len(self.solids):
+            found.append(Complaint(("solids",), self.solids, "must differ"))
+        for key in ("anchor", "axis"):
+            value = getattr(self, key)
+            if value is not None and len(value) != dimension:
+                found.append(Complaint((key,), value, f"must {counted(dimension)} in {dimension}-D"))
+        for key in ("axis", "limits", "motor_speed", "motor_torque"):
+            if not hinge and getattr(self, key) is not None:
+                found.append(Complaint((key,), getattr(self, key), f"is of hinges: this joint is {self.kind}"))
+        if (self.motor_speed is None) != (self.motor_torque is None):
+            found.append(Complaint(("motor_torque",), self.motor_torque, "goes with motor_speed: give both, or none"))
+        if hinge and dimension == 3 and (self.axis is None or not any(self.axis)):
+            found.append(Complaint(("axis",), self.axis, "of a hinge in 3-D must be given, and not zero"))
+        if hinge and dimension == 2 and self.axis is not None:
+            found.append(Complaint(("axis",), self.axis, "is z in 2-D: leave it out"))
+        if self.kind == "ball" and dimension == 2:
+            found.append(Complaint(("kind",), self.kind, "is a hinge in 2-D"))
+        if self.limits is not None and not -180.0 <= self.limits[0] <= self.limits[1] <= 180.0:
+            found.append(Complaint(("limits",), self.limits, "must be in order and within 180 degrees"))
+        return found
+
+    def to_joint(self, bodies: Sequence[int]) -> Joint:
+        """Return the joint; `bodies` has the number among the bodies of each solid, WORLD of what stands."""
+        first, second = [bodies[number] for number in [*self.solids, *([-1] if len(self.solids) == 1 else [])]]
+        anchor, axis = (np.array([*vector, 0.0][:3]) for vector in (self.anchor, self.axis or [0.0, 0.0, 1.0]))
+        limits = np.radians([-np.inf, np.inf] if self.limits is None else self.limits).tolist()
+        speed, torque = float(np.radians(self.motor_speed or 0.0)), self.motor_torque or 0.0
+        return Joint(first, second, anchor, axis, (limits[0], limits[1]), speed, torque, self.kind)
+
+
+class TargetTable(Table):
+    """[[target]]: where a point of a body is to be. With targets inverse kinematics moves the bodies: no forces, no contacts.
+
+    Each body needs a hinge in which it comes first; hinges form trees that hang on what stands.
+    """
+
+    solid: int = Field(ge=0, description="the rigid body, by its number among the [[solid]]s, from 0")
+    point: Vector = Field(description="of the body, as placed [m]")
+    times: list[float] = Field(min_length=1, description="increasing [s]")
+    places: list[Vector] = Field(min_length=1, description="where the point is to be at those times, on straight ways between them [m]")
+
+    def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
+        """Return what is wrong with the target among these solids in a scene of 2 or 3 dimensions."""
+        found = []
+        if self.solid >= len(solids) or not solids[self.solid].is_body:
+            found.append(Complaint(("solid",), self.solid, "must be the number of a rigid body"))
+        for place, value in [(("point",), self.point), *((("places", index), row) for index, row in enumerate(self.places))]:
+            if len(value) != dimension:
+                found.append(Complaint(place, value, f"must {counted(dimension)} in {dimension}-D"))
+        if not (np.diff(self.times) > 0.0).all():
+            found.append(Complaint(("times",), self.times, "must increase"))
+        if len(self.places) != len(self.times):
+            found.append(Complaint(("places",), self.places, f"must have {len(self.times)} entries, one for each time"))
+        return found
+
+
 class ContactScene(Scene):
     """A scene of rigid bodies without a material."""
 
@@ -53,6 +143,31 @@ class ContactScene(Scene):
     domain: ContactDomain
     solver: ContactSolver = Field(default_factory=ContactSolver)  # type: ignore[assignment]
     output: ContactOutput = Field(default_factory=ContactOutput)
+    joint: list[JointTable] = Field(default_factory=list)
+    target: list[TargetTable] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _method_for_joints(cls, data: Any) -> Any:
+        """Fill in the method of scenes with joints where none is given."""
+        solver = data.get("solver", {}) if isinstance(data, dict) else None
+        if isinstance(solver, dict) and data.get("joint"):
+            return {**data, "solver": {"method": JOINTED, **solver}}
+        return data
+
+    def body_numbers(self) -> list[int]:
+        """Return the number among the bodies of each solid, WORLD of what stands, and WORLD once more at the end."""
+        moving = [solid.is_body for solid in self.solid]
+        return [int(sum(moving[:index])) if body else WORLD for index, body in enumerate(moving)] + [WORLD]
+
+    def joints(self) -> list[Joint]:
+        """Return the joints, between bodies by their numbers among the bodies."""
+        return [table.to_joint(self.body_numbers()) for table in self.joint]
+
+    def targets(self) -> list[Target]:
+        """Return the targets of inverse kinematics."""
+        rows = [(table, np.array([[*row, 0.0][:3] for row in [table.point, *table.places]])) for table in self.target]
+        return [Target(self.body_numbers()[table.solid], of[0], np.array(table.times), of[1:]) for table, of in rows]
 
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
@@ -74,6 +189,43 @@ class ContactScene(Scene):
         if self.solver.directions != 4 and self.solver.method not in STEWART_TRINKLE:
             message = f"is of the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} takes friction in boxes"
             found.append(Complaint(("solver", "directions"), self.solver.directions, message))
+        return found + (self._joint_complaints() if self.joint else []) + (self._target_complaints() if self.target else [])
+
+    def _target_complaints(self) -> list[Complaint]:
+        """Return what is wrong with targets, and with what they move."""
+        found = [
+            Complaint(("target", index, *c.place), c.value, c.message)
+            for index, table in enumerate(self.target)
+            for c in table.complaints(self.dimension, self.solid)
+        ]
+        if self.solver.method not in KINEMATIC:
+            message = f"is not for inverse kinematics; choose from {', '.join(KINEMATIC)}"
+            found.append(Complaint(("solver", "method"), self.solver.method, message))
+        for index, table in enumerate(self.joint):
+            if table.motor_torque is not None:
+                found.append(Complaint(("joint", index, "motor_torque"), table.motor_torque, "goes without targets, which move the bodies"))
+        if not found and not self._joint_complaints():
+            try:
+                tree_of(self.joints(), sum(solid.is_body for solid in self.solid))
+            except ValueError as error:
+                found.append(Complaint(("target",), None, str(error)))
+        return found
+
+    def _joint_complaints(self) -> list[Complaint]:
+        """Return what is wrong with joints, and what does not go with them."""
+        found = [
+            Complaint(("joint", index, *c.place), c.value, c.message)
+            for index, table in enumerate(self.joint)
+            for c in table.complaints(self.dimension, self.solid)
+        ]
+        if self.solver.method == DEFAULT:
+            message = f"takes no equations without bounds, which joints are; choose from {', '.join((*BOXED, *STEWART_TRINKLE))}"
+            found.append(Complaint(("solver", "method"), DEFAULT, message))
+        if self.domain.open:
+            found.append(Complaint(("domain", "open"), self.domain.open, "goes without joints: bodies that leave would tear them"))
+        for index, solid in enumerate(self.solid):
+            if solid.restitution:
+                found.append(Complaint(("solid", index, "restitution"), solid.restitution, "must be 0 where there are joints"))
         return found
 
     def plan(self) -> list[tuple[str, str]]:
@@ -84,8 +236,22 @@ class ContactScene(Scene):
         return [
             *((word, line) for word, line in super().plan() if word in kept and (word != "bodies" or moving <= 8)),
             *([("bodies", f"{moving} of {len(self.solid)} solids")] if moving > 8 else []),
-            ("solver", f"{solver.method} to {solver.tolerance:g}, at most {solver.max_iterations} iterations; friction: {model}"),
+            *([("joints", self._joint_line())] if self.joint else []),
+            *([("targets", f"{len(self.target)}, of inverse kinematics")] if self.target else []),
+            ("solver", f"{solver.method} to {solver.tolerance:g} rad, at most {solver.max_iterations} problems a step")
+            if self.target
+            else ("solver", f"{solver.method} to {solver.tolerance:g}, at most {solver.max_iterations} iterations; friction: {model}"),
         ]
+
+    def _joint_line(self) -> str:
+        """Return what joints there are, for the plan."""
+        counts = {kind: sum(table.kind == kind for table in self.joint) for kind in get_args(JointKind)}
+        motors, limited = (sum(getattr(table, key) is not None for table in self.joint) for key in ("motor_torque", "limits"))
+        named = {f"{count} {kind}": count for kind, count in counts.items()} | {
+            f"{limited} with limits": limited,
+            f"{motors} with motors": motors,
+        }
+        return ", ".join(line for line, count in named.items() if count)
 
     def _grid_complaints(self) -> list[Complaint]:
         """Return what is wrong with the domain; its sides need not be whole numbers of cells."""

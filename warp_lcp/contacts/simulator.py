@@ -8,12 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.contacts.kinematics import KinematicSimulation
 from warp_lcp.contacts.methods import MethodOfChoice
 from warp_lcp.contacts.scene import ContactScene
+from warp_lcp.gallery.inverse_kinematics import InverseKinematics
 from warp_lcp.material.particle_assembly import make_bodies, placed_solids
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import NoStopwatch, Part, SimulationFailed, Stopwatch, Surface
+from warp_lcp.solvers.registry import METHODS
 
 COLUMNS = ("kinetic_energy", "potential_energy", "max_speed", "solver", "solve_status", "solve_iterations", "solve_residual")
 
@@ -55,13 +58,14 @@ class ContactSimulation:
         with self.watch.stage("contacts"):
             self.bodies.begin_step(self.time, dt, self.gravity, 0.5 * (self._last_dt + dt))
             self.bodies.solve_contacts()
+            status = self._method.status.name  # before overlaps are solved for
         with self.watch.stage("motion"):
             self.bodies.end_step(dt)
         if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
             raise SimulationFailed(f"step {self.step_count + 1}: {trouble}")
         self.bodies.leave()
         self.time, self.step_count, self._last_dt = self.time + dt, self.step_count + 1, dt
-        return self._row(dt)
+        return self._row(dt, status)
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
@@ -102,8 +106,8 @@ class ContactSimulation:
         room = "a domain without far ends" if self.scene.domain.boundless else f"{sides} m"
         return [f"{count} rigid {'body' if count == 1 else 'bodies'} in {room}", *self.scene.notes()]
 
-    def _row(self, dt: float) -> dict[str, float | int | str | None]:
-        bodies, solved = self.bodies, self.bodies.contacts > 0
+    def _row(self, dt: float, status: str) -> dict[str, float | int | str | None]:
+        bodies, solved = self.bodies, self.bodies.contacts > 0 or bool(self.bodies.joints)
         momentum = np.sum([body.momentum for body in bodies.bodies], axis=0)
         energy = bodies.potential_energy(self.gravity) + 0.5 * dt * float(momentum @ self.gravity)  # back by half a step
         own: dict[str, float | int | str | None] = {
@@ -111,7 +115,7 @@ class ContactSimulation:
             "potential_energy": energy,
             "max_speed": bodies.top_speed(0.0),
             "solver": self.scene.solver.method if solved else None,
-            "solve_status": self._method.status.name if solved else None,
+            "solve_status": status if solved else None,
             "solve_iterations": bodies.contact_iterations if solved else None,
             "solve_residual": float(bodies.contact_residual) if solved else None,
         }
@@ -125,7 +129,7 @@ class ContactSimulator:
     summary = "rigid bodies that stack, slide, topple and bounce"
     scene_model = ContactScene
 
-    def create(self, scene: Scene, *, device: str, folder: Path) -> ContactSimulation:
+    def create(self, scene: Scene, *, device: str, folder: Path) -> ContactSimulation | KinematicSimulation:
         """Build a simulation of `scene`.
 
         Args:
@@ -144,4 +148,13 @@ class ContactSimulator:
         )
         bodies = make_bodies(scene, placed_solids(scene, folder), partial(RigidBodies, solver=method))
         assert bodies is not None  # of which the scene has one
+        if scene.target:
+            solve = InverseKinematics(
+                method=METHODS[solver.method](),
+                tolerance=solver.tolerance,
+                max_iterations=solver.max_iterations,
+                curvature=True,
+                device=device,
+            )
+            return KinematicSimulation(bodies, scene.targets(), solve, solver.method, scene.time.dt_max)
         return ContactSimulation(scene, bodies, method)

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.gallery.contact_stepper import ContactStepper
-from warp_lcp.gallery.hinges import WORLD, Hinge
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.gallery.rigid_world import FIXED, GRAVITY, Parts, World
 from warp_lcp.grid.solids import Box, Placement, Sphere
 from warp_lcp.rigid.contacts import contact_frames, jacobian
+from warp_lcp.rigid.joints import WORLD, Joint
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.solvers.nncg import NNCG
 
@@ -129,10 +129,10 @@ def _arch(links: int) -> tuple[list[Box], list[np.ndarray], np.ndarray]:
     return boxes, points, at(radius, angles[links // 2])
 
 
-def _chain(points: Sequence[Vector], limits: np.ndarray) -> tuple[Hinge, ...]:
+def _chain(points: Sequence[Vector], limits: np.ndarray) -> tuple[Joint, ...]:
     """Return hinges between bodies that follow each other, which turn by up to a limit [rad] each either way."""
     pairs = enumerate(zip(points, limits.tolist(), strict=True))
-    return tuple(Hinge(i + 1, i, np.array(at), Y_AXIS, (-limit, limit)) for i, (at, limit) in pairs)
+    return tuple(Joint(i + 1, i, np.array(at), Y_AXIS, (-limit, limit)) for i, (at, limit) in pairs)
 
 
 def _next_but_one(links: int) -> frozenset[tuple[int, int]]:
@@ -252,7 +252,7 @@ def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> Wor
     boxes, hinges = [box([0.42 * i, 0.0, 1.0], half) for i in range(links + 1)], []
     for i in range(links):
         anchor, most = np.array([0.42 * i + 0.21, 0.0, 1.0]), torque * ((links - i) / links) ** 2
-        hinges.append(Hinge(i + 1, i, anchor, Y_AXIS, (-1.0, 1.0), motor_speed=float(rng.uniform(-0.5, 0.5)), motor_torque=most))
+        hinges.append(Joint(i + 1, i, anchor, Y_AXIS, (-1.0, 1.0), motor_speed=float(rng.uniform(-0.5, 0.5)), motor_torque=most))
     return World(f"arm of {links} motors", boxes, [FIXED, *([box_mass(half)] * links)], hinges=tuple(hinges))
 
 
@@ -266,7 +266,7 @@ def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
     half, phase = (0.3, 0.04, 0.1), float(np.random.default_rng(seed).uniform(-0.05, 0.05))
     gears = [gear([0.5 * i, 0.0, 1.0], half, np.pi / 6 * (i % 2) + phase * (-1) ** i) for i in range(count)]
     torques = [50.0] + [0.0] * (count - 1)
-    axles = [Hinge(i, WORLD, np.array([0.5 * i, 0.0, 1.0]), Y_AXIS, motor_speed=1.0, motor_torque=t) for i, t in enumerate(torques)]
+    axles = [Joint(i, WORLD, np.array([0.5 * i, 0.0, 1.0]), Y_AXIS, motor_speed=1.0, motor_torque=t) for i, t in enumerate(torques)]
     return World(f"{count} driven gears", gears, [BARS * box_mass(half)] * count, hinges=tuple(axles), friction=0.2)
 
 

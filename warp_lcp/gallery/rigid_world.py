@@ -9,13 +9,13 @@ import numpy as np
 import scipy.sparse
 
 from warp_lcp.gallery.contact_models import ContactSystem
-from warp_lcp.gallery.hinges import Hinge
 from warp_lcp.grid.solids import Box, Sphere
 from warp_lcp.rigid.body import RigidBody
 from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import ContactSolve
 from warp_lcp.rigid.contacts import Contacts
+from warp_lcp.rigid.joints import Joint, JointRows
 from warp_lcp.rigid.mass_properties import MassProperties, mass_properties
 from warp_lcp.rigid.obstacles import Obstacle
 
@@ -25,6 +25,7 @@ FIXED = np.inf  # mass [kg] of a body that does not move
 GROUND = Obstacle(name="ground", points=np.zeros((1, 3)), normals=np.array([[0.0, 0.0, 1.0]]))
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 MARGIN = 0.02  # of the smallest body's reach: gaps up to it are contacts, besides those that the fastest bodies may close in a step
+NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row
 SLOP = 0.002  # of the smallest body's reach: overlap that is left alone, so that resting contacts stay
 
 
@@ -56,7 +57,7 @@ class World:
     solids: Sequence[Parts]
     mass: Sequence[float] | np.ndarray
     obstacles: tuple[Obstacle, ...] = (GROUND,)
-    hinges: tuple[Hinge, ...] = ()
+    hinges: tuple[Joint, ...] = ()
     friction: float = 0.5
     gravity: tuple[float, float, float] = GRAVITY
     ignored: frozenset[tuple[int, int]] = frozenset()
@@ -104,7 +105,7 @@ class World:
         """Return the velocity problem of a step.
 
         u = J v' + c with v' = v + dt g + M^-1 J'r. For a contact's normal row c = gap / dt where there is a gap, so that what approaches
-        arrives in the step, and rate min(gap + slop, 0) / dt where bodies overlap (Baumgarte); joints see `Hinge.rows`.
+        arrives in the step, and rate min(gap + slop, 0) / dt where bodies overlap (Baumgarte); joints see `JointRows.bias`.
 
         Args:
             dt: time step [s].
@@ -116,18 +117,16 @@ class World:
         if not (dt > 0 and 0 <= rate <= 1):
             raise ValueError(f"dt = {dt}, rate = {rate}: must be > 0 and in [0, 1]")
         n, contacts = len(self.bodies), self.contacts(dt)
-        joints = [hinge.rows(self.bodies, dt, rate) for hinge in self.hinges]
-        J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(n), *(rows.J for rows in joints)]))
+        joints = [_near(hinge.rows(self.bodies, dt)) for hinge in self.hinges]
+        J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(n), *(rows.jacobian(n) for rows in joints)]))
         masses = [np.zeros((6, 6)) if still else body.free_inverse_mass(3) for body, still in zip(self.bodies, self.fixed, strict=True)]
         response = scipy.sparse.csr_array(scipy.sparse.bsr_array((np.array(masses), np.arange(n), np.arange(n + 1))) @ J.T)
         falling = self.velocities()
         falling[~self.fixed, :3] += dt * np.array(self.gravity)
         bias, gap = np.zeros((len(contacts), 3)), contacts.gap
         bias[:, 0] = np.where(gap > 0, gap, rate * np.minimum(gap + SLOP * self.size, 0.0)) / dt
-        bias, low, high = (
-            np.concatenate([own, *(getattr(rows, name) for rows in joints)])
-            for name, own in (("bias", bias.ravel()), ("lower", np.zeros(0)), ("upper", np.zeros(0)))
-        )
+        bias = np.concatenate([bias.ravel(), *(rows.bias(dt, rate) for rows in joints)])
+        low, high = (np.concatenate([np.zeros(0), *(getattr(rows, name) for rows in joints)]) for name in ("lower", "upper"))
         B = scipy.sparse.csr_array(J @ response)
         B = scipy.sparse.csr_array(0.5 * (B + B.T))  # rounding must not make it unsymmetric
         system = ContactSystem(self.name, B, J @ falling.ravel() + bias, np.full(len(contacts), self.friction), low, high)
@@ -176,3 +175,8 @@ def _made(solid: Parts, mass: float) -> tuple[MassProperties, ContactShape]:
     parts = [mass_properties(box, 3, mass=mass / len(boxes)) for box in boxes]
     inertia = np.sum([part.inertia for part in parts], axis=0)
     return MassProperties(mass=mass, center=parts[0].center, inertia=inertia), ContactShape.united(boxes)
+
+
+def _near(rows: JointRows) -> JointRows:
+    """Return the rows without those of limits that are far away."""
+    return rows.where(rows.equations | rows.motors | (rows.error <= NEAR_LIMIT))

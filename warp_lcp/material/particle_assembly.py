@@ -74,7 +74,8 @@ def make_bodies(scene: Scene, placed: Sequence[PlacedSolid], make: Callable[...,
         if not ((body.position >= 0.0) & (body.position <= np.array(_vector(scene.domain.size)))).all():
             raise ValueError(f"{body.name} has its center of mass at {body.position.round(6).tolist()} m, outside the domain")
     shapes = [placed[number - 1].geometry for number in motions]
-    made = make(bodies, shapes, list(motions), (walls, *others), scene.dimension)
+    joints = scene.joints()
+    made = make(bodies, shapes, list(motions), (walls, *others), scene.dimension, **({"joints": joints} if joints else {}))
     made.exits = (scene.domain.size, side_bits(scene.domain.open))
     return made
 

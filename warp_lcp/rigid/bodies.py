@@ -12,6 +12,7 @@ from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import Contacts, ContactSolve, ImpulseSolver, sweeps_and_newton
+from warp_lcp.rigid.joints import Joint
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.outline import BodySurface, body_surface
 
@@ -31,6 +32,8 @@ class _Begun:
         contacts: where bodies touch.
         impulses: of the contacts if no material pushes; once `settled` with what it gave.
         detour: of the bodies in the step, where they bounce.
+        dt: of the step [s].
+        kick_dt: how long gravity acts [s].
         settled: whether contacts have been solved for with what the material gave.
     """
 
@@ -39,6 +42,8 @@ class _Begun:
     contacts: Contacts
     impulses: np.ndarray
     detour: np.ndarray | None
+    dt: float
+    kick_dt: float
     settled: bool = False
 
 
@@ -55,7 +60,8 @@ class RigidBodies:
         numbers: the wall number of each, 1 + the index of its solid.
         obstacles: what else they may touch.
         dimension: 2 or 3.
-        solver: of the contacts' impulses.
+        solver: of the impulses of contacts and joints; the default takes contacts alone.
+        joints: between the bodies, numbered as in `bodies`; restitution must be 0 with them.
 
     Attributes:
         motions: a `BodyMotion` of each, for the solids.
@@ -78,13 +84,15 @@ class RigidBodies:
         obstacles: Sequence[Obstacle],
         dimension: int,
         solver: ImpulseSolver = sweeps_and_newton,
+        joints: Sequence[Joint] = (),
     ) -> None:
         """Prepare the shapes for contact, and check that bodies start apart."""
         self.bodies, self.numbers, self.dimension = list(bodies), list(numbers), dimension
         self.motions = [BodyMotion(body) for body in bodies]
         self._geometries = list(geometries)
         self.shapes = [ContactShape.of(geometry, dimension) for geometry in geometries]
-        self._solve = ContactSolve(ContactDetection(self.bodies, self.shapes, obstacles, dimension), solver)
+        self._solve = ContactSolve(ContactDetection(self.bodies, self.shapes, obstacles, dimension), solver, joints)
+        self.joints = self._solve.joints
         self._surfaces: list[BodySurface] | None = None
         self._begun: _Begun | None = None
         self.contacts, self.contact_residual, self.contact_iterations = 0, 0.0, 0
@@ -121,10 +129,10 @@ class RigidBodies:
                 body.accelerate(gravity, kick_dt)
         before = self._solve.bounce(contacts, approach, dt, kick_dt, gravity)
         free = self._momenta()
-        impulses = self._solve.push_apart(contacts)
+        impulses = self._solve.push_apart(contacts, dt=dt, kick_dt=kick_dt)
         self._solve.hold(contacts, impulses)
         self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
-        self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses))
+        self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses), dt, kick_dt)
 
     def solve_contacts(self) -> None:
         """Solve for the contacts with what the material gave.
@@ -139,7 +147,7 @@ class RigidBodies:
         if any(body.given.any() for body in self.bodies):
             for body, momenta in zip(self.bodies, begun.free, strict=True):
                 body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
-            impulses = self._solve.push_apart(begun.contacts, begun.impulses)
+            impulses = self._solve.push_apart(begun.contacts, begun.impulses, dt=begun.dt, kick_dt=begun.kick_dt)
             self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = replace(begun, impulses=impulses, settled=True)
 
@@ -232,7 +240,8 @@ class RigidBodies:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit."""
-        return {"bodies": self._states(), "body_contacts": self._solve.memory.state()}
+        joints = {"joint_impulses": self._solve.joint_impulses} if self.joints else {}
+        return {"bodies": self._states(), "body_contacts": self._solve.memory.state(), **joints}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -248,6 +257,7 @@ class RigidBodies:
 
     def _take(self, state: Mapping[str, np.ndarray]) -> None:
         self._solve.memory.restore(state.get("body_contacts", np.zeros((0, 8))))
+        self._solve.joint_impulses = np.array(state.get("joint_impulses", 0.0 * self._solve.joint_impulses), dtype=np.float64)
         for body, values in zip(self.bodies, np.asarray(state["bodies"], dtype=np.float64), strict=True):
             body.restore(values)
 
@@ -257,7 +267,8 @@ class RigidBodies:
         x, y, z: the center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, how far it has turned [degrees] and how fast
         it turns [degrees/s]; 3-D: wx, wy, wz, the angular velocity [degrees/s]. contacts: points where bodies touch or nearly do;
         contact_residual: how well the problem of their impulses was solved, relative to that of no impulses. With open sides:
-        bodies_gone, how many bodies have left by them.
+        bodies_gone, how many bodies have left by them. With joints: joint_error, the largest distance of anchors [m] or angle between what
+        is held [rad]; of each hinge, numbered among the joints, joint0_angle [degrees], and joint0_torque of its motor [N m].
         """
         names = IN_PLANE if self.dimension == 2 else IN_SPACE
         return (
@@ -265,7 +276,24 @@ class RigidBodies:
             "contacts",
             "contact_residual",
             *(("bodies_gone",) if self.exits[1] else ()),
+            *(("joint_error", *(f"joint{number}_{name}" for number, name in self._joint_columns())) if self.joints else ()),
         )
+
+    def _joint_columns(self) -> list[tuple[int, str]]:
+        """Return what the log has of each joint."""
+        hinges = [(number, joint) for number, joint in enumerate(self.joints) if joint.kind == "hinge"]
+        return [(number, name) for number, j in hinges for name in ("angle", *(("torque",) if j.motor_torque > 0.0 else ()))]
+
+    def _joint_row(self) -> list[float]:
+        """Return the entries of the columns of joints."""
+        if not self.joints:
+            return []
+        errors, torques = [0.0], self._solve.motor_torques()
+        for joint in self.joints:
+            rows = joint.rows(self.bodies, 1.0, self.dimension)
+            errors.append(float(np.abs(rows.error[rows.equations]).max()))
+        values = {"angle": lambda number: float(np.degrees(self.joints[number].angle(self.bodies))), "torque": torques.__getitem__}
+        return [max(errors), *(values[name](number) for number, name in self._joint_columns())]
 
     def row(self) -> dict[str, float | int]:
         """Return the entries of the columns."""
@@ -278,7 +306,7 @@ class RigidBodies:
                 values += [*body.position, *body.velocity, *spin]
         numbers = [float(value) for value in values]
         gone = [int(self.gone().sum())] if self.exits[1] else []
-        return dict(zip(self.columns(), [*numbers, self.contacts, float(self.contact_residual), *gone], strict=True))
+        return dict(zip(self.columns(), [*numbers, self.contacts, float(self.contact_residual), *gone, *self._joint_row()], strict=True))
 
     def surfaces(self) -> BodySurface:
         """Return the surfaces of all bodies as they are, for a frame; fields: `body`, counted from 0, and `velocity` [m/s]."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -20,6 +20,9 @@ from scipy.sparse.csgraph import connected_components
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_newton import ContactNewton
 from warp_lcp.rows import RowPass, Rows
+
+if TYPE_CHECKING:
+    from warp_lcp.rigid.joints import JointRows
 
 YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
 MANY = 20_000  # sweeps, where nothing else helps
@@ -39,7 +42,7 @@ class ContactImpulses(NamedTuple):
     """What a solve of a `ContactProblem` has found.
 
     Attributes:
-        impulses: [N s], shape (k, rows).
+        impulses: [N s], shape (k, rows); where there are joints, these flat and then those of joints [N s, N m s], shape (k rows + m,).
         residual: the largest of an island, relative to that of no impulses.
         iterations: the most of an island: sweeps, and steps of Newton's methods.
     """
@@ -47,6 +50,19 @@ class ContactImpulses(NamedTuple):
     impulses: np.ndarray
     residual: float
     iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class JointPart:
+    """The joints' rows of a problem: y = B x + b, lower <= x <= upper of the rows.
+
+    Args:
+        rows: as those of contacts, times a factor of the inverse masses.
+        b: velocities without impulses, with what removes errors [m/s, rad/s], shape (m,).
+    """
+
+    rows: JointRows
+    b: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +79,7 @@ class ContactProblem:
         b: velocities without impulses, less those that are the least [m/s], shape (k, rows).
         friction: Coulomb's coefficient, shape (k,).
         bodies: their number.
+        joints: further rows, which `solve` does not take; None: there are none.
     """
 
     first: np.ndarray
@@ -72,6 +89,7 @@ class ContactProblem:
     b: np.ndarray
     friction: np.ndarray
     bodies: int
+    joints: JointPart | None = None
 
     def yields(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the diagonal of B and what it has besides that of J J', shape (k rows,) each."""
@@ -107,7 +125,12 @@ class ContactProblem:
             stopping: of NNCG, of which `rtol` and `max_iterations` count.
             start: impulses to start from, shape (k, rows); none if None.
             unsolved: residual of an island above which Newton's methods go on, to `rtol`.
+
+        Raises:
+            ValueError: there are joints.
         """
+        if self.joints is not None:
+            raise ValueError("joints: sweeps of NNCG and Newton's methods take contacts alone; give RigidBodies another solver")
         k, rows, q = self.one.shape
         order, starts = self.islands()
         diagonal, yields = (values.reshape(k, rows)[order] for values in self.yields())

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rigid.body import AXES, PLANAR, in_space, rotation_by
+from warp_lcp.rigid.body import AXES, PLANAR, RigidBody, in_space, rotation_by
 from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints, Place, between
-from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
+from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, JointPart
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
+from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
 AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for
@@ -28,6 +31,8 @@ TINY = 1e-6  # of a step: what is left of it after an impact at its end
 ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)  # for overlaps, which take several steps anyway
 ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
+JOINED = 1e-9  # of the smallest body's size, and in rad: errors of joints at the end of a step that are none
+ROUNDS = 8  # solves of a step, at most, until its joints are where they ought to be at its end
 
 
 ImpulseSolver = Callable[[ContactProblem, np.ndarray], ContactImpulses]  # of a problem and the impulses to start from
@@ -44,16 +49,22 @@ class ContactSolve:
     Args:
         detection: of the bodies.
         solver: solves for the impulses of a step; overlaps, and what rests while others bounce, have their own.
+        joints: between the bodies; the bodies of one do not collide, nor do those that fixed ones make one piece of.
 
     Attributes:
-        residual: of the last problem, relative to that of no impulses; 0 without contacts.
-        iterations: of the last solve; 0 without contacts.
+        residual: of the last problem, relative to that of no impulses; 0 without contacts and joints.
+        iterations: of the last step; 0 without contacts and joints.
         memory: impulses of the last step.
+        joint_rows: of the last step; None: there are no joints, or there was no step.
+        joint_impulses: of these rows [N s, N m s], shape (m,).
     """
 
-    def __init__(self, detection: ContactDetection, solver: ImpulseSolver = sweeps_and_newton) -> None:
+    def __init__(self, detection: ContactDetection, solver: ImpulseSolver = sweeps_and_newton, joints: Sequence[Joint] = ()) -> None:
         self.detection, self.bodies, self.dimension = detection, detection.bodies, detection.dimension
         self.residual, self.iterations, self.memory, self._solver = 0.0, 0, ContactMemory(len(self.bodies)), solver
+        self.joints, self._joined = tuple(joints), joined_pairs(joints, len(self.bodies))
+        self.joint_rows: JointRows | None = None
+        self.joint_impulses = np.zeros(sum(joint.row_count(self.dimension) for joint in joints))
         bodies, shapes = self.bodies, detection.shapes
         self._reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
@@ -70,7 +81,7 @@ class ContactSolve:
             ValueError: which, and with what.
         """
         nothing = np.zeros(len(self.bodies))
-        for found in self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles))):
+        for found in self._apart(self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles)))):
             name, deep = self.bodies[found.first].name, -float(found.points.gap.min())
             if deep <= START_OVERLAP * self._size[found.first]:
                 continue
@@ -93,7 +104,7 @@ class ContactSolve:
         ways = AHEAD * dt * (speeds + spins * self._reach + falls)
         brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
         near = NEAR * float(self._size.min())
-        found = self.detection.find(time, ways, near + np.array(brought), near)
+        found = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
         if gone is not None and gone.any():
             out = np.append(gone, False)
             found = [pair for pair in found if not (out[pair.first] or out[pair.second])]
@@ -198,24 +209,77 @@ class ContactSolve:
             return None
         return -self._answer(contacts.on_bodies(contacts.when[:, None] * (impulses - before), len(self.bodies)))
 
-    def push_apart(self, contacts: Contacts, start: np.ndarray | None = None) -> np.ndarray:
-        """Solve for the impulses of contacts and give them to the bodies; return them [N s], shape (k, dimension).
+    def push_apart(self, contacts: Contacts, start: np.ndarray | None = None, *, dt: float = 0.0, kick_dt: float = 0.0) -> np.ndarray:
+        """Solve for the impulses of contacts and joints and give them to the bodies; return those of contacts [N s], shape (k, dimension).
 
         Args:
             contacts: the contacts.
             start: impulses to start from; those of the last step if None.
+            dt: time step [s], at whose end joints are to hold; they need it.
+            kick_dt: how long torques of motors have acted [s].
         """
         self.residual, self.iterations = 0.0, 0
-        if not len(contacts):
+        if not len(contacts) and not self.joints:
             return np.zeros((0, self.dimension))
         b = contacts.velocities(self._velocities())
         b[:, 0] -= contacts.target
         start = self.memory.recall(contacts, self.bodies) if start is None else start
         problem = self._problem(contacts, b, contacts.friction)
-        impulses, self.residual, self.iterations = self._solver(problem, start)
-        for body, impulse in zip(self.bodies, contacts.on_bodies(impulses, len(self.bodies)), strict=True):
-            body.push(impulse)
+        if self.joints:
+            impulses, pushes = self._hold_joints(problem, contacts, start, dt, kick_dt)
+        else:
+            impulses, self.residual, self.iterations = self._solver(problem, start)
+            pushes = contacts.on_bodies(impulses, len(self.bodies))
+        for body, push in zip(self.bodies, pushes, strict=True):
+            body.push(push)
         return impulses
+
+    def _hold_joints(
+        self, problem: ContactProblem, contacts: Contacts, start: np.ndarray, dt: float, kick_dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the impulses of contacts, and what these and those of joints add up to at each body, shape (n, q).
+
+        Impulses of joints act along the rows J of the step's beginning, and are such that errors e are 0 at its end (the SHAKE method:
+        second order, energy does not drift). e is not linear in velocities: the problem is solved again with c = e / dt - J v' of the v'
+        that it gave, where y = J v' + c; limits likewise with what is left up to them.
+        """
+        n, q = len(self.bodies), self._roots().shape[1]
+        rows = JointRows.joined([joint.rows(self.bodies, kick_dt, self.dimension) for joint in self.joints])
+        J, V, motors = rows.jacobian(n), self._velocities(), rows.motors
+        bias, free = rows.bias(dt), J @ V.ravel()
+        x = np.concatenate([start.ravel(), self.joint_impulses])
+        for _ in range(ROUNDS):
+            found = self._solver(replace(problem, joints=JointPart(self._weighted(rows), free + bias)), x)
+            x = found.impulses
+            impulses, held = x[: start.size].reshape(start.shape), x[start.size :]
+            pushes = contacts.on_bodies(impulses, n) + (J.T @ held).reshape(n, q)
+            after = rows.errors(self._moved(pushes, dt), self.dimension) / dt - J @ (V + self._answer(pushes)).ravel()
+            after[motors] = bias[motors]
+            off = dt * float(np.abs(after - bias).max())
+            bias = after
+            self.residual, self.iterations = found.residual, self.iterations + found.iterations
+            if off <= JOINED * min(1.0, float(self._size.min())):
+                break
+        self.joint_rows, self.joint_impulses = rows, held
+        return impulses, pushes
+
+    def motor_torques(self) -> dict[int, float]:
+        """Return the torque of each motor in the last step [N m], by the number of its joint; 0 before the first step."""
+        found, rows = dict.fromkeys(range(len(self.joints)), 0.0), self.joint_rows
+        if rows is not None:
+            owners = np.repeat(np.arange(len(self.joints)), [joint.row_count(self.dimension) for joint in self.joints])
+            for row in np.flatnonzero(rows.motors).tolist():
+                joint = int(owners[row])
+                found[joint] = self.joints[joint].motor_torque * float(self.joint_impulses[row] / rows.upper[row])
+        return found
+
+    def _moved(self, pushes: np.ndarray, dt: float) -> list[RigidBody]:
+        """Return the bodies where impulses, shape (n, q), let them be after dt [s]."""
+        moved = [copy(body) for body in self.bodies]
+        for body, push in zip(moved, pushes, strict=True):
+            body.push(push)
+            body.position, body.rotation = body.after(dt)
+        return moved
 
     def separation(self, contacts: Contacts, dt: float, detour: np.ndarray | None = None) -> np.ndarray | None:
         """Return the smallest ways (m, rad) of the bodies, in the metric of their masses, that reduce overlaps at the end of a step.
@@ -235,8 +299,21 @@ class ContactSolve:
         if not deep.any():
             return None
         b = np.where(deep, RATE * gap, np.maximum(gap, 0.0))
+        if self.joints:
+            return self._joined_separation(contacts, b, dt)
         problem = self._problem(contacts, b[:, None], np.zeros(len(b)))
         return self._answer(contacts.on_bodies(problem.solve(ROUGH).impulses, len(self.bodies)))
+
+    def _joined_separation(self, contacts: Contacts, b: np.ndarray, dt: float) -> np.ndarray:
+        """Return the ways of `separation` that leave joints together, of gaps b to reach [m], shape (k,)."""
+        moved = self._moved(np.zeros_like(self._velocities()), dt)
+        rows = JointRows.joined([joint.rows(moved, dt, self.dimension) for joint in self.joints])
+        rows = rows.where(rows.equations)
+        gaps = np.column_stack([b, np.zeros((len(b), self.dimension - 1))])
+        problem = replace(self._problem(contacts, gaps, np.zeros(len(b))), joints=JointPart(self._weighted(rows), rows.error))
+        x, n = self._solver(problem, np.zeros(gaps.size + len(rows))).impulses, len(self.bodies)
+        apart = contacts.on_bodies(x[: gaps.size].reshape(gaps.shape), n)
+        return self._answer(apart + (rows.jacobian(n).T @ x[gaps.size :]).reshape(n, -1))
 
     def hold(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Let contacts that bear against walls and other solids take what impulses would move into them, for each body by itself.
@@ -258,11 +335,24 @@ class ContactSolve:
 
     def _problem(self, contacts: Contacts, b: np.ndarray, friction: np.ndarray) -> ContactProblem:
         """Return the problem of the first rows of each contact, as many as b has, shape (k, rows)."""
-        roots = self._roots()
-        roots = np.concatenate([roots, np.zeros((1, *roots.shape[1:]))])
         one, other = (rows[:, : b.shape[1]] for rows in (contacts.one, contacts.other))
         first, second = contacts.first, contacts.second
+        roots = self._roots_or_none()
         return ContactProblem(first, second, one @ roots[first], other @ roots[second], b, friction, len(self.bodies))
+
+    def _weighted(self, rows: JointRows) -> JointRows:
+        """Return joints' rows as those of a problem."""
+        roots = self._roots_or_none()
+        return replace(rows, one=rows.one @ roots[rows.first], other=rows.other @ roots[rows.second])
+
+    def _roots_or_none(self) -> np.ndarray:
+        """Return `_roots`, and 0 in the place of what is no body, shape (n + 1, q, q)."""
+        roots = self._roots()
+        return np.concatenate([roots, np.zeros((1, *roots.shape[1:]))])
+
+    def _apart(self, found: Sequence[ContactPair]) -> list[ContactPair]:
+        """Return the pairs that no joint holds together."""
+        return [pair for pair in found if (pair.second, pair.first) not in self._joined]
 
     def assembled(self, found: Sequence[ContactPair], time: float, dt: float, gravity: np.ndarray | None) -> Contacts:
         """Return the contacts with their rows; tangents are along the slip, or along gravity, if that is given."""

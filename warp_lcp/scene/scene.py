@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from unicodedata import normalize
 
 import numpy as np
@@ -22,6 +22,9 @@ from warp_lcp.scene.table import Complaint, KeyFault, SceneError, Table, Vector,
 from warp_lcp.scene.unusual import scene_notes
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
 from warp_lcp.solvers.registry import grid_methods
+
+if TYPE_CHECKING:
+    from warp_lcp.rigid.joints import Joint
 
 MOST_CELLS = 8192  # along an axis: float32 positions there are rounded to a thousandth of a cell
 FAR_SIDES = ("right", "top", "front")
@@ -259,6 +262,10 @@ class Scene(Table):
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key of the material's shapes in the file, such as `liquid`, and the shapes; bodies alone have none."""
         return "material", ()
+
+    def joints(self) -> Sequence[Joint]:
+        """Return the joints between rigid bodies, which are numbered from 0 in the order of their solids."""
+        return ()
 
     def body_frictions(self) -> list[float]:
         """Return Coulomb's coefficient of each solid's surface against bodies and walls."""

@@ -1,0 +1,210 @@
+"""Scenes with joints and with targets: snakes, motors, gears; arms that reach; what is refused; resuming; frames and images."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+import scipy.optimize
+from typer.testing import CliRunner
+
+from every_step import differences_by_step
+from warp_lcp.cli import commands
+from warp_lcp.contacts.kinematics import KinematicSimulation
+from warp_lcp.contacts.methods import JOINTED, KINEMATIC
+from warp_lcp.contacts.scene import ContactScene
+from warp_lcp.contacts.simulator import ContactSimulation, ContactSimulator
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.table import SceneError
+
+Z = [0.0, 0.0, 1.0]
+
+
+def bar(x: float, y: float = 1.5, **more: Any) -> dict[str, Any]:
+    """Return a bar of 0.4 m along x that begins at x."""
+    return {"shape": "box", "min": [x, y - 0.05, 0.95], "max": [x + 0.4, y + 0.05, 1.05], "density": 1000.0, **more}
+
+
+def hinge(*solids: int, at: float, **more: Any) -> dict[str, Any]:
+    return {"kind": "hinge", "solids": list(solids), "anchor": [at, 1.5, 1.0], "axis": Z, **more}
+
+
+def tables(joints: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    """Return a scene of two bars and a post that stands."""
+    post = {"shape": "box", "min": [0.2, 0.0, 0.8], "max": [0.5, 2.0, 1.2]}
+    time = {"duration": 1.0, "frames_per_second": 10, "dt_max": 0.01}
+    own = {"solid": [post, bar(0.6), bar(1.05)], "joint": joints, "domain": {"size": [3.0, 3.0, 2.0]}, "time": time}
+    return {"scene": {"simulator": "contacts"}, **own, **more}
+
+
+JOINTS = [hinge(1, 0, at=0.55), hinge(2, 1, at=1.02, limits=[-20.0, 20.0])]
+REACH = {"solid": 2, "point": [1.45, 1.5, 1.0], "times": [0.0, 1.0], "places": [[1.45, 1.5, 1.0], [0.9, 2.1, 1.0]]}
+
+
+def loaded(source: Any, *overrides: str) -> ContactScene:
+    scene = load_scene(source, overrides)
+    assert isinstance(scene, ContactScene)
+    return scene
+
+
+def made(scene: ContactScene) -> Any:
+    return ContactSimulator().create(scene, device="cpu", folder=Path())
+
+
+def test_a_chain_falls_and_stays_together() -> None:
+    """Its limit holds, and energy does not grow, but for what swings of second order in the step do: 3e-4 of the energy of motion."""
+    scene = loaded(tables(JOINTS, solver={"tolerance": 1e-6}))
+    assert scene.solver.method == JOINTED
+    simulation, energies = made(scene), []
+    assert isinstance(simulation, ContactSimulation)
+    for _ in range(40):
+        row = simulation.step(0.01)
+        energies.append(row["kinetic_energy"] + row["potential_energy"])
+        assert row["joint_error"] < 1e-6
+        assert abs(row["joint1_angle"]) < 20.01
+        assert (row["solver"], row["solve_status"]) == (JOINTED, "CONVERGED")
+        assert row["solve_residual"] <= 1e-6
+    assert tuple(row) == simulation.columns()
+    assert np.diff(energies).max() < 3e-4 * row["kinetic_energy"]
+    assert energies[-1] < energies[0]
+
+
+def test_a_scene_in_the_plane() -> None:
+    """Two bars on hinges fall as two that are fixed to each other where the second's limits are 0."""
+    solids = [{"shape": "box", "min": [0.6 + 0.45 * n, 1.45], "max": [1.0 + 0.45 * n, 1.55], "density": 1000.0} for n in (0, 1)]
+    first = {"kind": "hinge", "solids": [0], "anchor": [0.55, 1.5]}
+    seconds = [
+        {"kind": "fixed", "solids": [1, 0], "anchor": [1.02, 1.5]},
+        {"kind": "hinge", "solids": [1, 0], "anchor": [1.02, 1.5], "limits": [0, 0]},
+    ]
+    ends = []
+    for second in seconds:
+        flat = tables([first, {**second}], solid=solids, domain={"size": [3.0, 3.0]})
+        if "limits" in second:
+            flat["joint"][1]["limits"] = [0.0, 0.0]
+        simulation = made(loaded(flat, "solver.tolerance=1e-8"))
+        for _ in range(30):
+            row = simulation.step(0.01)
+        ends.append([row["body0_angle"], row["body1_angle"], row["body1_x"], row["body1_y"]])
+    assert ends[0] == pytest.approx(ends[1], abs=1e-4)
+    assert ends[0][0] == pytest.approx(ends[0][1], abs=1e-4)
+    assert ends[0][0] < -30.0
+
+
+@pytest.mark.parametrize("more", [{}, {"target": [REACH]}, {"solver": {"method": "nncg", "tolerance": 1e-3}}])
+def test_a_run_goes_on_bit_for_bit_after_every_step(more: dict[str, Any]) -> None:
+    assert differences_by_step(loaded(tables(JOINTS, **more)), 6, 2) == {}
+
+
+@pytest.mark.parametrize("method", KINEMATIC)
+def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
+    """Within the limits and at the point that SciPy's bounded least squares finds; anchors stay together."""
+    simulation = made(loaded(tables(JOINTS, target=[REACH], solver={"method": method, "tolerance": 1e-6})))
+    assert isinstance(simulation, KinematicSimulation)
+    for _ in range(10):
+        row = simulation.step(0.1)
+        assert row["solve_status"] == "CONVERGED"
+        assert row["solve_residual"] <= 1e-6
+        assert row["joint_error"] < 1e-12
+        assert abs(row["joint1_angle"]) <= 20.0 + 1e-6
+    goal = np.array(REACH["places"][1])
+
+    def off(angles: np.ndarray) -> np.ndarray:
+        a, b = angles[0], angles[0] + angles[1]
+        at = np.array([0.55, 1.5, 1.0]) + 0.47 * np.array([np.cos(a), np.sin(a), 0.0]) + 0.43 * np.array([np.cos(b), np.sin(b), 0.0])
+        return at - goal
+
+    limit = np.radians(20.0)
+    start = [1.0, 0.1 * np.sign(row["joint1_angle"])]  # the elbow bends either way
+    best = scipy.optimize.least_squares(off, start, bounds=([-np.inf, -limit], [np.inf, limit]), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert [row["joint0_angle"], row["joint1_angle"]] == pytest.approx(np.degrees(best.x).tolist(), abs=1e-3)
+    assert row["target_error"] == pytest.approx(float(np.linalg.norm(best.fun)), abs=1e-5)
+    tip = simulation.bodies.motions[1].pose(simulation.time).apply(np.array([REACH["point"]]))[0]
+    assert tip - goal == pytest.approx(best.fun, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joint": [hinge(1, 7, at=0.5)]}, "joint[0].solids = [1, 7]: must be numbers of [[solid]]s, from 0 to 2"),
+        ({"joint": [hinge(0, 1, at=0.5)]}, "the first must be a rigid body"),
+        ({"joint": [hinge(1, 1, at=0.5)]}, "must differ"),
+        ({"joint": [{"kind": "hinge", "solids": [1], "anchor": [0.5, 1.5, 1.0]}]}, "joint[0].axis: of a hinge in 3-D must be given"),
+        ({"joint": [hinge(1, at=0.5, motor_speed=1.0)]}, "joint[0].motor_torque: goes with motor_speed"),
+        ({"joint": [hinge(1, at=0.5, limits=[10.0, -10.0])]}, "joint[0].limits = [10.0, -10.0]: must be in order"),
+        (
+            {"joint": [{"kind": "ball", "solids": [1], "anchor": [0.5, 1.5, 1.0], "limits": [-1.0, 1.0]}]},
+            "is of hinges: this joint is ball",
+        ),
+        ({"joint": [{"kind": "rope", "solids": [1], "anchor": [0.5, 1.5, 1.0]}]}, "joint[0].kind"),
+        ({"solver": {"method": "sweeps-and-newton"}}, "takes no equations without bounds, which joints are; choose from nncg"),
+        ({"solid": [bar(0.6, restitution=0.5), bar(1.05)], "joint": [hinge(1, 0, at=1.02)]}, "must be 0 where there are joints"),
+        ({"domain": {"size": [3.0, 3.0, 2.0], "open": ["left"]}}, "domain.open"),
+        ({"target": [{**REACH, "solid": 0}]}, "target[0].solid = 0: must be the number of a rigid body"),
+        ({"target": [{**REACH, "times": [0.0]}]}, "target[0].places"),
+        ({"target": [REACH], "joint": JOINTS[:1]}, "target: each body needs one hinge in which it comes first"),
+        ({"target": [REACH], "joint": [hinge(1, 2, at=1.02), hinge(2, 1, at=1.02)]}, "some form a ring"),
+        ({"target": [REACH], "solver": {"method": "staggering"}}, "is not for inverse kinematics"),
+    ],
+)
+def test_what_is_wrong_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(SceneError) as error:
+        load_scene(tables(JOINTS) | change)
+    assert message in str(error.value)
+
+
+def done(*arguments: object) -> str:
+    result = CliRunner().invoke(commands.app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, f"{arguments}: {result.stderr}\n{result.exception!r}"
+    return result.stdout
+
+
+@pytest.mark.parametrize("name", ["gears", "motor-arm", "reach", "snake"])
+def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
+    """meshio opens them, the log has residual and iterations, an image is drawn, and `scenes` lists them."""
+    assert "joints" in done("check", name, "--device", "cpu")
+    assert name in done("scenes")
+    done("run", name, "--device", "cpu", "--out", tmp_path / "run", "--frames", 1)
+    with open(tmp_path / "run" / "log.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert all(float(row["solve_residual"]) <= 1e-5 and int(row["solve_iterations"]) >= 0 for row in rows)
+    mesh = meshio.read(tmp_path / "run" / "frames" / "bodies_000001.vtu")
+    scene = loaded(name)
+    shown = sum(solid.is_body for solid in scene.solid) + len(scene.target)
+    assert set(np.unique(mesh.point_data["body"])) == set(range(shown))
+    done("render", tmp_path / "run", "--frame", 1, "--size", "320x240")
+    assert (tmp_path / "run" / "images" / "frame_000001.png").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_gear_turns_one_with_twice_its_teeth_half_as_fast() -> None:
+    """No tooth is skipped: the difference stays within the play between teeth, a third of their distance of 30 degrees."""
+    scene = loaded("gears")
+    simulation, turned = made(scene), np.zeros(2)
+    before = np.zeros(2)
+    while simulation.time < scene.time.duration - 1e-9:
+        row = simulation.step(min(simulation.stable_dt(), 0.01))
+        now = np.array([row["joint0_angle"], row["joint3_angle"]])
+        turned += (now - before + 180.0) % 360.0 - 180.0
+        before = now
+        assert abs(turned[1] + 0.5 * turned[0]) < 10.0
+        assert row["joint_error"] < 1e-7
+    assert turned[0] == pytest.approx(90.0 * scene.time.duration, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "apart"), [("motor-arm", 1e-6), ("snake", 1e-5)])
+def test_built_in_scenes_run_to_their_ends(name: str, apart: float) -> None:
+    scene = loaded(name)
+    simulation = made(scene)
+    while simulation.time < scene.time.duration - 1e-9:
+        row = simulation.step(min(simulation.stable_dt(), scene.time.dt_max))
+        assert row["joint_error"] < apart
+        assert row["solve_status"] == "CONVERGED"
+    for number, table in enumerate(scene.joint):
+        if table.limits is not None:
+            assert table.limits[0] - 0.1 < row[f"joint{number}_angle"] < table.limits[1] + 0.1
+        if table.motor_torque is not None:
+            assert abs(row[f"joint{number}_torque"]) <= table.motor_torque * (1 + 1e-9)
