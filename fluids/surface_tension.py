@@ -103,7 +103,7 @@ class SurfaceTension:
         bend = self._curvature(window, passes)
         if self._cosine != 0.0:  # how the surface goes on into walls depends on its curvature
             found = [self._shares[name] for name in ("linear", "cubic", "once", "twice")]
-            inputs = [*self._walls, planes, 1.0 / (grid.dimension - 1), self._cosine, *found, bend, self._lean.flatten()]
+            inputs = [*self._walls, self._raised, planes, 1.0 / (grid.dimension - 1), self._cosine, *found, bend, self._lean.flatten()]
             launch_list(kernels.lean_kernel, len(self._walls[0]), inputs, device=grid.device)
             self._join(self._lean)
             bend = self._curvature(window, passes)
@@ -194,7 +194,8 @@ class SurfaceTension:
         distance, device = self.boundary.distance, self.grid.device
         blocked, *lists = wall_cells(self.grid, self.boundary.base.numpy(), None if distance is None else distance.numpy())
         self._blocked.assign(blocked)
-        self._walls = [wp.array(v, dtype=kind, device=device) for v, kind in zip(lists, (wp.int32, wp.vec3, wp.float32), strict=True)]
+        kinds = (wp.int32, wp.vec3, wp.float32, wp.float32)
+        *self._walls, self._raised = (wp.array(v, dtype=kind, device=device) for v, kind in zip(lists, kinds, strict=True))
 
 
 def _profile(passes: int) -> dict[str, float]:
@@ -206,8 +207,8 @@ def _profile(passes: int) -> dict[str, float]:
 
 def wall_cells(
     grid: StaggeredGrid, base: np.ndarray, distance: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return which cells are walls, and of those beside open ones: flat index, the point before the wall that each mirrors, and how far.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Return which cells are walls, and of those beside open ones: flat index, the point before the wall that each reads, and how far.
 
     A cell whose center lies in a solid is a wall, mirrored along the solid's normal; so is each of the ring or, without a distance, of a
     solid's whole cells, mirrored along the axes.
@@ -219,7 +220,7 @@ def wall_cells(
 
     Returns:
         `blocked`, int8 in the stored shape; the cells, int32, shape (n,); the points (i, j, k) in cells' numbers, shape (n, 3); the ways
-        [cells], shape (n,); float32.
+        [cells], and how far in the open the middle of each lies, 0 of a mirror, shape (n,); float32.
     """
     flat, ends = grid.dimension == 2, np.array(base.shape) - 1
     inner = np.zeros(base.shape, dtype=bool)
@@ -240,6 +241,7 @@ def wall_cells(
     both = padded[tuple((cells + 1 + sides).T)]
     toward = np.where(both[:, None], sides, first)
     points, way = (cells + toward).astype(np.float32), np.abs(toward).sum(axis=1).astype(np.float32)
+    raised = np.zeros_like(way)
     at, flat_index = tuple(cells.T), np.asarray(np.ravel_multi_index(tuple(cells.T), base.shape), dtype=np.int32)
     solid = np.flatnonzero((center[at] < 0.0) & inner[at])
     depth, along = -2.0 * center[at][solid], normal.reshape(3, -1)[:, flat_index[solid]].T
@@ -248,8 +250,8 @@ def wall_cells(
         mirrored = np.clip(cells[solid] + depth[:, None] * along, 1, ends - 1)
         around = [np.minimum(np.floor(mirrored).astype(int) + corner, ends) for corner in corners]
         depth += 0.25 * np.logical_or.reduce([blocked[tuple(cell.T)] != 0 for cell in around])
-    points[solid], way[solid] = mirrored, depth
-    return blocked.astype(np.int8), flat_index, points[:, ::-1].copy(), way
+    points[solid], way[solid], raised[solid] = mirrored, depth, 0.5 * depth + center[at][solid]
+    return blocked.astype(np.int8), flat_index, points[:, ::-1].copy(), way, raised
 
 
 def _beside(marked: np.ndarray, steps: list[np.ndarray]) -> np.ndarray:

@@ -125,14 +125,17 @@ def distance_of(k: int, j: int, i: int, once: FIELD, twice: FIELD, linear: float
 
 @list_kernel(MODULE)
 def lean_kernel(
-    i, cells: INTS, points: POINTS, way: FLOATS, planes: int, part: float, cosine: float, linear: float, cubic: float, once: FIELD,
-    twice: FIELD, bend: FIELD, lean: FLOATS,
+    i, cells: INTS, points: POINTS, way: FLOATS, raised: FLOATS, planes: int, part: float, cosine: float, linear: float, cubic: float,
+    once: FIELD, twice: FIELD, bend: FIELD, lean: FLOATS,
 ):  # fmt: skip
     """Find by how much the distance d to the surface falls into a wall's cell, each cell of the way, so that the two meet at their angle.
 
     Where the surface meets the wall that is the cosine. At d from there, on the wall, parallel surfaces meet it at other angles, of
     cosine (1 - kappa d), kappa the surface's curvature [1/cells] across the line where they meet: `part` of the whole one. It is taken
     where the surface is nearest, two cells further from the wall, beside which it is not right before this is known.
+
+    The way's middle lies `raised` cells before a wall that cuts cells, where its ends were moved into the open. Of a circle of radius
+    1/kappa whose center is cosine / kappa behind the wall, that is raised + cosine / kappa from the middle, which takes the cosine's place.
     """
     p = points[i]
     low = bend.shape[1] * bend.shape[2]
@@ -152,7 +155,9 @@ def lean_kernel(
     slope = wp.vec3(x, y, z)
     steep = wp.max(wp.dot(slope, slope), 0.1)
     q = FURTHER * away - slope * (d / steep)
-    q = wp.vec3(float(a), float(b), float(c)) + q * wp.min(MOST / wp.max(wp.length(q), 1e-6), 1.0)
+    cell = wp.vec3(float(a), float(b), float(c))
+    d += wp.dot(slope, p - cell)  # at the point itself, which lies between cells where the wall's cell is cut
+    q = cell + q * wp.min(MOST / wp.max(wp.length(q), 1e-6), 1.0)
     a = wp.clamp(int(wp.floor(q[0])), 1, bend.shape[2] - 2)
     b = wp.clamp(int(wp.floor(q[1])), 1, bend.shape[1] - 2)
     c = wp.clamp(int(wp.floor(q[2])), 1, bend.shape[0] - 2)
@@ -172,7 +177,7 @@ def lean_kernel(
     fall = cosine
     if weight > 0.25:
         kappa = part * total / weight
-        fall = cosine * (1.0 - kappa * wp.clamp(d - 0.5 * way[i] * cosine, -NEAR, NEAR))
+        fall = (cosine + kappa * raised[i]) * (1.0 - kappa * wp.clamp(d - 0.5 * way[i] * cosine, -NEAR, NEAR))
     lean[cells[i]] = fall
 
 
