@@ -52,8 +52,8 @@ for (int i = first; i < last; ++i) {
     for (int axis = 0; axis <= planes; ++axis) {
         const long long cells[2] = {i - step[axis], i};
         const int at = axis == 0 ? i : (axis == 1 ? j : k);
-        const bool pressed = kind[cells[0]] == FLUID || kind[i] == FLUID;
-        volume[axis][i] = inside && at > 1 && pressed ? filled(cells, 2) : 0.0f;
+        const bool airy = kind[cells[0]] == AIR && kind[i] == AIR;  // no projection gave it a velocity of its own
+        volume[axis][i] = inside && at > 1 && !airy ? filled(cells, 2) : 0.0f;
     }
     for (int e = 0; e < 2*planes - 1; ++e) {
         const int a = e < 2 ? 0 : 1, b = e < 1 ? 1 : 2;
