@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,10 @@ STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
     "interior-point": lambda s: wl.InteriorPoint(precision="double"),
     "primal-dual-active-set": lambda s: wl.PrimalDualActiveSet(),
 }
-assert {*BOXED, *STEWART_TRINKLE} <= METHODS.keys()
+CONE: dict[str, Callable[[], Any]] = {
+    "proximal-gauss-seidel": wl.ProximalGaussSeidel
+}  # the circular cone itself, bodies instead of a matrix
+assert {*BOXED, *STEWART_TRINKLE, *CONE} <= METHODS.keys()
 
 
 class MethodOfChoice:
@@ -52,7 +56,7 @@ class MethodOfChoice:
     """
 
     def __init__(self, name: str, *, directions: int, tolerance: float, most: int, device: str) -> None:
-        self._method = BOXED.get(name) or STEWART_TRINKLE.get(name)
+        self._method, self._cone = BOXED.get(name) or STEWART_TRINKLE.get(name), CONE.get(name)
         self._model: ContactModel = StewartTrinkleModel(directions) if name in STEWART_TRINKLE else BoxedModel()
         self._stopping = wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most)
         self._device, self.status = device, wl.SolveStatus.CONVERGED
@@ -60,13 +64,15 @@ class MethodOfChoice:
     def __call__(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
         """Return the impulses; those of the least residual where the method does not converge, as `status` says."""
         self.status = wl.SolveStatus.CONVERGED
-        if self._method is None:
+        if self._method is None and self._cone is None:
             found = problem.solve(self._stopping, start, self._stopping.rtol)
             if found.residual > self._stopping.rtol:
                 self.status = wl.SolveStatus.MAX_ITERATIONS
             return found
         if not (problem.b[:, 0] < 0.0).any():  # nothing approaches: impulses are 0
             return ContactImpulses(np.zeros_like(start), 0.0, 0)
+        if self._method is None:
+            return self._in_cones(problem, start)
         system = contact_system(problem)
         lcp = self._model.problem(system).lcp(device=self._device)
         x0 = self._model.guess(system, start.ravel())
@@ -74,6 +80,18 @@ class MethodOfChoice:
         self.status = result.status
         impulses = self._model.impulses(system, result.x.numpy()).reshape(start.shape)
         return ContactImpulses(impulses, float(result.relative_residual), result.iterations)
+
+    def _in_cones(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
+        """Return the impulses in the circular cones; tolerances are relative to no impulses, as those of the other models."""
+        p = problem
+        yields = p.yields()[1].reshape(p.b.shape)
+        cones = wl.FrictionalContact(
+            p.first, p.second, p.one, p.other, p.b, p.friction, p.bodies, yields=yields, device=self._device
+        )  # fmt: skip
+        stopping = replace(self._stopping, rtol=0.0, atol=self._stopping.rtol * cones.reference)
+        result = wl.solve(cones, self._cone(), stopping=stopping, x0=start)
+        self.status = result.status
+        return ContactImpulses(result.x.numpy().copy(), result.residual / cones.reference, result.iterations)
 
 
 def contact_system(problem: ContactProblem) -> ContactSystem:

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from warp_lcp.contacts.methods import BOXED, DEFAULT, STEWART_TRINKLE
+from warp_lcp.contacts.methods import BOXED, CONE, DEFAULT, STEWART_TRINKLE
 from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene import MOST_CELLS, Domain, Output, Scene
@@ -28,10 +28,10 @@ class ContactSolver(Table):
     """[solver]: the method for the impulses of contacts, and how far it goes."""
 
     preset: PresetName | None = Field(default=None, description="not for bodies alone")
-    method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE] = Field(
+    method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE] = Field(
         default=DEFAULT,
         description="sweeps-and-newton is that of bodies in liquids; of the others those from nncg to staggering take friction in boxes, "
-        "those from lemke on the model of Stewart and Trinkle",
+        "those from lemke on the model of Stewart and Trinkle, proximal-gauss-seidel has the circular cone itself",
     )
     directions: int = Field(default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle, in 3-D")
     tolerance: Share = Field(default=1e-5, description="the residual to reach, relative to that of no impulses")
@@ -72,7 +72,8 @@ class ContactScene(Scene):
         if self.solver.precision != "double":
             found.append(Complaint(("solver", "precision"), self.solver.precision, "must be double"))
         if self.solver.directions != 4 and self.solver.method not in STEWART_TRINKLE:
-            message = f"is of the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} takes friction in boxes"
+            others = "takes the circular cone" if self.solver.method in CONE else "takes friction in boxes"
+            message = f"is of the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} {others}"
             found.append(Complaint(("solver", "directions"), self.solver.directions, message))
         return found
 
@@ -80,11 +81,16 @@ class ContactScene(Scene):
         """Return what a run would do."""
         kept = {"preset", "open", "moving", "bodies", "time", "frames"}
         solver, moving = self.solver, sum(solid.is_body for solid in self.solid)
-        model = f"Stewart and Trinkle, {solver.directions} sides" if solver.method in STEWART_TRINKLE else "boxes"
+        models = dict.fromkeys(STEWART_TRINKLE, f"Stewart and Trinkle, {solver.directions} sides") | dict.fromkeys(
+            CONE, "the circular cone"
+        )
         return [
             *((word, line) for word, line in super().plan() if word in kept and (word != "bodies" or moving <= 8)),
             *([("bodies", f"{moving} of {len(self.solid)} solids")] if moving > 8 else []),
-            ("solver", f"{solver.method} to {solver.tolerance:g}, at most {solver.max_iterations} iterations; friction: {model}"),
+            (
+                "solver",
+                f"{solver.method} to {solver.tolerance:g}, at most {solver.max_iterations} iterations; friction: {models.get(solver.method, 'boxes')}",
+            ),
         ]
 
     def _grid_complaints(self) -> list[Complaint]:

@@ -53,7 +53,7 @@ class ContactSimulation:
             SimulationFailed: a body is not finite any more.
         """
         with self.watch.stage("contacts"):
-            self.bodies.begin_step(self.time, dt, self.gravity, 0.5 * (self._last_dt + dt))
+            self.bodies.begin_step(self.time, dt, self.gravity, 0.5 * (self._last_dt + dt), material=False)
             self.bodies.solve_contacts()
         with self.watch.stage("motion"):
             self.bodies.end_step(dt)

@@ -96,7 +96,7 @@ class RigidBodies:
         """Time of the state [s]."""
         return self.bodies[0].time
 
-    def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float) -> None:
+    def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float, *, material: bool = True) -> None:
         """Let gravity act, and contacts; hold bodies that rest against walls and solids that the scene moves or that stand.
 
         Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it meets a body on the floor as it meets the
@@ -107,6 +107,7 @@ class RigidBodies:
             dt: time step [s], > 0.
             gravity: [m/s^2], shape (3,).
             kick_dt: how long gravity acts [s].
+            material: whether one may push the bodies in this step; else nothing asks what holds them.
         """
         self.restore_step()
         gravity = np.asarray(gravity, dtype=np.float64)
@@ -122,7 +123,8 @@ class RigidBodies:
         before = self._solve.bounce(contacts, approach, dt, kick_dt, gravity)
         free = self._momenta()
         impulses = self._solve.push_apart(contacts)
-        self._solve.hold(contacts, impulses)
+        if material:
+            self._solve.hold(contacts, impulses)
         self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses))
 
@@ -205,7 +207,7 @@ class RigidBodies:
         for body, shape, motion in zip(self.bodies, self.shapes, self.motions, strict=True):
             if not np.isfinite(body.state()).all():
                 return f"{body.name} has a velocity that is not finite"
-            points = motion.pose(body.time).apply(shape.points)
+            points = motion.pose(body.time).apply(shape.points) if len(endless) else shape.points
             for axis in endless:
                 if points[:, axis].min() - shape.radius < 0.0 or points[:, axis].max() + shape.radius > size[axis]:
                     return f"{body.name} has reached a side of the periodic {'xyz'[axis]} axis, which rigid bodies cannot cross"

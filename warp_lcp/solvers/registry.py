@@ -2,7 +2,7 @@
 
 A new method is one file and one line here. Each class says in `supports` which capabilities it asks of an operator, any one of them (see
 `warp_lcp.problem.protocol`; nothing where every operator will do), and in `needs` what must hold of A ("symmetric", ...). A class that
-takes small problems only has `most_unknowns`; one that takes no upper bounds and no equations has `boxed = False`; one that ends with
+takes small problems only has `most_unknowns`; one whose problems are no `LCP` names their class as `problems`, and takes no operators; one that takes no upper bounds and no equations has `boxed = False`; one that ends with
 NEGATIVE_CURVATURE where A is surely no P- and no semi-definite matrix has `definite = True`.
 """
 
@@ -27,6 +27,7 @@ from warp_lcp.solvers.penalty import Penalty
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
 from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.staggering import Staggering
@@ -77,6 +78,7 @@ METHODS = Methods(
         "primal-dual-active-set": PrimalDualActiveSet,
         "projected-jacobi": ProjectedJacobi,
         "projected-multigrid": ProjectedMultigrid,
+        "proximal-gauss-seidel": ProximalGaussSeidel,
         "psor": ProjectedSOR,
         "quadratic-program": QuadraticProgram,
         "staggering": Staggering,
