@@ -105,6 +105,6 @@ def _reported(found: dict[str, dict[str, list[float]]]) -> tuple[list[Record], T
     columns = ["method", "contacts", "seconds a step", "of these in solves", "iterations", "residual", "overlap [m]"]
     remark = (
         f"The same {STEPS} steps by all, in turns, medians; the last columns are shares of {METHODS[0]}'s, of which {SHARE:g} of a step is "
-        f"aimed at. Residuals are relative to no impulses, asked for {TOLERANCE:g}, each in its own model: boxes of friction or the circular cone."
+        f"aimed at. Residuals are relative to no impulses, asked for {TOLERANCE:g}, in boxes of friction or the circular cone."
     )
     return records, Table(f"{SPHERES} spheres in a box", [*columns, "share of a step", "share of a solve"], rows, remark)

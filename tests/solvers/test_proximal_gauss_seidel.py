@@ -1,5 +1,7 @@
 """Contacts in the circular cone: sweeps against a plain loop, solutions against Coulomb's law written out and against conic programs."""
 
+from itertools import pairwise
+
 import clarabel
 import numpy as np
 import pytest
@@ -146,7 +148,7 @@ def test_contacts_of_a_color_share_no_body():
     problem = drawn("spheres", 2, friction=0.5, ratio=1.0)
     order, starts = colors(problem.first, problem.second, problem.bodies)
     assert sorted(order.tolist()) == list(range(len(problem)))
-    for begin, end in zip(starts[:-1], starts[1:], strict=True):
+    for begin, end in pairwise(starts):
         bodies = np.concatenate([problem.first[order[begin:end]], problem.second[order[begin:end]]])
         bodies = bodies[bodies < problem.bodies]
         assert len(set(bodies.tolist())) == len(bodies) > 0

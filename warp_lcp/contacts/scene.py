@@ -81,16 +81,12 @@ class ContactScene(Scene):
         """Return what a run would do."""
         kept = {"preset", "open", "moving", "bodies", "time", "frames"}
         solver, moving = self.solver, sum(solid.is_body for solid in self.solid)
-        models = dict.fromkeys(STEWART_TRINKLE, f"Stewart and Trinkle, {solver.directions} sides") | dict.fromkeys(
-            CONE, "the circular cone"
-        )
+        model = "the circular cone" if solver.method in CONE else "boxes"
+        model = f"Stewart and Trinkle, {solver.directions} sides" if solver.method in STEWART_TRINKLE else model
         return [
             *((word, line) for word, line in super().plan() if word in kept and (word != "bodies" or moving <= 8)),
             *([("bodies", f"{moving} of {len(self.solid)} solids")] if moving > 8 else []),
-            (
-                "solver",
-                f"{solver.method} to {solver.tolerance:g}, at most {solver.max_iterations} iterations; friction: {models.get(solver.method, 'boxes')}",
-            ),
+            ("solver", f"{solver.method} to {solver.tolerance:g}, at most {solver.max_iterations} iterations; friction: {model}"),
         ]
 
     def _grid_complaints(self) -> list[Complaint]:

@@ -54,7 +54,7 @@ FOLLOW = RowPass(
 
 @dataclass(frozen=True, kw_only=True)
 class ProximalGaussSeidel(Settings):
-    """Solve for the impulses of contacts with Coulomb's circular cone by proximal maps, contact by contact [Erleben 2017].
+    """Solve for the impulses of contacts in Coulomb's circular cone by proximal maps ([Book] 1.1.4, 1.3.5; Erleben 2017).
 
     A sweep takes each contact once, at the velocities that those before it have left:
 
@@ -66,9 +66,8 @@ class ProximalGaussSeidel(Settings):
 
     Sweeps are accelerated as `NNCG` accelerates them, by g = r - sweep(r), beta = |g|^2 / |g before|^2, r <- r + beta p, p <- beta p - g,
     and p <- 0 where beta > 1 [Silcowitz-Hansen et al. 2010]; the residual is that after a sweep, where r is in its cones. Where it has
-    stayed above 0.9 of its least for `wait` sweeps, as sweeps that go round in circles do, all r-factors shrink, down to a twentieth. (In
-    the paper they shrink at every rise, which acceleration has without harm.) No theorem promises convergence for mu > 0; the residual,
-    recomputed in float64 from r alone, is that of De Saxce's law, `FrictionalContact.residual`.
+    stayed above 0.9 of its least for `wait` sweeps, as sweeps that go round in circles do, all r-factors shrink, down to a twentieth. No
+    theorem promises convergence for mu > 0. The residual, recomputed in float64 from r alone, is that of `FrictionalContact.residual`.
 
     Args:
         accelerate: whether sweeps are accelerated; plain ones took 3 to 6 times as many for 1,000 spheres in a box.

@@ -2,8 +2,9 @@
 
 A new method is one file and one line here. Each class says in `supports` which capabilities it asks of an operator, any one of them (see
 `warp_lcp.problem.protocol`; nothing where every operator will do), and in `needs` what must hold of A ("symmetric", ...). A class that
-takes small problems only has `most_unknowns`; one whose problems are no `LCP` names their class as `problems`, and takes no operators; one that takes no upper bounds and no equations has `boxed = False`; one that ends with
-NEGATIVE_CURVATURE where A is surely no P- and no semi-definite matrix has `definite = True`.
+takes small problems only has `most_unknowns`; one whose problems are no `LCP` names their class as `problems`, and takes no operators;
+one that takes no upper bounds and no equations has `boxed = False`; one that ends with NEGATIVE_CURVATURE where A is surely no P- and no
+semi-definite matrix has `definite = True`.
 """
 
 from __future__ import annotations
