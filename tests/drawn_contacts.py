@@ -57,7 +57,7 @@ def spheres(rng, ratio, side, layers=3):
     normals = np.concatenate(ways)
     roots = np.zeros((n, 6, 6))
     roots[:, range(6), range(6)] = np.column_stack([np.repeat(1 / masses[:, None], 3, 1), np.repeat(2.5 / masses[:, None], 3, 1)]) ** 0.5
-    return (np.concatenate(first), np.concatenate(second), normals, -normals, normals), roots, falling(rng, n, 0.3)
+    return (np.concatenate(first), np.concatenate(second), normals, -normals, normals), roots, falling(rng, n, 0.05)
 
 
 def stack(rng, ratio, height=4):

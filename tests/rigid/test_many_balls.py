@@ -28,7 +28,7 @@ def turned(rng):
 def test_balls_touch_where_each_two_of_them_do():
     """Pair by pair by the distance to the other one; two have the same center."""
     rng, n = np.random.default_rng(3), 25
-    shapes = [ContactShape.of(Sphere([0.0, 0.0, 0.0], float(rng.uniform(0.1, 0.3))), 3) for _ in range(n)]
+    shapes = [ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3) for _ in range(n)]
     at = rng.uniform(0.0, 1.2, (n, 3))
     at[7] = at[3]
     bodies = [SimpleNamespace(rotation=turned(rng), position=p, properties=SimpleNamespace(center=np.zeros(3))) for p in at]
