@@ -101,7 +101,7 @@ def cone_program(problem, lift):
     return np.array(found.x).reshape(k, dim)
 
 
-@pytest.mark.parametrize(("family", "seed"), [("spheres", 1), ("stack", 2), ("any", 3)])
+@pytest.mark.parametrize(("family", "seed"), [("stack", 2), ("any", 3)])
 def test_velocities_are_those_of_the_cone_program_with_the_slip_that_they_have(family, seed):
     """De Saxce: with mu |u_t| added to u_n the law is the optimum of a conic program [Acary et al. 2011], whose velocities are unique."""
     problem = drawn(family, seed, friction=0.4, ratio=3.0)
@@ -142,6 +142,10 @@ def test_bits_are_those_of_one_thread():
     finally:
         wl.set_threads(before)
     assert len(found) == 1
+
+
+def test_it_is_found_by_its_name():
+    assert wl.METHODS["proximal-gauss-seidel"] is wl.ProximalGaussSeidel
 
 
 def test_contacts_of_a_color_share_no_body():

@@ -13,7 +13,7 @@ import warp_lcp as wl
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.rigid.contacts import jacobian
-from warp_lcp.solvers.registry import METHODS
+from warp_lcp.solvers.registry import CONTACTS, METHODS
 
 DEFAULT = "sweeps-and-newton"  # of `warp_lcp.rigid.contact_problem`: what bodies in liquids and in sand are solved by
 PIVOTING = 1e-8  # of the normal and the friction problem of a staggered iteration, solved by pivoting
@@ -35,10 +35,8 @@ STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
     "interior-point": lambda s: wl.InteriorPoint(precision="double"),
     "primal-dual-active-set": lambda s: wl.PrimalDualActiveSet(),
 }
-CONE: dict[str, Callable[[], Any]] = {
-    "proximal-gauss-seidel": wl.ProximalGaussSeidel
-}  # the circular cone itself, bodies instead of a matrix
-assert {*BOXED, *STEWART_TRINKLE, *CONE} <= METHODS.keys()
+CONE: dict[str, Callable[[], Any]] = {**CONTACTS}  # the circular cone itself, bodies instead of a matrix
+assert {*BOXED, *STEWART_TRINKLE} <= METHODS.keys()
 
 
 class MethodOfChoice:
