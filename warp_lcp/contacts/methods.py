@@ -86,6 +86,7 @@ class MethodOfChoice:
         cones = wl.FrictionalContact(
             p.first, p.second, p.one, p.other, p.b, p.friction, p.bodies, yields=yields, device=self._device
         )  # fmt: skip
+        assert self._cone is not None
         stopping = replace(self._stopping, rtol=0.0, atol=self._stopping.rtol * cones.reference)
         result = wl.solve(cones, self._cone(), stopping=stopping, x0=start)
         self.status = result.status

@@ -36,6 +36,7 @@ class ContactSimulation:
 
     def __init__(self, scene: ContactScene, bodies: RigidBodies, method: MethodOfChoice) -> None:
         self.scene, self.bodies, self._method = scene, bodies, method
+        bodies.material = False
         self.time, self.step_count, self._last_dt = 0.0, 0, 0.0
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
         self.watch: Stopwatch = NoStopwatch()
@@ -53,7 +54,7 @@ class ContactSimulation:
             SimulationFailed: a body is not finite any more.
         """
         with self.watch.stage("contacts"):
-            self.bodies.begin_step(self.time, dt, self.gravity, 0.5 * (self._last_dt + dt), material=False)
+            self.bodies.begin_step(self.time, dt, self.gravity, 0.5 * (self._last_dt + dt))
             self.bodies.solve_contacts()
         with self.watch.stage("motion"):
             self.bodies.end_step(dt)

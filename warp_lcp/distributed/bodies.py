@@ -26,9 +26,9 @@ class SharedBodies(RigidBodies):
         super().__init__(*settings)
         self._ranks = ranks
 
-    def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float, *, material: bool = True) -> None:
+    def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float) -> None:
         """Let gravity act, and contacts; hold bodies that rest, see the base class."""
-        super().begin_step(time, dt, gravity, kick_dt, material=material)
+        super().begin_step(time, dt, gravity, kick_dt)
         self._take_root()
 
     def solve_contacts(self) -> None:

@@ -65,6 +65,7 @@ class RigidBodies:
         contact_iterations: of its solve.
         exits: sides of the domain that bodies leave by: its size [m], and bits of `warp_lcp.grid.sides.side_bits`. A body whose center of
             mass has crossed one is out of the simulation for good: at rest outside, touched by nothing, in no frame.
+        material: whether one may push the bodies; else nothing asks what holds them.
 
     Raises:
         ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
@@ -89,6 +90,7 @@ class RigidBodies:
         self._begun: _Begun | None = None
         self.contacts, self.contact_residual, self.contact_iterations = 0, 0.0, 0
         self.exits: tuple[Sequence[float], int] = ((), 0)
+        self.material = True
         self._solve.check_start(self.time)
 
     @property
@@ -96,7 +98,7 @@ class RigidBodies:
         """Time of the state [s]."""
         return self.bodies[0].time
 
-    def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float, *, material: bool = True) -> None:
+    def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float) -> None:
         """Let gravity act, and contacts; hold bodies that rest against walls and solids that the scene moves or that stand.
 
         Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it meets a body on the floor as it meets the
@@ -107,7 +109,6 @@ class RigidBodies:
             dt: time step [s], > 0.
             gravity: [m/s^2], shape (3,).
             kick_dt: how long gravity acts [s].
-            material: whether one may push the bodies in this step; else nothing asks what holds them.
         """
         self.restore_step()
         gravity = np.asarray(gravity, dtype=np.float64)
@@ -123,7 +124,7 @@ class RigidBodies:
         before = self._solve.bounce(contacts, approach, dt, kick_dt, gravity)
         free = self._momenta()
         impulses = self._solve.push_apart(contacts)
-        if material:
+        if self.material:
             self._solve.hold(contacts, impulses)
         self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses))
