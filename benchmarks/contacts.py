@@ -55,8 +55,8 @@ def measure(options: Options, out: Path) -> Results:
         steps, unit = "sweeps, linear iterations, pivots or factorizations", "residual / residual at x = 0"
         charts += [Lines(name, system.name, steps, unit, curves)] if name in DRAWN else []
     equal = _equal(options)
-    steps, table = steps_of_spheres(options)
-    return Results([*records, *solves, *equal, *steps], [_finding(equal), _equal_table(equal), *_tables(solves), table], charts)
+    piles, pile = steps_of_spheres(options)
+    return Results([*records, *solves, *equal, *piles], [_finding(equal), _equal_table(equal), *_tables(solves), pile], charts)
 
 
 def next_step(name: str, device: str) -> Assembly:
