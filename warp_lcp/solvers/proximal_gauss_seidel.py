@@ -70,7 +70,7 @@ class ProximalGaussSeidel(Settings):
     theorem promises convergence for mu > 0. The residual, recomputed in float64 from r alone, is that of `FrictionalContact.residual`.
 
     Args:
-        accelerate: whether sweeps are accelerated; plain ones took 3 to 6 times as many for 1,000 spheres in a box.
+        accelerate: whether sweeps are accelerated; plain ones took more than three times as many for 1,000 spheres in a box.
         check_every: sweeps from one look at the residual to the next; a step of the method, so that limits are met in multiples of it.
         wait: sweeps without progress after which r-factors shrink.
         shrink: what they are multiplied by.
