@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import warp_lcp as wl
+from warp_lcp.benchmarks.contact_steps import steps_of_spheres
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table
 from warp_lcp.benchmarks.harness.timing import Figure, Options
@@ -54,7 +55,8 @@ def measure(options: Options, out: Path) -> Results:
         steps, unit = "sweeps, linear iterations, pivots or factorizations", "residual / residual at x = 0"
         charts += [Lines(name, system.name, steps, unit, curves)] if name in DRAWN else []
     equal = _equal(options)
-    return Results([*records, *solves, *equal], [_finding(equal), _equal_table(equal), *_tables(solves)], charts)
+    piles, pile = steps_of_spheres(options)
+    return Results([*records, *solves, *equal, *piles], [_finding(equal), _equal_table(equal), *_tables(solves), pile], charts)
 
 
 def next_step(name: str, device: str) -> Assembly:

@@ -24,6 +24,7 @@ from warp_lcp.operators import (
     SumOperator,
 )
 from warp_lcp.problem.affine_bounds import AffineBounds
+from warp_lcp.problem.frictional_contact import FrictionalContact
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
@@ -48,6 +49,7 @@ from warp_lcp.solvers.penalty import Penalty
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
 from warp_lcp.solvers.psor import ProjectedSOR, advised_omega
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.registry import METHODS
@@ -97,6 +99,7 @@ __all__ = [
     "DenseOperator",
     "DirectEnumeration",
     "FischerNewton",
+    "FrictionalContact",
     "GradientDescent",
     "Gradients",
     "GridLines",
@@ -115,6 +118,7 @@ __all__ = [
     "ProjectedJacobi",
     "ProjectedMultigrid",
     "ProjectedSOR",
+    "ProximalGaussSeidel",
     "QuadraticProgram",
     "Recommendation",
     "Record",

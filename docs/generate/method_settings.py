@@ -29,7 +29,7 @@ def section(kind: type[Any]) -> str:
 
 def page() -> str:
     """Return the page."""
-    return HEAD + "".join(map(section, (wl.StoppingCriteria, wl.CycleSettings, *wl.METHODS.values())))
+    return HEAD + "".join(map(section, (wl.StoppingCriteria, wl.CycleSettings, *wl.METHODS.values(), wl.ProximalGaussSeidel)))
 
 
 if __name__ == "__main__":

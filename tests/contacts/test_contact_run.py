@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import warp_lcp as wl
 from every_step import differences_by_step
 from warp_lcp.cli import commands
-from warp_lcp.contacts.methods import BOXED, DEFAULT, STEWART_TRINKLE
+from warp_lcp.contacts.methods import BOXED, CONE, DEFAULT, STEWART_TRINKLE
 from warp_lcp.contacts.scene import ContactScene
 from warp_lcp.contacts.simulator import ContactSimulation, ContactSimulator
 from warp_lcp.scene.scene_file import load_scene
@@ -91,7 +91,7 @@ def test_a_body_falls_as_a_stone_does_and_hits_the_floor() -> None:
     assert tuple(row) == simulation.columns()
 
 
-@pytest.mark.parametrize("method", [DEFAULT, "psor", "lemke"])
+@pytest.mark.parametrize("method", [DEFAULT, "psor", "lemke", "proximal-gauss-seidel"])
 def test_energy_does_not_grow_without_restitution(method: str) -> None:
     """Bodies fall on each other, tilted and turning: kinetic and potential energy together never grow."""
     turned = {"rotate": [20.0, 10.0, 30.0], "about": [1.4, 1.95, 1.25], "angular_velocity": [90.0, 0.0, -200.0]}
@@ -115,7 +115,7 @@ def test_a_ball_bounces_as_its_restitution_says() -> None:
     assert max(heights[hit:]) == pytest.approx(0.25 + 0.5**2 * 1.0, rel=0.01)
 
 
-@pytest.mark.parametrize("method", [DEFAULT, *BOXED, *STEWART_TRINKLE])
+@pytest.mark.parametrize("method", [DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE])
 def test_every_method_says_what_it_left(method: str) -> None:
     """Three boxes rest by any method; the log has its name, status, iterations and residual."""
     scene = loaded(*(box(1.0 + 0.01 * n, SIDE * n) for n in range(3)), solver={"method": method, "tolerance": 1e-3})
@@ -137,9 +137,24 @@ def test_the_log_says_when_a_method_falls_short() -> None:
     assert float(row["solve_residual"] or 0.0) > 1e-5  # type: ignore[arg-type]
 
 
+def test_a_body_that_slides_along_a_diagonal_is_braked_by_mu_g() -> None:
+    """The circular cone brakes by mu g in every direction; the four sides of a pyramid, or boxes, need not."""
+    speed, mu, steps, dt = 1.0, 0.4, 15, 0.01
+    way = np.array([np.cos(0.6), 0.0, np.sin(0.6)])
+    scene = loaded(
+        box(1.0, 0.0, velocity=(speed * way).tolist(), friction=mu), solver={"method": "proximal-gauss-seidel", "tolerance": 1e-8}
+    )
+    simulation = made(scene)
+    for _ in range(steps):
+        simulation.step(dt)
+    velocity = simulation.bodies.bodies[0].velocity
+    braked = mu * 9.81 * (steps - 0.5) * dt  # the first step's gravity acts for half of it
+    np.testing.assert_allclose(velocity, (speed - braked) * way, atol=1e-5)
+
+
 def test_in_a_plane() -> None:
     solids = [{"shape": "box", "min": [1.0, 0.5 * n], "max": [1.5, 0.5 * n + 0.5], "density": 500.0} for n in range(3)]
-    for method in (DEFAULT, "nncg", "minimum-map-newton"):
+    for method in (DEFAULT, "nncg", "minimum-map-newton", "proximal-gauss-seidel"):
         simulation = made(loaded(*solids, domain={"size": [3.0, 3.0]}, solver={"method": method, "tolerance": 1e-6}))
         for _ in range(20):
             row = simulation.step(0.01)
@@ -147,7 +162,7 @@ def test_in_a_plane() -> None:
         assert row["max_speed"] < 1e-4  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("method", [DEFAULT, "subspace-minimization", "fischer-newton"])
+@pytest.mark.parametrize("method", [DEFAULT, "subspace-minimization", "fischer-newton", "proximal-gauss-seidel"])
 def test_a_run_goes_on_bit_for_bit_after_every_step(method: str) -> None:
     solids = [box(1.0, 0.0), box(1.1, SIDE), box(1.3, 1.2, velocity=[1.0, -2.0, 0.0], restitution=0.3)]
     scene = loaded(*solids, solver={"method": method, "tolerance": 1e-5})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import warp_lcp as wl
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.rigid.contacts import jacobian
-from warp_lcp.solvers.registry import METHODS
+from warp_lcp.solvers.registry import CONTACTS, METHODS
 
 DEFAULT = "sweeps-and-newton"  # of `warp_lcp.rigid.contact_problem`: what bodies in liquids and in sand are solved by
 JOINTED = "lemke"  # in its place where there are joints, which are equations: sweeps are slow at them, pivots exact
@@ -35,6 +36,7 @@ STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
     "interior-point": lambda s: wl.InteriorPoint(precision="double"),
     "primal-dual-active-set": lambda s: wl.PrimalDualActiveSet(),
 }
+CONE: dict[str, Callable[[], Any]] = {**CONTACTS}  # the circular cone itself, bodies instead of a matrix
 # of inverse kinematics, whose problems have small dense matrices and no blocks
 KINEMATIC = ("lemke", "fischer-newton", "minimum-map-newton", "interior-point", "primal-dual-active-set", "nncg", "psor")
 assert {*BOXED, *STEWART_TRINKLE} <= METHODS.keys()
@@ -55,7 +57,7 @@ class MethodOfChoice:
     """
 
     def __init__(self, name: str, *, directions: int, tolerance: float, most: int, device: str) -> None:
-        self._method = BOXED.get(name) or STEWART_TRINKLE.get(name)
+        self._method, self._cone = BOXED.get(name) or STEWART_TRINKLE.get(name), CONE.get(name)
         self._model: ContactModel = StewartTrinkleModel(directions) if name in STEWART_TRINKLE else BoxedModel()
         self._stopping = wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most)
         self._device, self.status = device, wl.SolveStatus.CONVERGED
@@ -63,13 +65,15 @@ class MethodOfChoice:
     def __call__(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
         """Return the impulses; those of the least residual where the method does not converge, as `status` says."""
         self.status = wl.SolveStatus.CONVERGED
-        if self._method is None:
+        if self._method is None and self._cone is None:
             found = problem.solve(self._stopping, start, self._stopping.rtol)
             if found.residual > self._stopping.rtol:
                 self.status = wl.SolveStatus.MAX_ITERATIONS
             return found
         if problem.joints is None and not (problem.b[:, 0] < 0.0).any():  # nothing approaches: impulses are 0
             return ContactImpulses(np.zeros_like(start), 0.0, 0)
+        if self._method is None:
+            return self._in_cones(problem, start)
         system = contact_system(problem)
         lcp = self._model.problem(system).lcp(device=self._device)
         x0 = self._model.guess(system, start.ravel())
@@ -77,6 +81,19 @@ class MethodOfChoice:
         self.status = result.status
         impulses = self._model.impulses(system, result.x.numpy()).reshape(start.shape)
         return ContactImpulses(impulses, float(result.relative_residual), result.iterations)
+
+    def _in_cones(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
+        """Return the impulses in the circular cones; tolerances are relative to no impulses, as those of the other models."""
+        p = problem
+        yields = p.yields()[1].reshape(p.b.shape)
+        cones = wl.FrictionalContact(
+            p.first, p.second, p.one, p.other, p.b, p.friction, p.bodies, yields=yields, device=self._device
+        )  # fmt: skip
+        assert self._cone is not None
+        stopping = replace(self._stopping, rtol=0.0, atol=self._stopping.rtol * cones.reference)
+        result = wl.solve(cones, self._cone(), stopping=stopping, x0=start)
+        self.status = result.status
+        return ContactImpulses(result.x.numpy().copy(), result.residual / cones.reference, result.iterations)
 
 
 def contact_system(problem: ContactProblem) -> ContactSystem:

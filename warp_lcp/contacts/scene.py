@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from warp_lcp.contacts.kinematics import Target, tree_of
-from warp_lcp.contacts.methods import BOXED, DEFAULT, JOINTED, KINEMATIC, STEWART_TRINKLE
+from warp_lcp.contacts.methods import BOXED, CONE, DEFAULT, JOINTED, KINEMATIC, STEWART_TRINKLE
 from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.rigid.joints import WORLD, Joint, JointKind
 from warp_lcp.scene.presets import PresetName
@@ -32,10 +32,11 @@ class ContactSolver(Table):
     """[solver]: the method for the impulses of contacts, and how far it goes."""
 
     preset: PresetName | None = Field(default=None, description="not for bodies alone")
-    method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE] = Field(
+    method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE] = Field(
         default=DEFAULT,
         description="sweeps-and-newton is that of bodies in liquids; of the others those from nncg to staggering take friction in boxes, "
-        f"those from lemke on the model of Stewart and Trinkle; with joints {JOINTED}, unless given, and not {DEFAULT}",
+        "those from lemke on the model of Stewart and Trinkle, proximal-gauss-seidel has the circular cone itself; "
+        f"with joints {JOINTED}, unless given, and neither {DEFAULT} nor {', '.join(CONE)}",
     )
     directions: int = Field(default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle, in 3-D")
     tolerance: Share = Field(default=1e-5, description="the residual to reach, relative to that of no impulses")
@@ -187,7 +188,8 @@ class ContactScene(Scene):
         if self.solver.precision != "double":
             found.append(Complaint(("solver", "precision"), self.solver.precision, "must be double"))
         if self.solver.directions != 4 and self.solver.method not in STEWART_TRINKLE:
-            message = f"is of the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} takes friction in boxes"
+            others = "takes the circular cone" if self.solver.method in CONE else "takes friction in boxes"
+            message = f"is of the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} {others}"
             found.append(Complaint(("solver", "directions"), self.solver.directions, message))
         return found + (self._joint_complaints() if self.joint else []) + (self._target_complaints() if self.target else [])
 
@@ -218,9 +220,9 @@ class ContactScene(Scene):
             for index, table in enumerate(self.joint)
             for c in table.complaints(self.dimension, self.solid)
         ]
-        if self.solver.method == DEFAULT:
+        if self.solver.method in (DEFAULT, *CONE):
             message = f"takes no equations without bounds, which joints are; choose from {', '.join((*BOXED, *STEWART_TRINKLE))}"
-            found.append(Complaint(("solver", "method"), DEFAULT, message))
+            found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.domain.open:
             found.append(Complaint(("domain", "open"), self.domain.open, "goes without joints: bodies that leave would tear them"))
         for index, solid in enumerate(self.solid):
@@ -232,7 +234,8 @@ class ContactScene(Scene):
         """Return what a run would do."""
         kept = {"preset", "open", "moving", "bodies", "time", "frames"}
         solver, moving = self.solver, sum(solid.is_body for solid in self.solid)
-        model = f"Stewart and Trinkle, {solver.directions} sides" if solver.method in STEWART_TRINKLE else "boxes"
+        model = "the circular cone" if solver.method in CONE else "boxes"
+        model = f"Stewart and Trinkle, {solver.directions} sides" if solver.method in STEWART_TRINKLE else model
         return [
             *((word, line) for word, line in super().plan() if word in kept and (word != "bodies" or moving <= 8)),
             *([("bodies", f"{moving} of {len(self.solid)} solids")] if moving > 8 else []),

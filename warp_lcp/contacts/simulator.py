@@ -39,6 +39,7 @@ class ContactSimulation:
 
     def __init__(self, scene: ContactScene, bodies: RigidBodies, method: MethodOfChoice) -> None:
         self.scene, self.bodies, self._method = scene, bodies, method
+        bodies.material = False
         self.time, self.step_count, self._last_dt = 0.0, 0, 0.0
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
         self.watch: Stopwatch = NoStopwatch()

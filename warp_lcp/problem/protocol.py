@@ -254,11 +254,13 @@ def layout_of(A: Operator) -> Layout:
 def takes(method: Any, A: Operator) -> bool:
     """Return whether a method, or its class, takes an operator: A has one of the capabilities in `supports`, if that names any."""
     asked = getattr(method, "supports", ())
-    return not asked or any(has(A, capability) for capability in asked)
+    return not hasattr(method, "problems") and (not asked or any(has(A, capability) for capability in asked))
 
 
 def families(method: Any) -> set[str]:
-    """Return which of our own families of operators a method, or its class, takes: "dense", "sparse", "grid"."""
+    """Return which of our own families of operators a method, or its class, takes: "dense", "sparse", "grid"; none of other problems."""
+    if hasattr(method, "problems"):
+        return set()
     asked = getattr(method, "supports", ())
     return {family for capability in asked for family in CAPABILITIES[capability][1]} if asked else set(FAMILIES)
 

@@ -71,6 +71,7 @@ class RigidBodies:
         contact_iterations: of its solve.
         exits: sides of the domain that bodies leave by: its size [m], and bits of `warp_lcp.grid.sides.side_bits`. A body whose center of
             mass has crossed one is out of the simulation for good: at rest outside, touched by nothing, in no frame.
+        material: whether one may push the bodies; else nothing asks what holds them.
 
     Raises:
         ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
@@ -97,6 +98,7 @@ class RigidBodies:
         self._begun: _Begun | None = None
         self.contacts, self.contact_residual, self.contact_iterations = 0, 0.0, 0
         self.exits: tuple[Sequence[float], int] = ((), 0)
+        self.material = True
         self._solve.check_start(self.time)
 
     @property
@@ -130,7 +132,8 @@ class RigidBodies:
         before = self._solve.bounce(contacts, approach, dt, kick_dt, gravity)
         free = self._momenta()
         impulses = self._solve.push_apart(contacts, dt=dt, kick_dt=kick_dt)
-        self._solve.hold(contacts, impulses)
+        if self.material:
+            self._solve.hold(contacts, impulses)
         self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses), dt, kick_dt)
 
@@ -213,7 +216,7 @@ class RigidBodies:
         for body, shape, motion in zip(self.bodies, self.shapes, self.motions, strict=True):
             if not np.isfinite(body.state()).all():
                 return f"{body.name} has a velocity that is not finite"
-            points = motion.pose(body.time).apply(shape.points)
+            points = motion.pose(body.time).apply(shape.points) if len(endless) else shape.points
             for axis in endless:
                 if points[:, axis].min() - shape.radius < 0.0 or points[:, axis].max() + shape.radius > size[axis]:
                     return f"{body.name} has reached a side of the periodic {'xyz'[axis]} axis, which rigid bodies cannot cross"

@@ -11,7 +11,7 @@ import numpy as np
 from warp_lcp.grid.motion import Motion, Pose
 from warp_lcp.rigid.body import RigidBody
 from warp_lcp.rigid.box_contacts import OrientedBox, box_box
-from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.contact_shape import ON_SURFACE, ContactShape
 from warp_lcp.rigid.obstacles import Obstacle
 
 FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: a flat rest needs no more
@@ -189,6 +189,27 @@ def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
     return points.where(np.array(chosen))
 
 
+def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs of boxes along the axes that overlap, i > j in their order: those beside each other along the longest way first.
+
+    Args:
+        middle: of the boxes [m], shape (n, 3).
+        half: half their sides [m], shape (n, 3).
+    """
+    low, high = middle - half, middle + half
+    axis = int(np.ptp(middle, axis=0).argmax())
+    order = np.argsort(low[:, axis], kind="stable")
+    ends = np.searchsorted(low[order, axis], high[order, axis], side="right")  # who begins before a box ends, after itself
+    after = ends - np.arange(len(order)) - 1
+    one = np.repeat(np.arange(len(order)), after)
+    other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(after) - after, after)
+    one, other = order[one], order[other]
+    both = ((low[one] <= high[other]) & (low[other] <= high[one])).all(axis=1)
+    pairs = np.sort(np.stack([one[both], other[both]]), axis=0)
+    pairs = pairs[:, np.lexsort(pairs)]
+    return pairs[1], pairs[0]
+
+
 @dataclass(frozen=True, eq=False)
 class ContactPair:
     """Contacts of two.
@@ -235,6 +256,7 @@ class ContactDetection:
         self._middle = np.array([0.5 * (shape.low + shape.high) for shape in shapes])
         self._half = np.array([0.5 * (shape.high - shape.low) - shape.radius for shape in shapes])
         self._radius = np.array([shape.radius for shape in shapes])
+        self._ball = np.array([shape.closed and len(shape.points) == 1 and not shape.boxes for shape in shapes])
 
     def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> list[ContactPair]:
         """Return where bodies touch.
@@ -253,12 +275,28 @@ class ContactDetection:
         found = []
         for obstacle, more in zip(self.obstacles, brought, strict=True):
             found += self._with_obstacle(obstacle, obstacle.pose(time), poses, middle, half, ways + more)
-        margins = near + ways[:, None] + ways
-        apart = (np.abs(middle[:, None] - middle) - half[:, None] - half).max(axis=2)
-        for i, j in np.argwhere(np.tril(apart <= margins, -1)).tolist():
-            points = between(self.shapes[i], poses[i], self.shapes[j], poses[j], float(margins[i, j]), self.dimension)
-            found.append(ContactPair(i, j, self._kept(points, min(self.shapes[i].size, self.shapes[j].size))))
+        first, second = close_pairs(middle, half + ways[:, None] + 0.5 * near)
+        margins = near + ways[first] + ways[second]
+        way = np.linalg.norm(middle[first] - middle[second], axis=1)
+        balls = self._ball[first] & self._ball[second] & (way > ON_SURFACE * self._radius[second])
+        touching = self._balls(first[balls], second[balls], middle, margins[balls])
+        for i, j, margin in zip(first[~balls].tolist(), second[~balls].tolist(), margins[~balls].tolist(), strict=True):
+            points = between(self.shapes[i], poses[i], self.shapes[j], poses[j], margin, self.dimension)
+            touching.append(ContactPair(i, j, self._kept(points, min(self.shapes[i].size, self.shapes[j].size))))
+        found += touching if balls.all() else sorted(touching, key=lambda pair: (pair.first, pair.second))
         return [entry for entry in found if len(entry.points)]
+
+    def _balls(self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray) -> list[ContactPair]:
+        """Return the contacts of balls i with balls j, all at once: the point between them on the line of their centers."""
+        way = centers[i] - centers[j]
+        length = np.linalg.norm(way, axis=1)
+        gap = length - self._radius[j] - self._radius[i]
+        near = gap <= margins
+        i, j, gap = i[near], j[near], gap[near]
+        normal = way[near] / length[near, None]
+        point = centers[i] - (self._radius[i] + 0.5 * gap)[:, None] * normal
+        each = zip(i.tolist(), j.tolist(), range(len(i)), strict=True)
+        return [ContactPair(a, b, ContactPoints(point[t : t + 1], normal[t : t + 1], gap[t : t + 1])) for a, b, t in each]
 
     def _kept(self, points: ContactPoints, size: float) -> ContactPoints:
         return points if self._every else spread(points, size, self.dimension)

@@ -101,13 +101,24 @@ class ContactMemory:
         start, old = np.zeros(contacts.wall.shape), self.values
         if not len(old) or not len(contacts):
             return start
-        places = _places(contacts, bodies)
-        same = (contacts.first[:, None] == old[:, 0]) & (contacts.second[:, None] == old[:, 1])
-        way = np.where(same, np.linalg.norm(places[:, None] - old[:, 2:5], axis=2), np.inf)
-        nearest, each = way.argmin(axis=1), np.arange(len(places))
-        known = (way[each, nearest] < SAME_PLACE * contacts.size) & (way.argmin(axis=0)[nearest] == each)
-        start[known] = (contacts.frames[known] @ old[nearest[known], 5:, None])[:, :, 0]
+        places, pairs = _places(contacts, bodies), len(bodies) + 1
+        keys, before = contacts.first * pairs + contacts.second, (old[:, 0] * pairs + old[:, 1]).astype(np.int64)
+        order = np.argsort(before, kind="stable")
+        low, high = (np.searchsorted(before[order], keys, side=side) for side in ("left", "right"))
+        fresh = np.repeat(np.arange(len(keys)), high - low)  # each contact beside each old one of the same two
+        known = order[np.arange(len(fresh)) - np.repeat(np.cumsum(high - low) - high, high - low)]
+        way = np.linalg.norm(places[fresh] - old[known, 2:5], axis=1)
+        mine, theirs = _least(fresh, known, way), _least(known, fresh, way)
+        both = np.intersect1d(mine, theirs, assume_unique=True)
+        both = both[way[both] < SAME_PLACE * contacts.size[fresh[both]]]
+        start[fresh[both]] = (contacts.frames[fresh[both]] @ old[known[both], 5:, None])[:, :, 0]
         return start
+
+
+def _least(group: np.ndarray, other: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Return the entry of each group with the shortest way, of those alike the one with the least `other`."""
+    order = np.lexsort((other, way, group))
+    return order[np.diff(group[order], prepend=-1) > 0]
 
 
 def _places(contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:

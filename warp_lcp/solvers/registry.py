@@ -2,8 +2,9 @@
 
 A new method is one file and one line here. Each class says in `supports` which capabilities it asks of an operator, any one of them (see
 `warp_lcp.problem.protocol`; nothing where every operator will do), and in `needs` what must hold of A ("symmetric", ...). A class that
-takes small problems only has `most_unknowns`; one that takes no upper bounds and no equations has `boxed = False`; one that ends with
-NEGATIVE_CURVATURE where A is surely no P- and no semi-definite matrix has `definite = True`.
+takes small problems only has `most_unknowns`; one whose problems are no `LCP` names their class as `problems`, and takes no operators: it
+stands in a table of its own; one that takes no upper bounds and no equations has `boxed = False`; one that ends with NEGATIVE_CURVATURE
+where A is surely no P- and no semi-definite matrix has `definite = True`.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from warp_lcp.solvers.penalty import Penalty
 from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
 from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.staggering import Staggering
@@ -44,10 +46,15 @@ ALSO = {
 
 
 class Methods(dict[str, type[Any]]):
-    """Methods by their names; an unknown one's KeyError says which is meant, or which there are."""
+    """Methods by their names; an unknown one's KeyError says which is meant, or which there are.
+
+    Those listed are methods of linear complementarity problems; looked up by name, those of `CONTACTS` are found, too.
+    """
 
     def __missing__(self, name: str) -> type[Any]:
-        """Refuse a name that no method has."""
+        """Return a method of contacts, or refuse a name that no method has."""
+        if name in CONTACTS:
+            return CONTACTS[name]
         raise KeyError(f"no method is called {name!r}: {self.nearest(name)}")
 
     def nearest(self, name: object) -> str:
@@ -60,6 +67,7 @@ class Methods(dict[str, type[Any]]):
         return nearest(word, self)
 
 
+CONTACTS: dict[str, type[Any]] = {"proximal-gauss-seidel": ProximalGaussSeidel}  # methods of `FrictionalContact`, no `LCP`
 METHODS = Methods(
     {
         "accelerated-projected-gradient": AcceleratedProjectedGradient,

@@ -1,0 +1,110 @@
+"""Steps of many spheres in a box, by methods in turns from the same state: seconds of a step and of its solve, residual, overlap."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from warp_lcp.benchmarks.harness.record import Record, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.contacts import SIMULATOR
+from warp_lcp.contacts.simulator import ContactSimulation
+from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
+from warp_lcp.scene.scene_file import load_scene
+
+SPHERES, SIDE = 1000, 10  # and how many lie along a side of the box
+SETTLING, STEPS, DT = 40, 5, 0.005  # steps until they have fallen onto each other, steps measured, and their length [s]
+RADIUS, APART = 0.05, 0.115  # [m]: the largest, and from center to center at first
+TOLERANCE, MOST = 1e-5, 3000  # of the solves; boxes of friction may take as many iterations as they need
+METHODS = ("psor", "nncg", "proximal-gauss-seidel")
+SHARE = 0.2  # of the time of PSOR's steps
+
+
+def spheres(method: str) -> dict[str, Any]:
+    """Return the scene: spheres of 9 to 10 cm on a lattice, a bit off their places, that fall onto each other."""
+    rng, solids = np.random.default_rng(0), []
+    for number in range(SPHERES):
+        layer, place = divmod(number, SIDE * SIDE)
+        center = (np.array([place // SIDE, layer, place % SIDE]) + 0.5) * APART + rng.uniform(-0.006, 0.006, 3)
+        solids.append({"shape": "sphere", "center": center.tolist(), "radius": RADIUS * rng.uniform(0.9, 1.0), "density": 1000.0})
+    layers = -(-SPHERES // SIDE**2)
+    return {
+        "scene": {"simulator": "contacts"},
+        "time": {"duration": 10.0, "frames_per_second": 10, "dt_max": DT},
+        "domain": {"size": [SIDE * APART, (layers + 3) * APART, SIDE * APART], "resolution": 32},
+        "solid": solids,
+        "solver": {"method": method, "tolerance": TOLERANCE, "max_iterations": MOST},
+    }
+
+
+class _Timed:
+    """A method of contacts whose solves are timed."""
+
+    def __init__(self, solver: Any) -> None:
+        self.solver, self.seconds = solver, 0.0
+
+    def __call__(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
+        begun = time.perf_counter()
+        found: ContactImpulses = self.solver(problem, start)
+        self.seconds += time.perf_counter() - begun
+        return found
+
+
+def overlap(simulation: ContactSimulation) -> float:
+    """Return the largest overlap of two spheres [m]."""
+    at = np.array([body.position for body in simulation.bodies.bodies])
+    radius = np.array([shape.radius for shape in simulation.bodies.shapes])
+    i, j = cKDTree(at).query_pairs(2.0 * RADIUS, output_type="ndarray").T
+    return float((radius[i] + radius[j] - np.linalg.norm(at[i] - at[j], axis=1)).max(initial=0.0))
+
+
+def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
+    """Return what steps take by each method: all take the same step from the same state, in turns; the last method's is kept."""
+    made, timed = {}, {}
+    for method in METHODS:
+        options.say(f"{SPHERES} spheres in a box: {method}")
+        made[method] = SIMULATOR.create(load_scene(spheres(method)), device=options.device, folder=Path())
+        solve = made[method].bodies._solve
+        solve._solver = timed[method] = _Timed(solve._solver)
+    last = made[METHODS[-1]]
+    for _ in range(SETTLING):
+        last.step(DT)
+    found: dict[str, dict[str, list[float]]] = {method: defaultdict(list) for method in METHODS}
+    for number in range(-1, STEPS):  # the first one loads kernels
+        state = last.state()
+        for method in METHODS:
+            simulation, timed[method].seconds = made[method], 0.0
+            simulation.restore(state)
+            begun = time.perf_counter()
+            row = simulation.step(DT)
+            seconds = time.perf_counter() - begun
+            figures = {"seconds": seconds, "solve_seconds": timed[method].seconds, "overlap": overlap(simulation)}
+            figures |= {"iterations": float(row["solve_iterations"] or 0), "residual": float(row["solve_residual"] or 0)}
+            figures |= {"contacts": float(row["contacts"] or 0)}
+            for name, value in figures.items() if number >= 0 else ():
+                found[method][name].append(value)
+    return _reported(found)
+
+
+def _reported(found: dict[str, dict[str, list[float]]]) -> tuple[list[Record], Table]:
+    units = {"seconds": "s", "solve_seconds": "s", "overlap": "m"}
+    records, rows = [], []
+    for method, figures in found.items():
+        record = Record(
+            f"{SPHERES} spheres in a box: {method}", {n: Figure.of(v, units.get(n, "")) for n, v in figures.items()}, {"method": method}
+        )
+        records.append(record)
+        shares = [float(np.median(np.divide(figures[n], found[METHODS[0]][n]))) for n in ("seconds", "solve_seconds")]
+        names = ("contacts", "seconds", "solve_seconds", "iterations", "residual", "overlap")
+        rows.append([method, *(f"{record.value(name):.3g}" for name in names), *(f"{share:.3g}" for share in shares)])
+    columns = ["method", "contacts", "seconds a step", "of these in solves", "iterations", "residual", "overlap [m]"]
+    remark = (
+        f"The same {STEPS} steps by all, in turns, medians; the last columns are shares of {METHODS[0]}'s, of which {SHARE:g} of a step is "
+        f"aimed at. Residuals are relative to no impulses, asked for {TOLERANCE:g}, in boxes of friction or the circular cone."
+    )
+    return records, Table(f"{SPHERES} spheres in a box", [*columns, "share of a step", "share of a solve"], rows, remark)

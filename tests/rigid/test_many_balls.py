@@ -1,0 +1,77 @@
+"""What makes many bodies quick: pairs by a sweep along an axis, balls all at once, impulses recalled by the two that touch."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from warp_lcp.grid.solids import Sphere
+from warp_lcp.rigid.contact_detection import ContactDetection, Place, between, close_pairs
+from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.contacts import SAME_PLACE, ContactMemory
+
+
+def test_close_pairs_are_those_that_overlap():
+    """Against all pairs, boxes that just touch among them."""
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        n = int(rng.integers(1, 30))
+        middle, half = rng.integers(0, 12, (n, 3)) / 4.0, rng.integers(0, 4, (n, 3)) / 8.0
+        low, high = middle - half, middle + half
+        expected = np.argwhere(np.tril(((low[:, None] <= high) & (low <= high[:, None])).all(axis=2), -1))
+        np.testing.assert_array_equal(np.column_stack(close_pairs(middle, half)), expected)
+
+
+def turned(rng):
+    return np.linalg.qr(rng.standard_normal((3, 3)))[0]
+
+
+def test_balls_touch_where_each_two_of_them_do():
+    """Pair by pair by the distance to the other one; two have the same center."""
+    rng, n = np.random.default_rng(3), 25
+    shapes = [ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3) for _ in range(n)]
+    at = rng.uniform(0.0, 1.2, (n, 3))
+    at[7] = at[3]
+    bodies = [SimpleNamespace(rotation=turned(rng), position=p, properties=SimpleNamespace(center=np.zeros(3))) for p in at]
+    ways = rng.uniform(0.0, 0.02, n)
+    found = ContactDetection(bodies, shapes, (), 3).find(0.0, ways, np.zeros(0), 0.01)
+    places = [Place(body.rotation, body.position) for body in bodies]
+    expected = {}
+    for i in range(n):
+        for j in range(i):
+            points = between(shapes[i], places[i], shapes[j], places[j], 0.01 + ways[i] + ways[j], 3)
+            expected |= {(i, j): points} if len(points) else {}
+    assert [(pair.first, pair.second) for pair in found] == list(expected) and len(expected) > 20 and (7, 3) in expected
+    for pair in found:
+        for name in ("point", "normal", "gap"):
+            np.testing.assert_allclose(getattr(pair.points, name), getattr(expected[pair.first, pair.second], name), atol=1e-12)
+
+
+class Touching(SimpleNamespace):
+    def __len__(self):
+        return len(self.first)
+
+
+def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
+    """Each from at most one of the last step, to whose place no other is nearer."""
+    recalled = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        n, k, m = (int(count) for count in rng.integers((1, 1, 1), (5, 30, 30)))
+        bodies = [SimpleNamespace(position=rng.standard_normal(3), rotation=turned(rng)) for _ in range(n)]
+        contacts = Touching(
+            first=rng.integers(0, n, k), second=rng.integers(0, n + 1, k), point=rng.standard_normal((k, 3)).round(1),
+            size=np.full(k, rng.uniform(0, 40)), frames=rng.standard_normal((k, 3, 3)), wall=np.zeros((k, 3)),
+        )  # fmt: skip
+        memory = ContactMemory(n)
+        ends = rng.integers(0, n, m), rng.integers(0, n + 1, m)
+        memory.values = np.column_stack([*ends, rng.standard_normal((m, 3)).round(1), rng.standard_normal((m, 3))])
+        start, old = memory.recall(contacts, bodies), memory.values
+        places = [(p - bodies[i].position) @ bodies[i].rotation for p, i in zip(contacts.point, contacts.first, strict=True)]
+        way = np.linalg.norm(np.array(places)[:, None] - old[:, 2:5], axis=2)
+        way[(contacts.first[:, None] != old[:, 0]) | (contacts.second[:, None] != old[:, 1])] = np.inf
+        for c in range(k):
+            nearest = int(way[c].argmin())
+            known = way[c, nearest] < SAME_PLACE * contacts.size[c] and int(way[:, nearest].argmin()) == c
+            np.testing.assert_allclose(start[c], contacts.frames[c] @ old[nearest, 5:] if known else 0.0, atol=1e-14)
+            recalled += known
+    assert recalled > 20
