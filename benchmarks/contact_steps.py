@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from warp_lcp.benchmarks.harness.record import Record, Table
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.contacts import SIMULATOR
-from warp_lcp.contacts.simulator import ContactSimulation
+from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.scene.scene_file import load_scene
 
@@ -55,10 +55,10 @@ class _Timed:
         return found
 
 
-def overlap(simulation: ContactSimulation) -> float:
+def overlap(bodies: RigidBodies) -> float:
     """Return the largest overlap of two spheres [m]."""
-    at = np.array([body.position for body in simulation.bodies.bodies])
-    radius = np.array([shape.radius for shape in simulation.bodies.shapes])
+    at = np.array([body.position for body in bodies.bodies])
+    radius = np.array([shape.radius for shape in bodies.shapes])
     i, j = cKDTree(at).query_pairs(2.0 * RADIUS, output_type="ndarray").T
     return float((radius[i] + radius[j] - np.linalg.norm(at[i] - at[j], axis=1)).max(initial=0.0))
 
@@ -83,7 +83,7 @@ def steps_of_spheres(options: Options) -> tuple[list[Record], Table]:
             begun = time.perf_counter()
             row = simulation.step(DT)
             seconds = time.perf_counter() - begun
-            figures = {"seconds": seconds, "solve_seconds": timed[method].seconds, "overlap": overlap(simulation)}
+            figures = {"seconds": seconds, "solve_seconds": timed[method].seconds, "overlap": overlap(simulation.bodies)}
             figures |= {"iterations": float(row["solve_iterations"] or 0), "residual": float(row["solve_residual"] or 0)}
             figures |= {"contacts": float(row["contacts"] or 0)}
             for name, value in figures.items() if number >= 0 else ():

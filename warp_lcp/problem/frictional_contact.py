@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 from scipy.sparse import bsr_array, csr_array
 
-from warp_lcp.problem.solve import ConvexSetProblem
+from warp_lcp.problem.solve import VariationalInequality
 
 
-class FrictionalContact(ConvexSetProblem):
+class FrictionalContact(VariationalInequality):
     """Find impulses r at k contacts so that Coulomb's law holds for the velocities u = J J' r + e r + b that they leave.
 
     A contact's rows are its normal and `dim` - 1 tangents. With K = {|r_t| <= mu r_n} and its dual cone K* = {u_n >= mu |u_t|} the law is
