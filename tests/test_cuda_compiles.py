@@ -5,6 +5,7 @@ import importlib
 import itertools
 import pkgutil
 import re
+import tempfile
 from pathlib import Path
 from unittest import mock
 
@@ -33,6 +34,9 @@ from warp_lcp.rows.vectors import CUDA_BLOCK
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.principal_system import principal_system
 
+# Modules that have compiled for CUDA, with the hash of their sources. `python tests/test_cuda_compiles.py` compiles the
+# others and writes it.
+COMPILED = Path(__file__).with_name("compiled_for_cuda.txt")
 ONE_LAUNCH = [CycleSettings(one_launch_cpu=4096), CycleSettings(one_launch_cpu=4096, coarsest_cpu=8)]  # as GPUs cycle
 METHODS = [
     wl.MinimumMapNewton(),
@@ -205,6 +209,12 @@ def use_sand_kernels():
                     stress_passes(dimension, real, box=box, rate=rate, cut=cut)
 
 
+def use_contact_kernels():
+    down, none = np.eye(3)[None], np.zeros((1, 3, 3))
+    ball = wl.FrictionalContact([0], [1], down, none, b=[[-1.0, 3.0, 4.0]], friction=[0.5], bodies=1, device="cpu")
+    assert wl.solve(ball, wl.ProximalGaussSeidel())
+
+
 def family(name):
     """Return what the variants of a module share: its name without the types and switches that they were made for."""
     package, module, *variant = name.split(".")
@@ -249,11 +259,24 @@ def modules_of_every_kernel(reals):
     use_stencil_kernels(reals)
     use_coupled_kernels(reals)
     use_sand_kernels()
+    use_contact_kernels()
     for form in [made for made in gc.get_objects() if isinstance(made, Form)]:
         assert form.kernel  # of the pass alone, which the CPU launches in waves
     from warp._src.context import user_modules
 
     return sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels)
+
+
+def one_a_family(names):
+    """Return the longest name of each family."""
+    return list({family(name): name for name in sorted(names, key=len)}.values())
+
+
+def lines_of(names):
+    """Return a line for each module: its name, the hash of its source and Warp's version."""
+    from warp._src.context import user_modules
+
+    return sorted(f"{name} {user_modules[name].hash_module().hex()[:20]} {wp.__version__}" for name in names)
 
 
 def compile_for_cuda(name, archs, folder):
@@ -273,11 +296,12 @@ def compile_for_cuda(name, archs, folder):
     ids=["one", "all"],
 )
 def test_kernels_compile_for_cuda(reals, archs, tmp_path):
-    """One variant of each family of modules, or all of them."""
+    """One variant of each family of modules but for those that have compiled as they are, or all of them."""
     names = modules_of_every_kernel(reals)
     assert len(names) > 15
     if len(archs) == 1:
-        names = list({family(name): name for name in sorted(names, key=len)}.values())
+        compiled = set(COMPILED.read_text().splitlines())
+        names = [line.split()[0] for line in lines_of(one_a_family(names)) if line not in compiled]
     from warp._src.context import user_modules
 
     known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"  # minutes for all modules, so each once while it stays as it is
@@ -291,3 +315,13 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
         except (RuntimeError, OSError) as error:
             pytest.fail(f"{name} does not compile: {error}")
         mark.touch()
+
+
+if __name__ == "__main__":
+    known = set(COMPILED.read_text().splitlines()) if COMPILED.exists() else set()
+    lines = lines_of(one_a_family(modules_of_every_kernel((wp.float64,))))
+    with tempfile.TemporaryDirectory() as folder:
+        for line in lines:
+            if line not in known:
+                compile_for_cuda(line.split()[0], [80], Path(folder) / line.split()[0])
+    COMPILED.write_text("\n".join(lines) + "\n")

@@ -33,7 +33,7 @@ def passes(dim: int, q: int) -> SimpleNamespace:
 
     def declared(name: str, **roles: Any) -> RowPass:
         constants = {"DIM": dim, "Q": q, "FACTOR": FACTOR}
-        return RowPass(f"proximal_gauss_seidel_{dim}_{q}.{name}", HEADERS / f"contact_{name}.h", f64, constants=constants, **roles)
+        return RowPass(f"warp_lcp.proximal_gauss_seidel_{dim}_{q}.{name}", HEADERS / f"contact_{name}.h", f64, constants=constants, **roles)
 
     return SimpleNamespace(
         sweep=declared("sweep", box=contacts, whole={**reals, "g": f64, "state": f64}, numbers={"bodies": int}),
