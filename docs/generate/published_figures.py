@@ -37,8 +37,8 @@ def _cell(record: dict[str, Any] | None) -> str:
     if record is None:
         return "not run"
     f = {name: figure["value"] for name, figure in record["figures"].items()}
-    times = f", x {f['over_linear']:.1f}" if "over_linear" in f else ""
-    return f"{f['iterations']:.0f} ({f['linear_iterations']:.0f}), {_seconds(f['total'])}{times}"
+    time = f"x {f['over_linear']:.1f}" if "over_linear" in f else _seconds(f["total"])
+    return f"{f['iterations']:.0f} ({f['linear_iterations']:.0f}), {time}"
 
 
 def _seconds(seconds: float) -> str:
