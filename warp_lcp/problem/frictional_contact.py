@@ -1,4 +1,4 @@
-"""Contacts of rigid bodies with Coulomb's circular cone: what velocities impulses make, and how far they are from the law."""
+"""Contact problem of rigid bodies with Coulomb's circular friction cone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from warp_lcp.problem.solve import VariationalInequality
 
 
 class FrictionalContact(VariationalInequality):
-    """Find impulses r at k contacts so that Coulomb's law holds for the velocities u = J J' r + e r + b that they leave.
+    """Contact problem of rigid bodies with Coulomb's circular friction cone.
+
+    Find impulses r at k contacts so that Coulomb's law holds for the velocities u = J J' r + e r + b that they leave.
 
     A contact's rows are its normal and `dim` - 1 tangents. With K = {|r_t| <= mu r_n} and its dual cone K* = {u_n >= mu |u_t|} the law is
 
@@ -107,7 +109,10 @@ class FrictionalContact(VariationalInequality):
         return np.asarray((J @ (J.T @ r.ravel())).reshape(r.shape) + self.yields * r + self.b)
 
     def residual(self, r: np.ndarray) -> float:
-        """Return the norm of d (r - P_K(r - u^ / d)) at impulses r, shape (k, dim), with d the mean of a contact's diagonal [m/s]."""
+        """Return the norm of the proximal map's defect at impulses r [m/s].
+
+        ||d (r - P_K(r - u^ / d))|| with r of shape (k, dim) and d the mean of a contact's diagonal.
+        """
         d, u = self.diagonal.mean(axis=1, keepdims=True), self.velocities(r)
         u[:, 0] += self.friction * np.linalg.norm(u[:, 1:], axis=1)
         return float(np.linalg.norm(d * (r - onto_cones(r - u / d, self.friction))))

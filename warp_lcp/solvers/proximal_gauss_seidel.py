@@ -54,7 +54,9 @@ FOLLOW = RowPass(
 
 @dataclass(frozen=True, kw_only=True)
 class ProximalGaussSeidel(Settings):
-    """Solve for the impulses of contacts in Coulomb's circular cone by proximal maps ([Book] 1.1.4, 1.3.5; Erleben 2017).
+    """Gauss-Seidel sweeps of proximal maps for contacts with circular friction cones.
+
+    [Book] 1.1.4, 1.3.5; Erleben 2017.
 
     A sweep takes each contact once, at the velocities that those before it have left:
 
