@@ -17,33 +17,32 @@ NO_MATERIAL = "there is no material: bodies are all that moves"
 
 
 class ContactDomain(Domain):
-    """[domain]: the box whose walls bodies stand on and lean against. There is no grid."""
+    """[domain]: the box; there is no grid."""
 
-    resolution: int = Field(
-        default=64, ge=2, le=MOST_CELLS, description="of pictures, parts of the longest side: bodies alone have no grid"
-    )
+    resolution: int = Field(default=64, ge=2, le=MOST_CELLS, description="resolution of pictures")
 
 
 class ContactSolver(Table):
-    """[solver]: the method for the impulses of contacts, and how far it goes."""
+    """[solver]: solution for the contact impulses."""
 
     preset: PresetName | None = Field(default=None, description="not for bodies alone")
     method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE] = Field(
         default=DEFAULT,
-        description="sweeps-and-newton is that of bodies in liquids; of the others those from nncg to staggering take friction in boxes, "
-        "those from lemke on the model of Stewart and Trinkle",
+        description="sweeps-and-newton: as for bodies in liquids; from lemke on: friction model of Stewart and Trinkle; others: boxes",
     )
-    directions: int = Field(default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle, in 3-D")
-    tolerance: Share = Field(default=1e-5, description="the residual to reach, relative to that of no impulses")
-    max_iterations: Count = Field(default=600, description="iterations after which a step takes the impulses as they are")
-    precision: PrecisionName = Field(default="double", description="impulses are computed in double precision")
+    directions: int = Field(
+        default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle in 3-D, even"
+    )
+    tolerance: Share = Field(default=1e-5, description="residual, relative to that of no impulses")
+    max_iterations: Count = Field(default=600, description="iterations before a step accepts the impulses as they are")
+    precision: PrecisionName = Field(default="double", description="double only")
 
 
 class ContactOutput(Output):
-    """[output]: what the run's folder gets besides the surfaces of the bodies."""
+    """[output]: files besides the surfaces of the bodies."""
 
-    particles: bool = Field(default=False, description="there are none")
-    grid: bool = Field(default=False, description="there is none")
+    particles: bool = Field(default=False, description="not for bodies alone")
+    grid: bool = Field(default=False, description="not for bodies alone")
 
 
 class ContactScene(Scene):
