@@ -132,7 +132,7 @@ class Physics(Table):
     """[physics]: gravity and density."""
 
     gravity: Vector = Field(description="acceleration of gravity [m/s^2]; default: 9.81 down")
-    density: Positive = Field(default=1000.0, description="density of the material [kg/m^3]")
+    density: Positive = Field(default=1000.0, description="density of the liquid [kg/m^3]; of sand: material.density")
 
 
 class Solver(Table):
