@@ -34,39 +34,31 @@ COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-act
 
 
 class Pressure(Table):
-    """[pressure]: what the pressure does."""
+    """[pressure]: pressure model and free surface."""
 
     model: Literal["incompressible", "unilateral"] = Field(
-        default="incompressible",
-        description="incompressible: liquid keeps its volume; unilateral: it cannot be compressed, but comes apart freely",
+        default="incompressible", description="incompressible: constant volume; unilateral: no suction, liquid separates freely"
     )
     surface: Literal["ghost-fluid", "voxel"] = Field(
-        default="ghost-fluid",
-        description="ghost-fluid: the free surface lies between cell centers, second order; voxel: on the cells' faces",
+        default="ghost-fluid", description="ghost-fluid: free surface between cell centers, second order; voxel: on cell faces"
     )
-    smoothing: int = Field(default=0, ge=0, le=8, description="binomial passes over the level set of a ghost-fluid surface")
+    smoothing: int = Field(default=0, ge=0, le=8, description="binomial filter passes over the level set of a ghost-fluid surface")
 
 
 class Viscosity(Table):
-    """[viscosity]: a liquid that is thick."""
+    """[viscosity]: viscous liquid; off without the table."""
 
-    value: float = Field(gt=0, le=1e9, allow_inf_nan=False, description="of the liquid [Pa s]: water 0.001, honey 10, tar 10000")
+    value: float = Field(gt=0, le=1e9, allow_inf_nan=False, description="dynamic viscosity [Pa s]: water 0.001, honey 10, tar 10000")
     slip_length: float = Field(
-        default=0.0,
-        ge=0,
-        allow_inf_nan=True,
-        description="how far behind a wall that holds the liquid its velocity would be the wall's [m]: 0 is no slip; of walls that are "
-        '"separating" or "sticky"',
+        default=0.0, ge=0, allow_inf_nan=True, description='slip length of "separating" and "sticky" walls [m]; 0: no slip'
     )
 
 
 class SurfaceTensionSettings(Table):
-    """[surface_tension]: the surface pulls itself together; it does not unless the table is there."""
+    """[surface_tension]: tension of the free surface; off without the table."""
 
-    coefficient: Positive = Field(description="of the liquid against air [N/m]; water has 0.072")
-    contact_angle: float = Field(
-        default=90.0, ge=0, le=180, description="between surface and walls, measured in the liquid [degrees]; above 90 walls repel it"
-    )
+    coefficient: Positive = Field(description="surface tension [N/m]; water 0.072")
+    contact_angle: float = Field(default=90.0, ge=0, le=180, description="contact angle in the liquid [degrees]; above 90 walls repel it")
 
 
 class LiquidScene(ParticleScene):
@@ -178,7 +170,7 @@ class LiquidScene(ParticleScene):
         if self.pressure.model == "unilateral":
             found.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
         elif self.lets_go:
-            found.append(Model("separating walls", "liquid may let go of domain.wall or a solid: bounds on the pressure"))
+            found.append(Model("separating walls", "liquid may separate from domain.wall or a solid: bounds on the pressure"))
         elif self.domain.wall == "separating":
             found.append(Model("separating walls", "the domain has no wall: equations without bounds", built=False))
         if ghost:

@@ -13,10 +13,10 @@ from warp_lcp.settings import NonNegative
 
 
 class WallDragSettings(Table):
-    """[wall_drag]: friction along walls whose boundary layer the grid does not resolve; without the table, and `drag` of a solid, none."""
+    """[wall_drag]: drag of walls with an unresolved boundary layer; off without the table and `drag` of a solid."""
 
-    coefficient: NonNegative = Field(default=0.0, description="c_f of walls and solids: the shear stress is c_f / 2 rho u^2; about 0.005")
-    domain: NonNegative | None = Field(default=None, description="of the domain's walls; coefficient unless given")
+    coefficient: NonNegative = Field(default=0.0, description="c_f of walls and solids, about 0.005: shear stress c_f / 2 rho u^2")
+    domain: NonNegative | None = Field(default=None, description="c_f of the domain's walls; default: coefficient")
 
 
 def _column_name(text: str) -> str:
@@ -27,11 +27,13 @@ def _column_name(text: str) -> str:
 
 
 class Probe(Table):
-    """[[probe]]: a point at which every step is measured, for probes.csv."""
+    """[[probe]]: measurement at a point in each step, in probes.csv."""
 
-    name: Annotated[str, AfterValidator(_column_name)] = Field(description="of its columns, such as NAME_pressure")
-    position: Vector = Field(description="the point [m], in the domain")
-    quantity: Literal["pressure", "velocity", "level"] = Field(description="level: height of the surface above it, against gravity [m]")
+    name: Annotated[str, AfterValidator(_column_name)] = Field(description="prefix of its columns, as in NAME_pressure")
+    position: Vector = Field(description="point in the domain [m]")
+    quantity: Literal["pressure", "velocity", "level"] = Field(
+        description="level: height of the surface above the point, against gravity [m]"
+    )
 
     def columns(self, dimension: int) -> tuple[str, ...]:
         """Return the names of its columns."""

@@ -45,77 +45,73 @@ Angle = Annotated[float, Field(gt=0, lt=60)]
 
 
 class SandTime(Time):
-    """[time], with steps short enough for sand: what moves further than a cell a step packs unevenly."""
+    """[time]: shorter steps, since sand that moves further than a cell per step packs unevenly."""
 
-    cfl: float = Field(default=0.8, ge=1e-3, description="a Courant number, usually 0.5 to 1")
-    dt_max: Positive = Field(default=5e-3, description="the longest step [s]")
+    cfl: float = Field(default=0.8, ge=1e-3, description="Courant number, usually 0.5 to 1")
+    dt_max: Positive = Field(default=5e-3, description="longest step [s]")
 
 
 class SandDomain(Domain):
-    """[domain], with friction on its walls, and sides that sand leaves to come in on the other."""
+    """[domain]: also wall friction and periodic axes."""
 
     later: ClassVar = {}
     friction: WallFriction | None = Field(
-        default=None, description=f"of the domain's walls: {FRICTIONS}; material.wall_friction unless given"
+        default=None, description=f"friction coefficient of the domain's walls: {FRICTIONS}; default: material.wall_friction"
     )
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell",
-        description="cut-cell: solids cut through cells as their surfaces do, but where a solid moves, an axis is periodic or"
-        ' solver.method = "interleaved-sweeps": there, to the stresses, they fill whole cells, as with voxel',
+        description="cut-cell: surfaces of solids cut cells; voxel: solids fill whole cells and cannot move; stresses use whole "
+        'cells if a solid moves, an axis is periodic or solver.method = "interleaved-sweeps"',
     )
-    periodic: list[bool] | None = Field(default=None, description="which axes have no end, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
+    periodic: list[bool] | None = Field(default=None, description="periodic axes, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
 
 
 class MaterialTable(Table):
-    """[material]: what kind of grains."""
+    """[material]: properties of the grains."""
 
     renamed: ClassVar = {"angle_of": "friction_angle_test"}
-    name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="gives what the table does not")
+    name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="material of the defaults")
     friction_angle: Angle | None = Field(
-        default=None, description="degrees: the slope at which sand that runs stops; see friction_angle_test"
+        default=None, description="slope at which running sand stops [degrees], see friction_angle_test; default: by name"
     )
-    density: Positive | None = Field(default=None, description="at the densest, air included [kg/m^3]")
-    max_fraction: Share | None = Field(default=None, description="of space that grains fill at the densest")
-    wall_friction: WallFriction | None = Field(default=None, description=f"against solids: {FRICTIONS}")
+    density: Positive | None = Field(default=None, description="density at the densest packing, air included [kg/m^3]; default: by name")
+    max_fraction: Share | None = Field(default=None, description="volume fraction of grains at the densest packing; default: by name")
+    wall_friction: WallFriction | None = Field(
+        default=None, description=f"friction coefficient of walls and solids: {FRICTIONS}; default: by name"
+    )
     cohesion: NonNegative = Field(
-        default=0.0, description="the shear stress it bears without pressure [Pa]; over cos(friction_angle) unless that is of repose"
+        default=0.0,
+        description="cohesion [Pa]: shear strength without pressure, over cos(friction_angle) unless friction_angle_test is repose",
     )
-    tensile_strength: NonNegative = Field(default=0.0, description="the tension it bears where it is densely packed [Pa]")
+    tensile_strength: NonNegative = Field(default=0.0, description="tensile strength at dense packing [Pa]")
     friction_angle_test: FrictionAngleTest = Field(
         default="repose",
-        description="the test that friction_angle comes from: repose, the slope at which layers stop (k = tan); sand at rest holds"
-        " up to asin(k), so heaps poured slowly lie up to 5 degrees steeper; or a test of soil mechanics, plane-strain (k = sin: layers"
-        " of 30 degrees stop at 26.6, heaps lie at 30) or triaxial-compression",
+        description="test of friction_angle: repose, the slope where layers stop, or plane-strain or triaxial-compression of soils",
     )
 
 
 class Friction(Table):
-    """[friction]: what shear stresses sand bears.
+    """[friction]: shear strength of sand.
 
-    With `dynamic_angle` friction grows with the rate of shear, mu(I) [Jop, Forterre & Pouliquen 2006]: its coefficient goes from that of
-    `material.friction_angle`, mu_s, to that of `dynamic_angle`, mu_2, as mu_s + (mu_2 - mu_s) / (1 + I_0 / I), where I is the rate of shear
-    times `grain_size` over the square root of pressure over the density of a grain, `material.density` over `material.max_fraction`. So a
-    layer on a slope between the two angles runs at a steady speed, and columns of sand fall a little less far. Glass beads of 0.53 mm have
-    20.9 and 32.76 degrees. It takes no memory; an iteration of the solve takes up to 1.4 times as long.
+    With `dynamic_angle`, friction grows with the shear rate: mu(I) [Jop, Forterre & Pouliquen 2006]. The density of a
+    grain is `material.density` / `material.max_fraction`. Glass beads of 0.53 mm have 20.9 and 32.76 degrees. An
+    iteration of the solve takes up to 1.4 times as long.
     """
 
     model: Literal["cone", "box"] = Field(
-        default="cone",
-        description="cone: alike in all directions; box: that of Narain et al. 2010, whose layers flow where they should rest",
+        default="cone", description="cone: isotropic; box: of Narain et al. 2010, layers flow on slopes where they should rest"
     )
-    dynamic_angle: Angle | None = Field(
-        default=None, description="degrees: friction grows with the rate of shear, mu(I), from material.friction_angle to this"
-    )
-    grain_size: Positive | None = Field(default=None, description="diameter of the grains, with dynamic_angle [m]")
+    dynamic_angle: Angle | None = Field(default=None, description="friction angle at high shear rates [degrees]")
+    grain_size: Positive | None = Field(default=None, description="grain diameter [m], with dynamic_angle")
     inertial_number: float | None = Field(
-        default=None, ge=1e-9, description=f"at which half of the growth is there, with dynamic_angle; {GLASS:g} of glass beads by itself"
+        default=None, ge=1e-9, description=f"I_0 of mu(I), with dynamic_angle; default: {GLASS:g} (glass beads)"
     )
 
 
 class Gauge(Table):
-    """[gauge]: measures what falls through a height, as the log's flow_rate."""
+    """[gauge]: flow rate through a height, `flow_rate` in the log."""
 
-    height: float = Field(description="above the domain's floor [m]")
+    height: float = Field(description="height above the domain's floor [m]")
 
 
 def _not_automatic(value: Any) -> Any:
@@ -127,24 +123,24 @@ def _not_automatic(value: Any) -> Any:
 
 
 class SandSolver(Table):
-    """[solver]: the method for pressure and friction together."""
+    """[solver]: solution for pressure and friction together."""
 
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
     method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
-        default="accelerated-projection", description="interleaved-sweeps is the textbook's, several times slower"
+        default="accelerated-projection", description="interleaved-sweeps: the textbook method, several times slower"
     )
     tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(
-        default=1e-3, description="of the stresses, root mean square in units of rho g dx"
+        default=1e-3, description="root mean square residual of the stresses [rho g dx]"
     )
-    max_iterations: int = Field(default=600, ge=10, description="iterations after which a step takes the stresses as they are")
-    precision: Literal["single"] = Field(default="single", description="of the stresses; residuals are double")
+    max_iterations: int = Field(default=600, ge=10, description="iterations before a step accepts the stresses as they are")
+    precision: Literal["single"] = Field(default="single", description="precision of the stresses; residuals are double")
 
 
 class SandProperties(MaterialProperties):
     """What a body of sand has besides its shape."""
 
-    friction_angle: Angle | None = Field(default=None, description="degrees; material.friction_angle unless given")
-    cohesion: NonNegative | None = Field(default=None, description="[Pa]; material.cohesion unless given")
+    friction_angle: Angle | None = Field(default=None, description="friction angle [degrees]; default: material.friction_angle")
+    cohesion: NonNegative | None = Field(default=None, description="cohesion [Pa]; default: material.cohesion")
 
 
 class SandBox(SandProperties, BoxTable):

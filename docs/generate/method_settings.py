@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import warp_lcp as wl
 from warp_lcp.settings import ranges, rule
 
 PAGE = Path(__file__).parents[1] / "settings.md"
+COMMON = 3  # methods with the same row from which on it stands in the table of common settings
 HEAD = """# Settings of methods
 
 <!-- Written by docs/generate/method_settings.py from the classes; do not edit. -->
@@ -17,19 +19,38 @@ HEAD = """# Settings of methods
 Allowed values and defaults. Other values raise a `ValueError` that names the setting, the value and the range.
 [Solvers](api/solvers.md) explains the settings.
 """
+ALSO = "and [common](#common-settings) "
 
 
-def section(kind: type[Any]) -> str:
-    """Return the settings of a class as a table, empty where it has none."""
-    fields, allowed = dataclasses.fields(kind), ranges(kind)
-    rows = [f"| `{f.name}` | {rule(allowed[f.name])} | `{getattr(kind(), f.name)!r}` |" for f in fields if f.name != "cycle"]
-    cycle = ["", "and `cycle`, [CycleSettings](#cyclesettings)"] if len(rows) < len(fields) else []
-    return "\n".join(["", f"## {kind.__name__}", "", "| setting | must be | default |", "|---|---|---|", *rows, *cycle, ""]) if rows else ""
+def rows(kind: type[Any]) -> dict[str, str]:
+    """Return the settings of a class as rows of a table, by name."""
+    allowed, default, found = ranges(kind), kind(), {}
+    for name in (field.name for field in dataclasses.fields(kind)):
+        words = rule(allowed[name]).replace("an integer", "integer").replace("a finite number", "finite")
+        found[name] = f"| `{name}` | {words} | `{getattr(default, name)!r}` |"
+    return found | {"cycle": "| `cycle` | `CycleSettings` | [CycleSettings](#cyclesettings) |"} if "cycle" in found else found
+
+
+def section(title: str, lines: list[str], also: list[str]) -> str:
+    """Return a table, and the names of settings that stand in the common one."""
+    table = ["| setting | must be | default |", "|---|---|---|", *lines, ""] if lines else []
+    names = ", ".join(f"`{name}`" for name in also)
+    return "\n".join(["", f"## {title}", "", *table, *([(ALSO if lines else "") + names, ""] if also else [])]) if lines or also else ""
 
 
 def page() -> str:
     """Return the page."""
-    return HEAD + "".join(map(section, (wl.StoppingCriteria, wl.CycleSettings, *wl.METHODS.values(), wl.ProximalGaussSeidel)))
+    methods = {kind.__name__: rows(kind) for kind in (*wl.METHODS.values(), wl.ProximalGaussSeidel)}
+    count = Counter(line for found in methods.values() for line in found.values())
+    common = [line for line, times in count.items() if times >= COMMON]
+    names = Counter(line.split("`")[1] for line in common)
+    common = [line for line in common if names[line.split("`")[1]] == 1]  # a name has one default here
+    parts = [section(kind.__name__, list(rows(kind).values()), []) for kind in (wl.StoppingCriteria, wl.CycleSettings)]
+    parts.append(section("Common settings", common, []))
+    for title, found in methods.items():
+        own = [line for line in found.values() if line not in common]
+        parts.append(section(title, own, [name for name, line in found.items() if line in common]))
+    return HEAD + "".join(parts)
 
 
 if __name__ == "__main__":

@@ -2,56 +2,141 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from pathlib import Path
 from typing import Any
 
+from warp_lcp.granular.materials import MATERIALS
 from warp_lcp.scene.scene_file import installed_simulators
 
 PAGE = Path(__file__).parents[1] / "scenes.md"
-MATERIALS = {"fluids": "liquid", "granular": "sand", "contacts": "bodies alone"}
 SHAPES = ("box", "sphere", "capsule", "plane", "mesh")
+SHARED = ("scene", "time", "domain", "physics", "output", "camera")
+SAMPLED = ("particles", "particles.reseed", "particles.narrow_band", "density_correction")
+SELF_EVIDENT = ("scene", "time", "physics", "output", "particles", "solver", "pressure", "material", "friction")  # by their headings
+ELSEWHERE = "not for bodies alone"  # begins the description of a key that bodies alone inherit
+LONG_LISTS = {  # by a key's default
+    "vtu": "[formats](frames-and-films.md#other-formats)",
+    "projected-multigrid": "others: those with * in [methods](methods.md)",
+    "sweeps-and-newton": "[methods](bodies.md#without-a-material)",
+}
 Definition = dict[str, Any]
 
 HEAD = """# Scene files
 
 <!-- Written by docs/generate/scene_keys.py from `warp-lcp schema`; do not edit. -->
 
-A scene is a TOML file in SI units, with angles in degrees. y is up; a domain of two lengths is 2-D, the x-y plane. The
-[tutorial](tutorial.md) writes some from nothing; [liquids](liquids.md), [sand](sand.md) and [rigid bodies](bodies.md) say what models do;
-`warp-lcp check` says what is wrong with a scene; `warp-lcp schema` prints what this page says, for editors (of sand: `--simulator
-granular`).
+A scene is a TOML file, such as this `column.toml`:
 
-A key with a default may be left out. A key that no table has is refused, and the message names the nearest one. `--set table.key=value` on
-the command line overrides a key.
+```toml
+[scene]
+simulator = "fluids"     # or "granular", "contacts"
+
+[time]
+duration = 2.0
+
+[domain]
+size = [2.0, 1.0]        # two sides: the x-y plane
+resolution = 64
+
+[[liquid]]
+shape = "box"
+min = [0.0, 0.0]
+max = [0.5, 0.8]
+
+[[solid]]
+shape = "sphere"
+center = [1.3, 0.2]
+radius = 0.1
+```
+
+```sh
+warp-lcp check column.toml                     # errors, suspicious settings
+warp-lcp run column.toml --set time.cfl=1.0    # overrides a key
+warp-lcp schema                                # JSON, for editors
+```
+
+- Units are SI, angles are in degrees, y is up. Vectors have an entry per axis.
+- Keys are optional unless marked *required*. Unknown keys are refused; the message names the nearest key.
+
+The [tutorial](tutorial.md) builds scenes step by step. [Liquids](liquids.md), [sand](sand.md) and [rigid bodies](bodies.md)
+explain the models.
 """
 
-TIMES = """### When steps end
-
-Steps end exactly at frames. They end, too, where a source or drain starts or stops or a solid's velocity jumps, unless that is closer than
-a quarter of a step to the step's start or to a frame, or another such time follows within the step: the step then runs across it. What a
-source lets in is exact all the same, the flow has its velocity in the steps in whose middle it runs, and a drain acts at the end of each
-step in part of which it is open.
+STEPS = """Steps end exactly at frames. They also end where a source or drain starts or stops, or a solid's velocity jumps, unless
+that is within a quarter of a step of the step's start or of a frame, or another such time follows within the step. The inflow of a
+source is exact anyway.
 """
 
-PLACED = """Any shape may be moved from where its keys put it, in this order: `scale`, `rotate`, `translate`.
-
-**`rotate` turns about the origin**, the low corner of the domain, and not about the shape's center, unless `about` names another point:
-`about = [0.5, 0.2]` with `rotate = 30.0` turns a box around [0.5, 0.2] on the spot. So does `scale`. In 2-D `rotate` is one angle,
-counterclockwise; in 3-D it is three, about the fixed axes x, then y, then z, each counterclockwise seen from the axis's tip."""
-
-MOVING = """A moving solid has `motion = { kind = "...", ... }`, a function of time alone that starts from where the shape is placed. Angles
-are in degrees; those of `keyframes` are about the axes and in the order of [`rotate`](#placing-a-shape), but through `center`.
+DOMAIN = """Material may leave `separating` walls. It slides along `free-slip` walls and sticks to `sticky` ones, which need
+`[viscosity]`.
 """
 
-MESHES = """A mesh is a closed surface: what its triangles surround, counted by the winding number, is inside. `warp-lcp check` and the
-start of a run say what was put right, with the file, how many triangles and where the first is:
+MATERIAL = """## Material, sources and drains
 
-- vertices closer than a millionth of the mesh's size become one; repeated triangles and those without area are dropped;
-- triangles that disagree with their neighbors are turned, and so are parts that are inside out, but for the walls of hollows;
-- triangles that cross others, and parts inside other parts, stay: what is surrounded twice is inside. Such a mesh is no rigid body, since
-  what is there twice would weigh twice; and it is refused where more than 1 % of it is inside out, since that much would be missing.
+`[[liquid]]` and `[[sand]]` fill their [shape](#shapes) at the start. A `[[source]]` lets material in, a `[[drain]]` removes it.
+"""
 
-Open surfaces, surfaces with one side only and surfaces without a volume are refused."""
+PLACED = """### Placing a shape
+
+A shape is moved by `scale`, `rotate` and `translate`, in this order. 2-D angles are counterclockwise. In 3-D a shape is rotated about the
+fixed axes x, then y, then z.
+
+**`rotate` and `scale` are about the origin**, not about the shape's center, unless `about` gives another point.
+"""
+
+SHAPED = """## Shapes
+
+A shape has a `shape` and its keys, all of them required:
+"""
+
+MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside is where its winding number is positive. Open and
+one-sided surfaces are refused. `warp-lcp check` and `run` report repairs:
+
+- Vertices closer than a millionth of the mesh's size are merged. Repeated triangles and those without area are dropped.
+- Triangles that disagree with their neighbors are flipped, as are parts that are inside out, except walls of hollows.
+- Intersections and parts inside other parts stay. Such a mesh cannot be a rigid body. It is refused if more than 1 % is inside out.
+"""
+
+MOVING = """## Motions
+
+`motion = { kind = "...", ... }` prescribes the motion of a solid over time, from where its shape is placed. Angles of
+`keyframes` are in the order of [`rotate`](#placing-a-shape), about axes through `center`.
+"""
+
+BODIES = """## Rigid bodies
+
+A `[[solid]]` with `mass` or `density` is a [rigid body](bodies.md): gravity, the material and other bodies move it. It must start apart
+from walls and other solids. A 2-D mass is that of a meter of depth.
+"""
+
+LIQUID = """## Liquid
+
+`scene.simulator = "fluids"`. See [liquids](liquids.md).
+"""
+
+SAND = """## Sand
+
+`scene.simulator = "granular"`. See [sand](sand.md).
+"""
+
+CONTACTS = """## Bodies alone
+
+`scene.simulator = "contacts"`: walls, gravity and `[[solid]]`s, at least one of them a rigid body, see
+[bodies without a material](bodies.md#without-a-material). There are no presets, and no frames of particles, cells
+or surfaces.
+"""
+
+LIMITS = """## Limits
+
+- At most 8192 cells along an axis. Sides are whole numbers of cells.
+- A scene has one kind of sand, and its walls are `separating`. Liquids may differ in viscosity, not in density.
+- `narrow_band` and `output.forces` are for liquids only.
+- Periodic axes are for sand without rigid bodies, sources, drains, reseeding or `[density_correction]`.
+- A solid is moved by `motion` or is a rigid body, not both. Neither works with `solids = "voxel"`.
+- `name` has at most 60 letters, digits, `-`, `_`, `.` and spaces.
+"""
 
 
 def reference(prop: Definition) -> str | None:
@@ -66,74 +151,132 @@ def toml(value: Any) -> str:
     """Return a default as a scene file has it."""
     if isinstance(value, bool):
         return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else f"{value:g}" if isinstance(value, float) and abs(value) < 1e6 else str(value)
+    if isinstance(value, str):
+        return f'"{value}"'
+    return f"{value:g}" if isinstance(value, float) and abs(value) < 1e6 else str(value)
+
+
+def words(prop: Definition) -> list[str]:
+    """Return the words that a key may hold, itself or as entries of a list."""
+    parts = [prop, *prop.get("anyOf", ()), prop.get("items", {})]
+    return [word for part in parts for word in part.get("enum", ()) if isinstance(word, str)]
 
 
 def bounds(prop: Definition) -> str:
-    """Return the range of a number in words of mathematics, empty where there is none."""
-    low = f">= {prop['minimum']:g}" if "minimum" in prop else f"> {prop['exclusiveMinimum']:g}" if "exclusiveMinimum" in prop else ""
-    high = f"<= {prop['maximum']:g}" if "maximum" in prop else f"< {prop['exclusiveMaximum']:g}" if "exclusiveMaximum" in prop else ""
-    return ", ".join(part for part in (low, high) if part)
+    """Return the range of a number if it says more than a sign or a share."""
+    for part in (prop, *prop.get("anyOf", ())):
+        if "minimum" in part and "maximum" in part:
+            return f"{part['minimum']:g} to {part['maximum']:g}"
+        if part.get("minimum", 0) > 1:
+            return f">= {part['minimum']:g}"
+    return ""
 
 
-def values(prop: Definition) -> str:
-    """Return what a key may hold."""
-    if "anyOf" in prop:
-        return " or ".join(values(part) for part in prop["anyOf"] if part.get("type") != "null")
-    if "const" in prop:
-        return f"`{toml(prop['const'])}`"
-    if "enum" in prop:
-        return ", ".join(f"`{toml(name)}`" for name in prop["enum"])
-    if "discriminator" in prop:
-        return "a [motion](#motions)"
-    kind = prop.get("type")
-    if kind == "array":
-        least, most = prop.get("minItems", 0), prop.get("maxItems")
-        count = "" if most is None else f"{least} " if least == most else f"{least} or {most} "
-        inner = prop.get("items", {})
-        return f"list of {count}{plural(inner)}"
-    words = {"number": "number", "integer": "integer", "boolean": "`true`, `false`", "string": "text"}
-    return " ".join(part for part in (words[str(kind)], bounds(prop)) if part)
+def default_of(name: str, prop: Definition, required: bool) -> str:
+    """Return the cell of a key's default."""
+    default = prop.get("description", "").partition("; default: ")[2]
+    if prop.get("default") not in (None, ""):
+        return f"`{toml(prop['default'])}`"
+    if default == "by name":
+        first, *rest = MATERIALS
+        return "; ".join([f"`{getattr(MATERIALS[first], name):g}`", *(f"{other} `{getattr(MATERIALS[other], name):g}`" for other in rest)])
+    return f"`{default}`" if re.fullmatch(r"[a-z_]+\.[a-z_]+|\d+", default) else default or "required" * required
 
 
-def plural(inner: Definition) -> str:
-    """Return what a list holds."""
-    if inner.get("type") in ("number", "integer"):
-        return " ".join(part for part in ("numbers", bounds(inner)) if part)
-    if inner.get("type") == "array":
-        return "vectors"
-    return f"({values(inner)})" if inner else "values"
+def beyond(text: str, base: str) -> str:
+    """Return a text without the words that it begins with as `base` does."""
+    own, other = text.split(), base.split()
+    alike = itertools.takewhile(lambda pair: pair[0].strip(";") == pair[1].strip(";"), zip(own, other, strict=False))
+    same = len(list(alike))
+    return " ".join(own[same:])
 
 
-def row(name: str, prop: Definition, required: bool) -> str:
-    """Return a key's line of a table."""
-    said = prop.get("description", "")
-    default = toml(prop["default"]) if prop.get("default") is not None else ""
-    shown = f"`{default}`" if default else "required" if required and "unless given" not in said else "-"
-    return f"| `{name}` | {said} | {values(prop)} | {shown} |"
+def described(prop: Definition) -> str:
+    """Return a key's description without its default."""
+    return str(prop["description"]).partition("; default: ")[0]
 
 
-def table(definition: Definition, leave_out: frozenset[str] = frozenset()) -> str:
-    """Return the keys of a definition as a Markdown table, empty if it has none."""
-    required = definition.get("required", ())
-    rows = [
-        row(name, prop, name in required)
-        for name, prop in definition["properties"].items()
-        if name not in leave_out and reference(prop) is None
-    ]
-    return "\n".join(["| key | meaning | values | default |", "|---|---|---|---|", *rows]) + "\n" if rows else ""
+def meaning_of(prop: Definition) -> str:
+    """Return what a key means and which words it may hold."""
+    meaning, allowed = described(prop), words(prop)
+    if len(allowed) > 6:
+        return f"{meaning}; {LONG_LISTS[prop['default']]}"
+    if any(word not in meaning for word in allowed) and not meaning.endswith(" only"):
+        return f"{meaning}: " + ", ".join(f"`{word}`" for word in allowed)
+    return ", ".join(part for part in (meaning, bounds(prop)) if part)
 
 
-def said_of(definition: Definition) -> str:
-    """Return a definition's sentence, without the name of its table."""
+def row(name: str, prop: Definition, required: bool, others: dict[str, Definition] | None = None) -> str:
+    """Return a key's line of a table.
+
+    Args:
+        name: of the key.
+        prop: of the schema.
+        required: whether it must be given.
+        others: the key's properties in scenes of other materials, by their names.
+    """
+    meaning, default = meaning_of(prop), default_of(name, prop, required)
+    for material, other in (others or {}).items():
+        if not other["description"].startswith(ELSEWHERE):
+            own, value = beyond(described(other), described(prop)), default_of(name, other, required)
+            meaning += f"; {material}: {own}" if own else ""
+            default += f"{', ' * bool(default)}{material} {value}" if value and value != default else ""
+    return f"| `{name}` | {meaning} | {default} |"
+
+
+def table(definition: Definition, leave_out: frozenset[str] = frozenset(), others: dict[str, Definition] | None = None) -> str:
+    """Return the keys of a definition as a Markdown table, empty if it has none.
+
+    Args:
+        definition: of the schema.
+        leave_out: keys that other tables have.
+        others: the same table in scenes of other materials, by their names.
+    """
+    required, rows = definition.get("required", ()), []
+    properties = {material: other["properties"] for material, other in (others or {}).items()}
+    for name, prop in definition["properties"].items():
+        if name not in leave_out and reference(prop) is None and not prop["description"].startswith(ELSEWHERE):
+            differing = {material: keys[name] for material, keys in properties.items() if keys[name] != prop}
+            rows.append(row(name, prop, name in required, differing))
+    for material, keys in properties.items():
+        own = {name: prop for name, prop in keys.items() if name not in definition["properties"]}
+        rows += [row(name, {**prop, "description": f"{material}: {prop['description']}"}, False) for name, prop in own.items()]
+    return "\n".join(["| key | meaning | default |", "|---|---|---|", *rows]) + "\n" if rows else ""
+
+
+def variant_table(kinds: dict[str, Definition], column: str, leave_out: frozenset[str], *, defaults: bool = True) -> str:
+    """Return the keys of tables that come in several kinds as one Markdown table.
+
+    Args:
+        kinds: the definitions by kind.
+        column: head of the column of kinds.
+        leave_out: keys that other tables have.
+        defaults: whether there is a column of defaults.
+    """
+    rows: dict[tuple[str, str, str], list[str]] = {}
+    for kind, definition in kinds.items():
+        for name, prop in definition["properties"].items():
+            if name not in leave_out:
+                cells = (name, meaning_of(prop), default_of(name, prop, name in definition.get("required", ())))
+                rows.setdefault(cells, []).append(kind)
+    last = [f" {default} |" * defaults for _, _, default in rows]
+    lines = [f"| `{name}` | {', '.join(of)} | {meaning} |" for (name, meaning, _), of in rows.items()]
+    head = [f"| key | {column} | meaning |" + " default |" * defaults, "|---|---|---|" + "---|" * defaults]
+    return "\n".join([*head, *(line + cell for line, cell in zip(lines, last, strict=True))]) + "\n"
+
+
+def summary(definition: Definition) -> str:
+    """Return a definition's description, without the name of its table."""
     text = definition["description"].split("]: ", 1)[-1]
-    text = text.split("], ", 1)[-1] if text.startswith("[") else text
     return text[0].upper() + text[1:]
 
 
-def section(level: int, name: str, definition: Definition) -> str:
-    """Return the section of a table."""
-    return f"{'#' * level} [{name}]\n\n{said_of(definition)}\n\n{table(definition)}"
+def section(name: str, definition: Definition, others: dict[str, Definition] | None = None) -> str:
+    """Return the section of a table, see `table`."""
+    text = summary(definition)
+    told = text.partition("\n\n")[2] if name in SELF_EVIDENT else text
+    told += "\n\n" if told else ""
+    return f"### [{name}]\n\n{told}{table(definition, others=others)}"
 
 
 def tables_of(schema: Definition) -> dict[str, Definition]:
@@ -154,11 +297,6 @@ def shapes_of(schema: Definition, name: str) -> dict[str, Definition]:
     return {shape: schema["$defs"][mapping[shape].rsplit("/", 1)[1]] for shape in SHAPES}
 
 
-def arrays_of(schema: Definition) -> list[str]:
-    """Return the arrays of shapes of a simulator's scenes."""
-    return [name for name, prop in schema["properties"].items() if "discriminator" in prop.get("items", {})]
-
-
 def lists_of(schema: Definition) -> dict[str, Definition]:
     """Return the arrays of tables of a simulator's scenes, but for shapes, by name."""
     entries = {name: reference(prop.get("items", {})) for name, prop in schema["properties"].items()}
@@ -166,82 +304,49 @@ def lists_of(schema: Definition) -> dict[str, Definition]:
 
 
 def shape_section(schema: Definition) -> str:
-    """Return what says where a shape lies, whatever it is made of."""
+    """Return the keys that place a shape."""
     drains = shapes_of(schema, "drain")
     common = {key for key in drains["box"]["properties"] if all(key in other["properties"] for other in drains.values())}
-    timed = frozenset({"start", "stop", "shape"})
-    own = []
-    for shape, definition in drains.items():
-        kept = frozenset(common | timed)
-        own.append(f'### shape = "{shape}"\n\n{table(definition, kept)}' + (f"\n{MESHES}\n" if shape == "mesh" else ""))
-    everywhere = {**drains["box"], "properties": {key: prop for key, prop in drains["box"]["properties"].items() if key in common - timed}}
-    return "\n".join(
-        ["## Shapes\n", "A `[[liquid]]`, `[[sand]]`, `[[solid]]`, `[[source]]` or `[[drain]]` is a shape: `shape` and its keys.\n", *own]
-    ) + (f"\n### Placing a shape\n\n{PLACED}\n\n{table(everywhere)}")
+    placing = common - {"start", "stop", "shape"}
+    placed = {**drains["box"], "properties": {key: prop for key, prop in drains["box"]["properties"].items() if key in placing}}
+    return "\n".join([SHAPED, variant_table(drains, "`shape`", frozenset(common), defaults=False), MESHES, PLACED, table(placed)])
 
 
 def motion_section(schema: Definition) -> str:
     """Return the kinds of motion."""
-    parts = ["## Motions\n", MOVING]
-    for name, definition in schema["$defs"].items():
-        if name.endswith("Motion"):
-            kind = definition["properties"]["kind"]["const"]
-            parts.append(f'### kind = "{kind}"\n\n{said_of(definition)}\n\n{table(definition, frozenset({"kind"}))}')
-    return "\n".join(parts)
+    kinds = {part["properties"]["kind"]["const"]: part for name, part in schema["$defs"].items() if name.endswith("Motion")}
+    lines = [f"- `{kind}`: {summary(definition)[0].lower()}{summary(definition)[1:]}" for kind, definition in kinds.items()]
+    return "\n".join([MOVING, *lines, "", variant_table(kinds, "`kind`", frozenset({"kind"}))])
 
 
-BODIES = """## Rigid bodies
-
-A `[[solid]]` with `mass` or `density` is a rigid body: gravity, the material and other bodies move it. Its shape is filled evenly; 2-D
-masses are those of a meter of depth, and a mesh is its cut by z = 0. It starts where its shape is placed, apart from the domain's walls
-and other solids.
-
-Bodies touch the domain's walls, where it has some, solids that stand or have a `motion`, and each other. Coulomb's coefficient is the
-body's `friction`; of two bodies it is the geometric mean, and the greater `restitution` counts. They cannot cross the sides of periodic
-axes.
-
-The log has the place, velocity and turn of each body, numbered from 0 in the order of the solids: `body0_x`, `body0_vx`, in 2-D
-`body0_angle` and `body0_spin` (degrees, degrees/s), in 3-D `body0_wx` and so on (degrees/s). Frames have their surfaces, `bodies.pvd`.
-"""
-
-
-BODIES_ALONE = """`scene.simulator = "contacts"`. Walls, gravity and [[solid]]s, at least one with `density` or `mass`, as in a liquid; see
-[bodies without a material](bodies.md#without-a-material).
-"""
-
-
-def array_section(schema: Definition, name: str) -> str:
-    """Return the keys of an array besides those of its shape."""
-    definition = shapes_of(schema, name)["box"]
-    of_shape = frozenset(shapes_of(schema, "drain")["box"]["properties"]) - {"start", "stop"}
-    rows = table(definition, of_shape)
-    return f"### [[{name}]]\n\nA [shape](#shapes), and:\n\n{rows}" if rows else f"### [[{name}]]\n\nA [shape](#shapes).\n"
+def material_section(liquid: Definition, sand: Definition) -> str:
+    """Return the keys of material, sources and drains besides those of the shape."""
+    of_shape = frozenset(shapes_of(liquid, "drain")["box"]["properties"]) - {"start", "stop"}
+    arrays = {"liquid": liquid, "sand": sand, "source": liquid, "drain": liquid}
+    kinds = {name: shapes_of(schema, name)["box"] for name, schema in arrays.items()}
+    return f"{MATERIAL}\n{variant_table(kinds, 'of', of_shape)}"
 
 
 def page() -> str:
     """Return the page."""
     installed = installed_simulators()
-    schemas = {name: installed[name].scene_model.model_json_schema(by_alias=True) for name in MATERIALS}
-    first, second, _ = schemas.values()
-    tables = {name: tables_of(schema) for name, schema in schemas.items()}
-    shared = [name for name, definition in tables["fluids"].items() if tables["granular"].get(name) == definition]
-    parts = [HEAD, "## Every scene\n", *(section(3, name, tables["fluids"][name]) for name in shared)]
-    alike = [name for name in arrays_of(first) if name in arrays_of(second) and shapes_of(first, name) == shapes_of(second, name)]
-    parts += [array_section(first, name) for name in alike]
-    parts += [TIMES, shape_section(first), motion_section(first), BODIES]
-    for simulator, material in MATERIALS.items():
-        schema = schemas[simulator]
-        if simulator == "contacts":  # the same [[solid]] as in liquids, and some of the tables
-            own = {name: definition for name, definition in tables[simulator].items() if tables["fluids"].get(name) != definition}
-            parts.append(f"## {material.capitalize()}\n\n{BODIES_ALONE}")
-            parts += [section(3, name, definition) for name, definition in own.items()]
-            parts += [section(3, f"[{name}]", definition) for name, definition in lists_of(schema).items()]
-            continue
-        parts.append(f'## {material.capitalize()}\n\n`scene.simulator = "{simulator}"`.\n')
-        parts += [section(3, name, definition) for name, definition in tables[simulator].items() if name not in shared]
-        parts += [section(3, f"[{name}]", definition) for name, definition in lists_of(schema).items()]
-        parts += [array_section(schema, name) for name in arrays_of(schema) if name not in alike]
-    return "\n".join(parts).rstrip() + "\n"
+    liquid, sand, alone = (installed[name].scene_model.model_json_schema(by_alias=True) for name in ("fluids", "granular", "contacts"))
+    tables, of_sand, of_bodies = tables_of(liquid), tables_of(sand), tables_of(alone)
+    notes = {"time": [STEPS], "domain": [DOMAIN]}
+    parts = [HEAD, "## Every scene\n"]
+    for name in SHARED:
+        others = {"sand": of_sand[name], "bodies alone": of_bodies[name]}
+        parts += [section(name, tables[name], others), *notes.get(name, [])]
+    of_shape = frozenset(shapes_of(liquid, "drain")["box"]["properties"])
+    parts += [shape_section(liquid), material_section(liquid, sand), "## Solids\n\nA `[[solid]]` has a [shape](#shapes) and:\n"]
+    parts += [table(shapes_of(liquid, "solid")["box"], of_shape), motion_section(liquid), BODIES]
+    parts += ["## Particles\n", "Of liquids and sand.\n", *(section(name, tables[name]) for name in SAMPLED), LIQUID]
+    parts += [section(name, definition) for name, definition in tables.items() if name not in (*SHARED, *SAMPLED)]
+    parts += [*(section(f"[{name}]", definition) for name, definition in lists_of(liquid).items()), SAND]
+    parts += [section(name, definition) for name, definition in of_sand.items() if name not in (*SHARED, *SAMPLED)]
+    parts += [CONTACTS, section("solver", of_bodies["solver"])]
+    parts += [section(f"[{name}]", definition) for name, definition in lists_of(alone).items()]
+    return "\n".join([*parts, LIMITS]).rstrip() + "\n"
 
 
 if __name__ == "__main__":

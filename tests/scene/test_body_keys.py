@@ -46,8 +46,8 @@ def made(*solids: dict[str, Any], **more: Any) -> Any:
     ("keys", "message"),
     [
         ({"mass": 1.0, "density": 500.0}, "solid[0].density = 500.0: goes without mass: give one of them"),
-        ({"mass": 0.0}, "solid[0].mass = 0.0: must be at least 1e-18 (makes it a rigid body that the material moves [kg; kg/m in 2-D])"),
-        ({"density": -1.0}, "solid[0].density = -1.0: must be at least 1e-18 (in place of mass: of the solid, filled evenly [kg/m^3])"),
+        ({"mass": 0.0}, "solid[0].mass = 0.0: must be at least 1e-18 (mass of a rigid body [kg; kg/m in 2-D])"),
+        ({"density": -1.0}, "solid[0].density = -1.0: must be at least 1e-18 (density of a rigid body, instead of mass [kg/m^3])"),
         (
             {"mass": 1.0, "motion": {"kind": "translation", "velocity": [1.0, 0.0]}},
             "solid[0].motion: goes without mass: a rigid body moves as forces ask",

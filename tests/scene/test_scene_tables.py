@@ -54,8 +54,8 @@ def test_frame_times_end_with_the_run():
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"time.cfl": 0}, "time.cfl = 0: must be at least 0.001 (a Courant number, usually 1 to 4)"),
-        ({"time.duration": math.nan}, "time.duration = NaN: must be finite (the simulated time [s])"),
+        ({"time.cfl": 0}, "time.cfl = 0: must be at least 0.001 (Courant number, usually 1 to 4)"),
+        ({"time.duration": math.nan}, "time.duration = NaN: must be finite (simulated time [s])"),
         ({"time.dt_max": math.inf}, "time.dt_max = Infinity: must be finite"),
         ({"time.duration": "2"}, 'time.duration = "2": must be a number'),
         ({"time.duration": True}, "time.duration = true: must be a number"),
@@ -127,8 +127,8 @@ def test_all_errors_are_listed():
         ({**BOX, "max": [0.4, 0.4, 0.4]}, "solid[0].max = [0.4, 0.4, 0.4]: must have 2 entries in 2-D"),
         ({**BOX, "rotate": [0.0, 90.0, 0.0]}, "solid[0].rotate = [0.0, 90.0, 0.0]: must be one number in 2-D"),
         ({**BOX, "scale": 0}, "solid[0].scale = 0: must be greater than 0"),
-        ({"shape": "sphere", "center": [0, 0], "radius": -1}, "solid[0].radius = -1: must be greater than 0 (a length [m])"),
-        ({"shape": "capsule", "from": [0, 0], "radius": 1}, "solid[0].to: is missing (the other end of the axis [m])"),
+        ({"shape": "sphere", "center": [0, 0], "radius": -1}, "solid[0].radius = -1: must be greater than 0 (radius [m])"),
+        ({"shape": "capsule", "from": [0, 0], "radius": 1}, "solid[0].to: is missing (end of the axis [m])"),
         ({"shape": "capsule", "from": [0, 0], "to": [0, 0], "radius": 1}, 'solid[0].to = [0.0, 0.0]: must differ from "from"'),
         ({"shape": "plane", "point": [0, 0], "normal": [0, 0]}, "solid[0].normal = [0.0, 0.0]: must not be zero"),
     ],

@@ -21,55 +21,51 @@ NO_MATERIAL = "there is no material: bodies are all that moves"
 
 
 class ContactDomain(Domain):
-    """[domain]: the box whose walls bodies stand on and lean against. There is no grid."""
+    """[domain]: the box; there is no grid."""
 
-    resolution: int = Field(
-        default=64, ge=2, le=MOST_CELLS, description="of pictures, parts of the longest side: bodies alone have no grid"
-    )
+    resolution: int = Field(default=64, ge=2, le=MOST_CELLS, description="resolution of pictures")
 
 
 class ContactSolver(Table):
-    """[solver]: the method for the impulses of contacts, and how far it goes."""
+    """[solver]: solution for the contact impulses."""
 
     preset: PresetName | None = Field(default=None, description="not for bodies alone")
     method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE] = Field(
         default=DEFAULT,
-        description="sweeps-and-newton is that of bodies in liquids; of the others those from nncg to staggering take friction in boxes, "
-        "those from lemke on the model of Stewart and Trinkle, proximal-gauss-seidel has the circular cone itself; "
-        f"with joints {JOINTED}, unless given, and neither {DEFAULT} nor {', '.join(CONE)}",
+        description="sweeps-and-newton: as for bodies in liquids; from lemke on: friction model of Stewart and Trinkle; "
+        f"proximal-gauss-seidel: circular cone; others: boxes; with joints {JOINTED}, unless given",
     )
-    directions: int = Field(default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle, in 3-D")
-    tolerance: Share = Field(default=1e-5, description="the residual to reach, relative to that of no impulses")
-    max_iterations: Count = Field(default=600, description="iterations after which a step takes the impulses as they are")
-    precision: PrecisionName = Field(default="double", description="impulses are computed in double precision")
+    directions: int = Field(
+        default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle in 3-D, even"
+    )
+    tolerance: Share = Field(default=1e-5, description="residual, relative to that of no impulses")
+    max_iterations: Count = Field(default=600, description="iterations before a step accepts the impulses as they are")
+    precision: PrecisionName = Field(default="double", description="double only")
 
 
 class ContactOutput(Output):
-    """[output]: what the run's folder gets besides the surfaces of the bodies."""
+    """[output]: files besides the surfaces of the bodies."""
 
-    particles: bool = Field(default=False, description="there are none")
-    grid: bool = Field(default=False, description="there is none")
+    particles: bool = Field(default=False, description="not for bodies alone")
+    grid: bool = Field(default=False, description="not for bodies alone")
 
 
 class JointTable(Table):
-    """[[joint]]: what holds two bodies together at a point, or a body in space. Bodies of a joint do not collide."""
+    """[[joint]]: connects two bodies at a point, or a body with space. Bodies of a joint do not collide."""
 
-    kind: JointKind = Field(description="a ball lets them turn about the anchor, a hinge about an axis through it, fixed not at all")
+    kind: JointKind = Field(description="ball: rotation about the anchor; hinge: rotation about an axis through it; fixed: no rotation")
     solids: list[int] = Field(
         min_length=1,
         max_length=2,
-        description="a rigid body by its number among the [[solid]]s, from 0, and another or what stands; one: in space",
+        description="numbers of [[solid]] tables from 0: a rigid body, and a body or standing solid; one number: in space",
     )
-    anchor: Vector = Field(description="the point where they are held, as they are placed [m]")
-    axis: Vector | None = Field(default=None, description="of a hinge in 3-D; z in 2-D")
+    anchor: Vector = Field(description="anchor in the initial pose [m]")
+    axis: Vector | None = Field(default=None, description="axis of a hinge in 3-D; z in 2-D")
     limits: list[float] | None = Field(
-        default=None,
-        min_length=2,
-        max_length=2,
-        description="of a hinge: least and largest angle of one to the other, 0 as placed [degrees]",
+        default=None, min_length=2, max_length=2, description="least and largest angle of a hinge, 0 in the initial pose [degrees]"
     )
-    motor_speed: float | None = Field(default=None, description="of a hinge: what its motor wants [degrees/s]")
-    motor_torque: Positive | None = Field(default=None, description="the most that the motor does [N m]")
+    motor_speed: float | None = Field(default=None, description="speed that the motor of a hinge aims at [degrees/s]")
+    motor_torque: Positive | None = Field(default=None, description="largest torque of the motor [N m]")
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
         """Return what is wrong with the joint among these solids in a scene of 2 or 3 dimensions."""
@@ -112,15 +108,15 @@ class JointTable(Table):
 
 
 class TargetTable(Table):
-    """[[target]]: where a point of a body is to be. With targets inverse kinematics moves the bodies: no forces, no contacts.
+    """[[target]]: path of a point of a body. Inverse kinematics moves the bodies, without forces and contacts.
 
     Each body needs a hinge in which it comes first; hinges form trees that hang on what stands.
     """
 
-    solid: int = Field(ge=0, description="the rigid body, by its number among the [[solid]]s, from 0")
-    point: Vector = Field(description="of the body, as placed [m]")
+    solid: int = Field(ge=0, description="number of the rigid body among the [[solid]] tables, from 0")
+    point: Vector = Field(description="point of the body in its initial pose [m]")
     times: list[float] = Field(min_length=1, description="increasing [s]")
-    places: list[Vector] = Field(min_length=1, description="where the point is to be at those times, on straight ways between them [m]")
+    places: list[Vector] = Field(min_length=1, description="places of the point at these times, on straight lines between them [m]")
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
         """Return what is wrong with the target among these solids in a scene of 2 or 3 dimensions."""

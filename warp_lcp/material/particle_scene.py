@@ -40,27 +40,27 @@ LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen 
 
 
 class Reseed(Table):
-    """[particles.reseed]: evens out particles deep in the material; off unless the table is there."""
+    """[particles.reseed]: reseeding inside the material; off without the table."""
 
-    every: Count = Field(default=2, description="steps from one time to the next")
-    min: Count | None = Field(default=None, description="particles in a cell, fewer are filled up; 3/8 of those at rest unless given")
-    max: Count | None = Field(default=None, description="particles in a cell, more are handed on; twice those at rest unless given")
+    every: Count = Field(default=2, description="steps between reseedings")
+    min: Count | None = Field(default=None, description="fewest particles of a cell; default: 3/8 of those at rest")
+    max: Count | None = Field(default=None, description="most particles of a cell; default: twice those at rest")
 
 
 class NarrowBandSettings(Table):
-    """[particles.narrow_band]: particles, in frames too, near the surface only, the grid carries what lies deeper; off unless there."""
+    """[particles.narrow_band]: particles, in frames too, only near the surface; off without the table."""
 
     width: float = Field(default=4.0, ge=3, description="cells below the surface that hold particles")
 
 
 class ParticleSettings(Table):
-    """[particles]: how the material is sampled and how its velocity moves between particles and grid."""
+    """[particles]: sampling of the material, transfers between particles and grid."""
 
-    per_axis: int = Field(default=2, ge=1, le=4, description="particles along the edge of a cell at the start")
-    transfer: Literal["apic", "flip", "pic"] = Field(default="apic", description="flip is livelier and noisier, pic damps")
-    flip_ratio: Part = Field(default=0.95, description="the share of FLIP when transfer is flip; the rest is PIC")
-    jitter: Part = Field(default=0.25, description="random displacement at the start, a fraction of the particles' distance")
-    seed: CountOrZero = Field(default=2015, description="of the random displacements")
+    per_axis: int = Field(default=2, ge=1, le=4, description="particles per cell edge at the start")
+    transfer: Literal["apic", "flip", "pic"] = Field(default="apic", description="transfer; flip is livelier and noisier, pic damps")
+    flip_ratio: Part = Field(default=0.95, description="share of FLIP with transfer flip; the rest is PIC")
+    jitter: Part = Field(default=0.25, description="random displacement at the start [particle distances]")
+    seed: CountOrZero = Field(default=2015, description="seed of the random displacements")
     reseed: Reseed | None = None
     narrow_band: NarrowBandSettings | None = None
 
@@ -71,12 +71,12 @@ class ParticleSettings(Table):
 
 
 class DensityCorrectionSettings(Table):
-    """[density_correction]: moves particles apart that have come too close; without the table as soon as a thousandth crowds."""
+    """[density_correction]: moves particles apart in cells that are too dense; without the table, once about 0.1 % of a liquid is."""
 
-    every: CountOrZero = Field(default=1, description="steps from one correction to the next; 0 switches it off")
-    tolerance: Share = Field(default=1e-2, description="the relative residual to reach")
+    every: CountOrZero = Field(default=1, description="steps between corrections; 0: off")
+    tolerance: Share = Field(default=1e-2, description="relative residual")
     max_density: float | None = Field(
-        default=None, gt=0, le=2, description="of a cell, in units of the density at rest; 1 + 0.1 / particles.per_axis unless given"
+        default=None, gt=0, le=2, description="largest density of a cell [density at rest]; default: 1 + 0.1 / particles.per_axis"
     )
 
     def largest(self, per_axis: int) -> float:

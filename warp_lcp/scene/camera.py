@@ -22,22 +22,16 @@ ROOM_KEYS, WINDOW_KEYS = ("position", "look_at", "up", "field_of_view"), ("low",
 
 
 class Camera(Table):
-    """[camera]: what images show; all of the domain unless given."""
+    """[camera]: view of images; default: the whole domain."""
 
-    position: Vector | None = Field(default=None, description="where the camera is [m], 3-D; where it sees all of the domain unless given")
-    look_at: Vector | None = Field(
-        default=None, description="the point in the middle of an image [m], 3-D; the domain's middle unless given"
-    )
-    up: Vector | None = Field(default=None, description="what is up in an image, 3-D; y unless given")
+    position: Vector | None = Field(default=None, description="position [m], 3-D; default: a view of the whole domain")
+    look_at: Vector | None = Field(default=None, description="center of the image [m], 3-D; default: the domain's center")
+    up: Vector | None = Field(default=None, description="up direction of the image, 3-D; default: y")
     field_of_view: float | None = Field(
-        default=None, ge=1, le=120, description=f"degrees over the height of an image, 3-D; {VIEW_ANGLE:g} unless given"
+        default=None, ge=1, le=120, description=f"vertical field of view [degrees], 3-D; default: {VIEW_ANGLE:g}"
     )
-    low: Vector | None = Field(
-        default=None, alias="min", description="the low corner of what images show [m], 2-D; the domain's unless given"
-    )
-    high: Vector | None = Field(
-        default=None, alias="max", description="the high corner of what images show [m], 2-D; the domain's unless given"
-    )
+    low: Vector | None = Field(default=None, alias="min", description="lower corner of the image [m], 2-D; default: the domain's")
+    high: Vector | None = Field(default=None, alias="max", description="upper corner of the image [m], 2-D; default: the domain's")
 
     def complaints(self, dimension: int, size: list[float]) -> list[Complaint]:
         """Return what is wrong with the camera in a domain of two or three sides [m]."""

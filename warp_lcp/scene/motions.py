@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from warp_lcp.grid import motion
 
 Axis = Annotated[list[float], Field(min_length=3, max_length=3)]
-CENTER = "a point of the axis [m]"
-AXIS = "the direction of the axis, in 3-D; 2-D solids turn about z"
+CENTER = "point of the axis [m]"
+AXIS = "direction of the axis, 3-D only"
 
 
 class PrescribedMotion(Table):
@@ -54,12 +54,12 @@ class PrescribedMotion(Table):
 
 
 class TranslationMotion(PrescribedMotion):
-    """A constant velocity between two times."""
+    """Constant velocity between two times."""
 
     kind: Literal["translation"] = "translation"
-    velocity: Vector = Field(description="[m/s]")
-    start: float = Field(default=0.0, description="when it sets off [s]")
-    stop: float | None = Field(default=None, description="when it comes to rest [s], later than start; never unless given")
+    velocity: Vector = Field(description="velocity [m/s]")
+    start: float = Field(default=0.0, description="start time [s]")
+    stop: float | None = Field(default=None, description="end time [s]; default: never")
 
     def to_motion(self, dimension: int) -> motion.Motion:
         """Return the shift over time."""
@@ -69,14 +69,14 @@ class TranslationMotion(PrescribedMotion):
 
 
 class RotationMotion(PrescribedMotion):
-    """A constant rate of turn about a fixed axis between two times."""
+    """Constant angular velocity about a fixed axis between two times."""
 
     kind: Literal["rotation"] = "rotation"
-    rate: float = Field(description="[degrees/s], counterclockwise seen from the axis's tip")
+    rate: float = Field(description="angular velocity [degrees/s], counterclockwise about the axis")
     center: Vector = Field(description=CENTER)
     axis: Axis | None = Field(default=None, description=AXIS)
-    start: float = Field(default=0.0, description="when it sets off [s]")
-    stop: float | None = Field(default=None, description="when it comes to rest [s], later than start; never unless given")
+    start: float = Field(default=0.0, description="start time [s]")
+    stop: float | None = Field(default=None, description="end time [s]; default: never")
 
     def to_motion(self, dimension: int) -> motion.Motion:
         """Return the turn over time."""
@@ -91,13 +91,13 @@ class RotationMotion(PrescribedMotion):
 
 
 class SinusoidMotion(PrescribedMotion):
-    """A swing of sin(360 degrees time / period + phase) times a shift, an angle or both."""
+    """Translation, rotation or both, times sin(360 degrees time / period + phase)."""
 
     kind: Literal["sinusoid"] = "sinusoid"
-    period: Positive = Field(description="[s]")
-    amplitude: Vector | None = Field(default=None, description="of the shift, along each axis [m]")
-    phase: float = Field(default=0.0, description="[degrees, not radians]; 0: in the middle at time 0, -90: at rest at one end")
-    angle: float | None = Field(default=None, description="amplitude of the turn [degrees]")
+    period: Positive = Field(description="period [s]")
+    amplitude: Vector | None = Field(default=None, description="amplitude of the translation along each axis [m]")
+    phase: float = Field(default=0.0, description="phase [degrees]; 0: in the middle at time 0, -90: at rest at one end")
+    angle: float | None = Field(default=None, description="amplitude of the rotation [degrees]")
     center: Vector | None = Field(default=None, description=CENTER)
     axis: Axis | None = Field(default=None, description=AXIS)
 
@@ -127,16 +127,14 @@ class SinusoidMotion(PrescribedMotion):
 
 
 class KeyframesMotion(PrescribedMotion):
-    """Places at given times; at rest before the first and after the last."""
+    """Poses at given times; at rest before the first and after the last."""
 
     kind: Literal["keyframes"] = "keyframes"
-    times: list[float] = Field(min_length=2, description="increasing [s]")
-    translate: list[Vector] | None = Field(default=None, description="a shift at each time [m]")
-    rotate: list[Angles] | None = Field(default=None, description="degrees at each time: one angle in 2-D, [x, y, z] in 3-D")
-    center: Vector | None = Field(default=None, description="the point that turns leave where it is [m]")
-    interpolation: Literal["linear", "smooth"] = Field(
-        default="linear", description="smooth: at rest at the ends, and no jumps of velocity"
-    )
+    times: list[float] = Field(min_length=2, description="increasing times [s]")
+    translate: list[Vector] | None = Field(default=None, description="translation at each time [m]")
+    rotate: list[Angles] | None = Field(default=None, description="rotation at each time [degrees]: one angle in 2-D, [x, y, z] in 3-D")
+    center: Vector | None = Field(default=None, description="fixed point of the rotation [m]")
+    interpolation: Literal["linear", "smooth"] = Field(default="linear", description="smooth: at rest at the ends, no jumps of velocity")
 
     def to_motion(self, dimension: int) -> motion.Motion:
         """Return shift and turn over time."""

@@ -41,7 +41,7 @@ def _tolerance(value: Any) -> Any:
 
 Tolerance = Annotated[Share | Literal["auto"], BeforeValidator(_tolerance, json_schema_input_type=Share | Literal["auto"])]
 
-PRESET_KEY = "sets time step, tolerance and more, where the scene does not; none unless given"
+PRESET_KEY = "defaults of time step, tolerance and others by accuracy"
 
 LONGEST_NAME = 60  # characters; file systems take 255 bytes, and a letter has up to four
 NAME_RULE = f'must be a name of at most {LONGEST_NAME} letters, digits, "-", "_", "." and spaces, without a dot or space at its ends'
@@ -63,21 +63,21 @@ def file_name(text: str) -> str:
 
 
 class About(Table):
-    """[scene]: what the file is."""
+    """[scene]: simulator, name and description."""
 
-    simulator: str = Field(description="the plug-in that runs the scene, such as fluids")
-    name: Annotated[str, AfterValidator(_name)] = Field(default="", description="a short name; the file's unless given")
-    description: str = Field(default="", description="a sentence about what there is to see")
+    simulator: str = Field(description="fluids, granular, contacts or another plug-in")
+    name: Annotated[str, AfterValidator(_name)] = Field(default="", description="short name; default: the file's")
+    description: str = Field(default="", description="sentence about the scene")
 
 
 class Time(Table):
-    """[time]: how long, how often to look, how large the steps may be."""
+    """[time]: duration, frames and steps."""
 
-    duration: Positive = Field(description="the simulated time [s]")
+    duration: Positive = Field(description="simulated time [s]")
     frames_per_second: Positive = Field(default=30.0, description="frames per simulated second [1/s]")
-    cfl: float = Field(default=2.0, ge=1e-3, description="a Courant number, usually 1 to 4")
-    dt_max: Positive = Field(default=0.02, description="the longest step [s]")
-    dt_min: Positive = Field(default=1e-6, description="the shortest step that the CFL number or a retry may ask for [s]")
+    cfl: float = Field(default=2.0, ge=1e-3, description="Courant number, usually 1 to 4")
+    dt_max: Positive = Field(default=0.02, description="longest step [s]")
+    dt_min: Positive = Field(default=1e-6, description="shortest step from cfl or retries [s]")
 
     @property
     def frame_count(self) -> int:
@@ -90,31 +90,20 @@ class Time(Table):
 
 
 class Domain(Table):
-    """[domain]: the box that everything happens in, and its grid.
-
-    A domain of cells of a `spacing` has no far ends: right, top and front are open, and nothing gets there.
-    """
+    """[domain]: a box from the origin, and its grid. With `spacing`, the domain has no far ends: right, top and front are open."""
 
     later: ClassVar = {"periodic": frozenset({True})}
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
-    size: list[Positive] = Field(
-        min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]; left out with spacing"
-    )
-    resolution: int = Field(ge=2, le=MOST_CELLS, description="cells along the longest side; left out with spacing")
-    spacing: Positive | None = Field(
-        default=None, description=f"instead of size and resolution: the side of a cell [m] of a domain without far ends, {MOST_CELLS} cells"
-    )
-    dimension: Literal[2, 3] | None = Field(default=None, description="with spacing: the domain's number of axes; 3 unless given")
-    wall: Wall = Field(default="separating", description="whether material may let go of the domain's walls")
+    size: list[Positive] = Field(min_length=2, max_length=3, description="sides [m], [x, y] or [x, y, z]; omitted with spacing")
+    resolution: int = Field(ge=2, le=MOST_CELLS, description="cells along the longest side; omitted with spacing")
+    spacing: Positive | None = Field(default=None, description="cell size [m] of a domain without far ends, instead of size and resolution")
+    dimension: Literal[2, 3] | None = Field(default=None, description="number of axes, with spacing; default: 3")
+    wall: Wall = Field(default="separating", description="boundary condition on the domain's walls")
     solids: Literal["cut-cell", "voxel"] = Field(
-        default="cut-cell", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
+        default="cut-cell", description="cut-cell: surfaces of solids cut cells; voxel: solids fill whole cells and cannot move"
     )
-    open: list[Literal[SIDES]] = Field(
-        default_factory=list, description="sides without a wall, where material leaves; y is up, x to the right, z to the front"
-    )
-    follow: bool = Field(
-        default=True, description="the grid covers what the material reaches where that is much less than the domain; false: all of it"
-    )
+    open: list[Literal[SIDES]] = Field(default_factory=list, description="sides without a wall, where material leaves")
+    follow: bool = Field(default=True, description="grid around the material only; false: the whole domain")
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
 
     @model_validator(mode="before")
@@ -143,51 +132,41 @@ class Domain(Table):
 
 
 class Physics(Table):
-    """[physics]: the constants of the world."""
+    """[physics]: gravity and density."""
 
-    gravity: Vector = Field(description="an acceleration [m/s^2]; 9.81 down along y unless given")
-    density: Positive = Field(default=1000.0, description="of the material [kg/m^3]")
+    gravity: Vector = Field(description="acceleration of gravity [m/s^2]; default: 9.81 down")
+    density: Positive = Field(default=1000.0, description="density of the liquid [kg/m^3]; of sand: material.density")
 
 
 class Solver(Table):
-    """[solver]: the method for the complementarity problem of every step, and how far it goes."""
+    """[solver]: solution of the complementarity problem of each step."""
 
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
     method: GridMethod = Field(default="projected-multigrid", description="projected-multigrid is the fastest")
-    tolerance: Tolerance = Field(
-        default=1e-4, description='the relative residual to reach; "auto": what leaves a tenth of the error that the time step makes'
-    )
-    precision: PrecisionName = Field(default="mixed", description="of the method's arithmetic")
-    max_iterations: Count = Field(default=100, description="iterations before the step counts as failed")
+    tolerance: Tolerance = Field(default=1e-4, description='relative residual; "auto": a tenth of the error of the time step')
+    precision: PrecisionName = Field(default="mixed", description="precision of the method")
+    max_iterations: Count = Field(default=100, description="iterations before the step fails")
 
 
 class Output(Table):
-    """[output]: what the run's folder gets."""
+    """[output]: files in the run folder."""
 
-    particles: bool = Field(default=True, description="write a frame of particles")
-    grid: bool = Field(default=True, description="write a frame of cells")
-    surface: bool = Field(default=False, description="write a frame of the material's surface: closed triangles, in 2-D segments")
+    particles: bool = Field(default=True, description="frames of particles")
+    grid: bool = Field(default=True, description="frames of cells")
+    surface: bool = Field(default=False, description="frames of the surface: closed triangles, 2-D: segments")
     surface_resolution: int | None = Field(
-        default=None, ge=1, le=8, description="surface points along the edge of a cell; as many as particles unless given"
+        default=None, ge=1, le=8, description="surface points per cell edge; default: particles.per_axis"
     )
-    surface_smoothing: float = Field(
-        default=1.5, ge=0.5, le=10, description="how far the surface smooths over the particles [their distances]"
-    )
-    surface_ply: bool = Field(default=False, description="write surfaces as PLY files too, for modelers such as Blender")
-    format: FrameFormat = Field(
-        default="vtu", description="of the files of particles, cells, surfaces and bodies: vtu, or what meshio writes and reads back"
-    )
-    grid_format: Literal["vtu", "vti"] = Field(
-        default="vtu", description="of the cells' files: vtu, as the others, or vti, smaller and faster where cells are many"
-    )
-    volume: bool = Field(default=False, description="write level set and density as NanoVDB files, of 3-D scenes")
-    diagnostics: bool = Field(
-        default=True, description="measure what only the log shows: volume and divergence of liquid, yielding and dissipation of sand"
-    )
-    forces: bool = Field(default=False, description="write forces.csv: force and torque of a liquid on each solid, a row a step")
-    checkpoint_every: CountOrZero = Field(default=50, description="steps between checkpoints; 0: not by steps")
-    checkpoint_minutes: Positive | None = Field(default=None, description="the most minutes of real time between checkpoints")
-    checkpoints_kept: Count = Field(default=3, description="how many of the newest checkpoints stay")
+    surface_smoothing: float = Field(default=1.5, ge=0.5, le=10, description="kernel width of the surface [particle distances]")
+    surface_ply: bool = Field(default=False, description="surfaces as PLY files too, for Blender and others")
+    format: FrameFormat = Field(default="vtu", description="format of frames")
+    grid_format: Literal["vtu", "vti"] = Field(default="vtu", description="format of frames of cells; vti is smaller and faster")
+    volume: bool = Field(default=False, description="level set and density as NanoVDB files, 3-D")
+    diagnostics: bool = Field(default=True, description="log of volume and divergence (liquid), yielding and dissipation (sand)")
+    forces: bool = Field(default=False, description="forces.csv: force and torque of a liquid on each solid per step")
+    checkpoint_every: CountOrZero = Field(default=50, description="steps between checkpoints; 0: unlimited")
+    checkpoint_minutes: Positive | None = Field(default=None, description="longest real time between checkpoints [min]")
+    checkpoints_kept: Count = Field(default=3, description="number of checkpoints kept")
 
 
 class Scene(Table):

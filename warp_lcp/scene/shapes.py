@@ -35,7 +35,7 @@ def _wall_friction(value: Any, handler: ValidatorFunctionWrapHandler) -> float |
 WallFriction = Annotated[
     Annotated[float, Field(ge=0, le=10)] | Literal["stick"], WrapValidator(_wall_friction, json_schema_input_type=float | Literal["stick"])
 ]
-FRICTIONS = "a number from 0 (free slip) to 10, or stick"
+FRICTIONS = "0 (free slip) to 10, or stick"
 STICKS = 1e6  # Coulomb's coefficient of a wall that holds what presses against it: sand, as far as that holds itself
 BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
 
@@ -55,15 +55,13 @@ class Shape(Table):
 
     if TYPE_CHECKING:
         shape: str  # of the file's key; each kind of shape has a value of its own
-    translate: Vector | None = Field(default=None, description="a shift [m]")
+    translate: Vector | None = Field(default=None, description="translation [m]")
     rotate: Angles | None = Field(
-        default=None, description="degrees: one angle in 2-D, [x, y, z] in 3-D; it turns the shape about the origin, or the point of about"
+        default=None, description="rotation about the origin or about [degrees]: one angle in 2-D, [x, y, z] in 3-D"
     )
-    about: Vector | None = Field(
-        default=None, description="the point that scale and rotate leave where it is, such as the shape's center [m]; else the origin"
-    )
-    scale: Positive = Field(default=1.0, description="a factor, the same along every axis")
-    invert: bool = Field(default=False, description="true: everything but the shape")
+    about: Vector | None = Field(default=None, description="fixed point of scale and rotate [m]; default: the origin")
+    scale: Positive = Field(default=1.0, description="scale factor")
+    invert: bool = Field(default=False, description="outside of the shape instead of inside")
 
     @abstractmethod
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
@@ -133,8 +131,8 @@ class BoxTable(Shape):
     """A box between two corners."""
 
     shape: Literal["box"] = "box"
-    min: Vector = Field(description="the low corner [m]")
-    max: Vector = Field(description="the high corner [m]")
+    min: Vector = Field(description="lower corner [m]")
+    max: Vector = Field(description="upper corner [m]")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the box; in 2-D it extends along z without limit."""
@@ -154,8 +152,8 @@ class SphereTable(Shape):
     """A ball; a disc in 2-D."""
 
     shape: Literal["sphere"] = "sphere"
-    center: Vector = Field(description="a point [m]")
-    radius: Positive = Field(description="a length [m]")
+    center: Vector = Field(description="center [m]")
+    radius: Positive = Field(description="radius [m]")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the ball, a disk in 2-D."""
@@ -168,9 +166,9 @@ class CapsuleTable(Shape):
     """All points within a radius of a segment."""
 
     shape: Literal["capsule"] = "capsule"
-    start: Vector = Field(alias="from", description="one end of the axis [m]")
-    end: Vector = Field(alias="to", description="the other end of the axis [m]")
-    radius: Positive = Field(description="a length [m]")
+    start: Vector = Field(alias="from", description="start of the axis [m]")
+    end: Vector = Field(alias="to", description="end of the axis [m]")
+    radius: Positive = Field(description="radius [m]")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the capsule around its axis."""
@@ -190,8 +188,8 @@ class PlaneTable(Shape):
     """The half space on the side of a plane that its normal points away from."""
 
     shape: Literal["plane"] = "plane"
-    point: Vector = Field(description="a point of the plane [m]")
-    normal: Vector = Field(description="points out of the material; its length does not matter")
+    point: Vector = Field(description="point of the plane [m]")
+    normal: Vector = Field(description="outward normal of any length")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the half space that the normal points away from."""
@@ -211,7 +209,7 @@ class MeshTable(Shape):
     """The inside of a closed surface of triangles; in 2-D, of its cut by the plane z = 0."""
 
     shape: Literal["mesh"] = "mesh"
-    file: str = Field(min_length=1, description=f"an OBJ, STL or PLY file, or a mesh that warp-lcp makes, such as {BUILTIN}torus")
+    file: str = Field(min_length=1, description=f"OBJ, STL or PLY file, or a built-in mesh, such as {BUILTIN}torus")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the inside of the mesh."""
@@ -228,29 +226,27 @@ class SolidProperties(Shape):
     """What a solid has besides its shape; where solids have more, classes of their own derive from SolidBox, SolidSphere and so on."""
 
     rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
-    wall: Wall | None = Field(default=None, description="whether material may let go of it; domain.wall unless given")
+    wall: Wall | None = Field(default=None, description="boundary condition on its surface; default: domain.wall")
     slip_length: float | None = Field(
         default=None,
         ge=0,
         allow_inf_nan=True,
-        description="of a thick liquid on it [m], 0: none, inf: free slip; viscosity.slip_length unless given",
+        description="slip length of a viscous liquid on it [m], inf: free slip; default: viscosity.slip_length",
     )
-    motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
-    mass: float | None = Field(default=None, ge=1e-18, description="makes it a rigid body that the material moves [kg; kg/m in 2-D]")
-    density: float | None = Field(default=None, ge=1e-18, description="in place of mass: of the solid, filled evenly [kg/m^3]")
-    velocity: Vector | None = Field(default=None, description="of a rigid body at the start [m/s]; at rest unless given")
+    motion: Motion | None = Field(default=None, description="prescribed motion; default: at rest")
+    mass: float | None = Field(default=None, ge=1e-18, description="mass of a rigid body [kg; kg/m in 2-D]")
+    density: float | None = Field(default=None, ge=1e-18, description="density of a rigid body, instead of mass [kg/m^3]")
+    velocity: Vector | None = Field(default=None, description="initial velocity of a rigid body [m/s]; default: 0")
     angular_velocity: Angles | None = Field(
-        default=None, description="of a rigid body at the start [degrees/s]: a number in 2-D, [x, y, z] in 3-D; 0 unless given"
+        default=None, description="initial angular velocity of a rigid body [degrees/s]: a number in 2-D, [x, y, z] in 3-D; default: 0"
     )
     friction: WallFriction | None = Field(
         default=None,
-        description=f"of its surface, against sand and between bodies and walls: {FRICTIONS}; domain.friction unless given, "
-        f"{BODY_FRICTION:g} for a rigid body in a liquid",
+        description=f"friction coefficient against sand, bodies and walls: {FRICTIONS}; "
+        f"default: domain.friction, in liquids {BODY_FRICTION:g}",
     )
-    restitution: Part = Field(default=0.0, description="of a rigid body: the part of the speed of an impact that comes back")
-    drag: NonNegative | None = Field(
-        default=None, description="of a liquid along its surface, as coefficient of [wall_drag], which it is unless given"
-    )
+    restitution: Part = Field(default=0.0, description="coefficient of restitution of a rigid body")
+    drag: NonNegative | None = Field(default=None, description="drag coefficient c_f in a liquid; default: wall_drag.coefficient")
 
     @property
     def is_body(self) -> bool:
@@ -301,14 +297,14 @@ class SolidProperties(Shape):
 class MaterialProperties(Shape):
     """What a material has besides its shape, whatever it is."""
 
-    velocity: Vector | None = Field(default=None, description="at the start [m/s]; at rest unless given")
+    velocity: Vector | None = Field(default=None, description="initial velocity [m/s]; default: 0")
 
 
 class LiquidProperties(MaterialProperties):
     """What a liquid has besides."""
 
     viscosity: float | None = Field(
-        default=None, gt=0, le=1e9, allow_inf_nan=False, description="its own [Pa s]; viscosity.value unless given"
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="viscosity [Pa s]; default: viscosity.value"
     )
 
 
@@ -355,8 +351,8 @@ class LiquidMesh(LiquidProperties, MeshTable):
 class Schedule(Table):
     """When a source or a drain runs."""
 
-    begin: NonNegative = Field(alias="start", default=0.0, description="when it starts to run [s]")
-    stop: float | None = Field(default=None, description="when it no longer runs [s]; it goes on unless given")
+    begin: NonNegative = Field(alias="start", default=0.0, description="start time [s]")
+    stop: float | None = Field(default=None, description="end time [s]; default: never")
 
     def schedule_complaints(self) -> list[Complaint]:
         """Return what is wrong with the times."""
@@ -368,9 +364,9 @@ class Schedule(Table):
 class SourceProperties(Schedule, Shape):
     """What a source has besides its shape."""
 
-    velocity: Vector = Field(description="of what comes out [m/s]")
+    velocity: Vector = Field(description="velocity of the inflow [m/s]")
     viscosity: float | None = Field(
-        default=None, gt=0, le=1e9, allow_inf_nan=False, description="of the liquid that comes out [Pa s]; viscosity.value unless given"
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="viscosity of the inflow [Pa s]; default: viscosity.value"
     )
 
     def complaints(self, dimension: int) -> list[Complaint]:
