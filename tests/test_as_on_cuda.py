@@ -48,17 +48,19 @@ def on_the_cpu() -> dict[str, dict[str, list[float]]]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+SMALL = 1e-2  # of velocities [m/s] and their gradients [1/s], which stresses solved to 1e-3 leave uncertain in sand that begins to move
+LONG = ("balls-on-sand-2d", "pouring-pile")  # a minute each
 EMULATED = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
 
 
 @EMULATED
-@pytest.mark.parametrize("name", built_in_scenes())
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in built_in_scenes()])
 def test_a_scene_goes_as_on_the_cpu(name: str) -> None:
     found, expected = stepped(name), on_the_cpu()[name]
     assert found.keys() == expected.keys()
     for key, values in found.items():
         assert values[0] == expected[key][0], key
-        np.testing.assert_allclose(values, expected[key], rtol=1e-3, atol=1e-3 * max(np.abs(expected[key][1:]).max(), 1e-3), err_msg=key)
+        np.testing.assert_allclose(values, expected[key], rtol=1e-3, atol=1e-3 * max(np.abs(expected[key][1:]).max(), SMALL), err_msg=key)
 
 
 @EMULATED
@@ -92,6 +94,7 @@ def test_the_model_of_gpus_hears_what_is_launched() -> None:
 
 
 @EMULATED
+@pytest.mark.slow
 def test_the_verdict_on_a_gpu_is_rehearsed(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "benchmarks.gpu", "--rehearse", "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=Path(__file__).parents[1], check=False)

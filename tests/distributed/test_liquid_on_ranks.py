@@ -116,7 +116,7 @@ def logs():
     return found
 
 
-@pytest.mark.parametrize("ranks", [pytest.param(2, marks=pytest.mark.slow), 4])
+@pytest.mark.parametrize("ranks", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs, ranks):
     mpi(ranks, PROGRAM, "run", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}, seconds=300.0)
     for name, (rows, cells, pressure) in logs.items():
@@ -126,7 +126,7 @@ def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs,
         np.testing.assert_allclose(saved["pressure"], pressure, atol=1e-5 * np.abs(pressure).max())
 
 
-@pytest.mark.parametrize("ranks", [3, 4])
+@pytest.mark.parametrize("ranks", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_ranks_have_the_surface_and_the_volumes_of_one_process(mpi, tmp_path, ranks):
     """Where nothing has been rounded otherwise yet bit for bit: the same triangles, with points on cuts once."""
     mpi(ranks, PROGRAM, "wrap", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"})
