@@ -152,6 +152,11 @@ def test_arguments_out_of_range_are_named():
             wrong()
 
 
-def test_a_splash_says_what_makes_its_problem():
-    with pytest.raises(AttributeError, match=r"splash.named\('everywhere'\).lcp"):
-        _ = splash(4).lcp
+def test_a_splash_makes_its_problem_by_its_bounds():
+    scene = splash(8)
+    found = wl.solve(scene.lcp("walls", device="cpu"), "projected-multigrid")
+    expected = wl.solve(scene.named("walls", device="cpu").lcp(), "projected-multigrid")
+    assert found and found.x.shape == scene.b.shape
+    np.testing.assert_array_equal(found.x.numpy(), expected.x.numpy())
+    with pytest.warns(DeprecationWarning, match=r"Splash\.problem is now Splash\.lcp"):
+        assert scene.problem("walls", "cpu").b.shape == scene.lcp("walls", device="cpu").b.shape

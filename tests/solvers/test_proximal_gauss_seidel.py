@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import clarabel
 import numpy as np
 import pytest
 import scipy.sparse
@@ -93,6 +92,7 @@ def cone_program(problem, lift):
     B = scipy.sparse.csc_matrix(scipy.sparse.triu(J @ J.T + scipy.sparse.diags_array(problem.yields.ravel())))
     scale = np.ones((k, dim))
     scale[:, 0] = problem.friction  # (mu r_n, r_t) in the second-order cone
+    clarabel = pytest.importorskip("clarabel")
     settings = clarabel.DefaultSettings()
     settings.verbose, settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = False, 1e-12, 1e-12, 1e-12
     rows = scipy.sparse.csc_matrix(scipy.sparse.diags_array(-scale.ravel()))

@@ -44,7 +44,7 @@ class FrictionalContact(VariationalInequality):
 
     Example:
         >>> down = FrictionalContact([0], [1], np.eye(3)[None], np.zeros((1, 3, 3)), [[-1.0, 3.0, 4.0]], [0.5], 1)
-        >>> down.residual(np.array([[1.0, -0.3, -0.4]]))  # held by mu r_n against the slip
+        >>> print(f"{down.residual(np.array([[1.0, -0.3, -0.4]])):.1f}")  # held by mu r_n against the slip
         0.0
     """
 
