@@ -123,6 +123,15 @@ def distance_of(k: int, j: int, i: int, once: FIELD, twice: FIELD, linear: float
     return within * (linear + cubic * within * within)
 
 
+@wp.func
+def away_from(cell: int, ny: int, nx: int, p: wp.vec3):
+    """Return the direction from the center of a cell, by its flat index on a grid of ny rows of nx cells, to a point [cells]."""
+    k = cell // (ny * nx)
+    j = (cell - k * ny * nx) // nx
+    away = p - wp.vec3(float(cell - k * ny * nx - j * nx), float(j), float(k))
+    return away / wp.max(wp.length(away), 1e-6)
+
+
 @list_kernel(MODULE)
 def lean_kernel(
     i, cells: INTS, points: POINTS, way: FLOATS, raised: FLOATS, planes: int, part: float, cosine: float, linear: float, cubic: float,
@@ -138,11 +147,7 @@ def lean_kernel(
     1/kappa whose center is cosine / kappa behind the wall, that is raised + cosine / kappa from the middle, which takes the cosine's place.
     """
     p = points[i]
-    low = bend.shape[1] * bend.shape[2]
-    k = cells[i] // low
-    j = (cells[i] - k * low) // bend.shape[2]
-    away = p - wp.vec3(float(cells[i] - k * low - j * bend.shape[2]), float(j), float(k))
-    away = away / wp.max(wp.length(away), 1e-6)
+    away = away_from(cells[i], bend.shape[1], bend.shape[2], p)
     a = wp.clamp(int(wp.floor(p[0] + 0.5)), 1, bend.shape[2] - 2)
     b = wp.clamp(int(wp.floor(p[1] + 0.5)), 1, bend.shape[1] - 2)
     c = wp.clamp(int(wp.floor(p[2] + 0.5)), 1, bend.shape[0] - 2)
@@ -230,11 +235,7 @@ def begin_kernel(
     along it. The same holds for air at a wall that liquid does not wet.
     """
     p = points[i]
-    low = share.shape[1] * share.shape[2]
-    k = cells[i] // low
-    j = (cells[i] - k * low) // share.shape[2]
-    away = p - wp.vec3(float(cells[i] - k * low - j * share.shape[2]), float(j), float(k))
-    away = away / wp.max(wp.length(away), 1e-6)
+    away = away_from(cells[i], share.shape[1], share.shape[2], p)
     a = int(wp.floor(p[0]))
     b = int(wp.floor(p[1]))
     c = int(wp.floor(p[2]))

@@ -87,7 +87,7 @@ class JointTable(Table):
             if not hinge and getattr(self, key) is not None:
                 found.append(Complaint((key,), getattr(self, key), f"is of hinges: this joint is {self.kind}"))
         if (self.motor_speed is None) != (self.motor_torque is None):
-            found.append(Complaint(("motor_torque",), self.motor_torque, "goes with motor_speed: give both, or none"))
+            found.append(Complaint(("motor_torque",), self.motor_torque, "needs motor_speed, and motor_speed needs it"))
         if hinge and dimension == 3 and (self.axis is None or not any(self.axis)):
             found.append(Complaint(("axis",), self.axis, "of a hinge in 3-D must be given, and not zero"))
         if hinge and dimension == 2 and self.axis is not None:
@@ -201,7 +201,7 @@ class ContactScene(Scene):
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         for index, table in enumerate(self.joint):
             if table.motor_torque is not None:
-                found.append(Complaint(("joint", index, "motor_torque"), table.motor_torque, "goes without targets, which move the bodies"))
+                found.append(Complaint(("joint", index, "motor_torque"), table.motor_torque, "must be left out: targets move the bodies"))
         if not found and not self._joint_complaints():
             try:
                 tree_of(self.joints(), sum(solid.is_body for solid in self.solid))
@@ -217,10 +217,10 @@ class ContactScene(Scene):
             for c in table.complaints(self.dimension, self.solid)
         ]
         if self.solver.method in (DEFAULT, *CONE):
-            message = f"takes no equations without bounds, which joints are; choose from {', '.join((*BOXED, *STEWART_TRINKLE))}"
+            message = f"cannot solve joints, which are equations; choose from {', '.join((*BOXED, *STEWART_TRINKLE))}"
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.domain.open:
-            found.append(Complaint(("domain", "open"), self.domain.open, "goes without joints: bodies that leave would tear them"))
+            found.append(Complaint(("domain", "open"), self.domain.open, "must be left out: a scene with joints has closed sides"))
         for index, solid in enumerate(self.solid):
             if solid.restitution:
                 found.append(Complaint(("solid", index, "restitution"), solid.restitution, "must be 0 where there are joints"))

@@ -1,6 +1,6 @@
-// Springs that y still pulls on stay, others let go at z = g - y / (rho d); unknowns beyond a bound go onto it and get one. `first`: so do those
-// that -y / (rho d) takes beyond it. `keep`: all stay. The shift is rho d where there is a spring; the sums are changes, springs, and the
-// square of y on those that stay.
+// Update the set of active springs. An active spring stays if y still pulls on it; otherwise it is released at z = g - y / (rho d).
+// An unknown beyond a bound moves onto it and gets a spring. `first`: also unknowns that -y / (rho d) moves beyond a bound. `keep`:
+// no spring is released. The shift is rho d where there is a spring. The sums count changes and springs, and add y^2 of those that stay.
 T moved = 0, active = 0, square = 0;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int i = 0; i < n; ++i) {
