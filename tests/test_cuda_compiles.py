@@ -141,7 +141,7 @@ def use_newton_kernels(reals):
         for A in operators:
             problem = wl.LCP(A, np.where(np.arange(np.prod(A.shape)).reshape(A.shape) % 2, -1.0, 1.0))
             for precision in ("mixed", "double"):
-                for method in (wl.MinimumMapNewton, wl.FischerNewton, wl.InteriorPoint):
+                for method in (wl.MinimumMapNewton, wl.FischerNewton, wl.InteriorPoint, wl.Penalty):
                     assert wl.solve(problem, method(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-4)), (A, method, precision)
                 assert wl.solve(problem, wl.InteriorPoint(precision=precision, crossover=1e-1), stopping=wl.StoppingCriteria(rtol=1e-4))
 
@@ -216,13 +216,15 @@ def use_contact_kernels():
 
 
 def family(name):
-    """Return what the variants of a module share: its name without the types and switches that they were made for."""
+    """Return what the variants of a module share: its name without types and switches, and how many kernels it has."""
+    from warp._src.context import user_modules
+
     package, module, *variant = name.split(".")
     if package == "granular":  # its switches are in the module's name; the longest variant has walls that cut and a rate, or a box
         module = re.sub("_(2d|3d|float32|float64|rate|cut)(?=_|$)", "", module)
-    if package == "fluids" and "_" in module:  # the longest variant of viscosity and pressure has all switches
-        module = re.sub("_(2d|cut|ghost|moving|drag|slip)(?=_|$)", "", module)
-    return package, module, *(re.match("[a-z]*", word)[0] for word in variant)
+    if package == "fluids" and module.startswith(("pressure", "viscosity")):  # the longest variant has all switches
+        module = re.sub("_(2d|cut|ghost|moving)(?=_|$)", "", module)
+    return package, module, len(user_modules[name].kernels), *(re.match("[a-z]*", word)[0] for word in variant)
 
 
 def modules_of_every_kernel(reals):
