@@ -13,12 +13,13 @@ from pathlib import Path
 from random import SystemRandom
 
 from warp_lcp.benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
-from warp_lcp.benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
+from warp_lcp.benchmarks.extremes.case import PRECISIONS, REFUSED, Case, Expected, Verdict, judge
 from warp_lcp.benchmarks.extremes.unseen import FRESH, judging
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Record, Results, Table, shown
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 
+ORDINARY = ("CONVERGED", REFUSED, "done")  # statuses that the report does not list case by case
 TITLE = "Extremes: hostile problems and scenes, and what they come to"
 FAMILIES = (
     shapes.sizes, shapes.masks, shapes.closed_pools, coefficients.slivers, coefficients.contrasts, coefficients.bodies, bounds.scales,
@@ -97,15 +98,24 @@ def families(records: Sequence[Record]) -> Table:
 
 
 def table(verdicts: Sequence[Verdict]) -> Table:
-    """Return a row a case, with status, relative residual and seconds in each precision; of random problems those that fail."""
+    """Return a row for each noteworthy case, with status, relative residual and seconds in each precision.
+
+    Noteworthy: a verdict is wrong, a solve stops before its tolerance, or it takes a second or more.
+    Random problems are listed only if a verdict is wrong.
+    """
     by_case = defaultdict[tuple[str, str], list[Verdict]](list)
     for v in (v for v in verdicts if v.wrong or v.case.family not in judging.FAMILIES):
         by_case[v.case.family, v.case.name].append(v)
     rows = []
     for name, own in by_case.items():
+        if all(v.attempt.status in ORDINARY and v.attempt.seconds < 1.0 and not v.wrong for v in own):
+            continue
         cells = {v.precision: f"{v.attempt.status}{v.attempt.at}, {v.attempt.seconds:.2g} s" for v in own}
         wrong = "; ".join(f"{v.precision}: {v.outcome}" for v in own if v.wrong)
         expected = "; ".join(dict.fromkeys(str(v.promise) for v in own))
         rows.append([*name, expected, *(cells.get(p, "-") for p in PRECISIONS), wrong or "yes"])
-    remark = "Status, residual relative to that of clip(0, l, u), seconds. It is computed by NumPy and SciPy from cells and faces."
-    return Table("Cases", ("family", "case", "expected", *PRECISIONS, "as it must be?"), rows, remark)
+    remark = (
+        "Cases that are wrong, stop before their tolerance, or take a second or more: status, residual relative to that of "
+        "clip(0, l, u) (computed by NumPy and SciPy from cells and faces), seconds."
+    )
+    return Table("Noteworthy cases", ("family", "case", "expected", *PRECISIONS, "as it must be?"), rows, remark)
