@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.solvers.dense_problem import DenseProblem, certifies, inconsistent
+from warp_lcp.solvers.dense_problem import DenseProblem, certifies, diagonally_dominant, inconsistent
 
 NONE = wl.SolveStatus.INFEASIBLE
 
@@ -187,3 +187,54 @@ def test_dense_equations_are_proved_to_have_no_solution():
     assert all(good for good, _ in found), [good.status for good, _ in found]
     assert all(bad.status is wl.SolveStatus.INFEASIBLE for _, bad in found), [bad.status for _, bad in found]
     assert max(bad.iterations for _, bad in found) <= 12, [bad.iterations for _, bad in found]
+
+
+def drawn_dominant(seed):
+    """Return a matrix whose rows are dominant, most of them weakly, and whether each row leads to a strictly dominant one."""
+    rng = np.random.default_rng([8, seed])
+    n = int(rng.integers(1, 25))
+    A = np.where(rng.random((n, n)) < rng.uniform(0.02, 0.3), rng.standard_normal((n, n)) * 10 ** rng.uniform(-6, 6, (n, n)), 0.0)
+    np.fill_diagonal(A, 0.0)
+    strict = rng.random(n) < rng.choice([0.0, 0.1, 0.5])
+    beside = np.abs(A).sum(axis=1)
+    np.fill_diagonal(A, np.where(strict, beside * rng.uniform(1.001, 2.0, n) + 1e-3, beside))
+    leads = strict.copy()
+    for _ in range(n):  # row i leads where row j does, for any a_ij != 0
+        leads |= (A != 0) @ leads
+    return A, bool(leads.all() and (A.diagonal() > 0).all())
+
+
+def check_dominance(seeds):
+    """The decision equals a plain loop's; such matrices are P-matrices, by principal minors of drawn index sets."""
+    yes = 0
+    for seed in seeds:
+        A, expected = drawn_dominant(seed)
+        assert diagonally_dominant(A) == diagonally_dominant(scipy.sparse.csr_array(A)) == expected, seed
+        yes += expected
+        if expected:
+            rng = np.random.default_rng([9, seed])
+            for _ in range(5):
+                rows = np.flatnonzero(rng.random(len(A)) < 0.5)
+                block = A[np.ix_(rows, rows)] / A.diagonal()[rows, None]
+                assert np.linalg.slogdet(block)[0] > 0, seed
+    assert 0.1 * len(seeds) < yes < 0.9 * len(seeds)
+
+
+def test_diagonal_dominance():
+    check_dominance(range(200))
+
+
+def test_what_is_not_dominant():
+    laplacian = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    assert not diagonally_dominant(laplacian)  # singular: no row is strictly dominant
+    assert diagonally_dominant(laplacian + np.diag([1e-3, 0.0]))
+    assert not diagonally_dominant(-np.eye(2))
+    assert not diagonally_dominant(np.array([[1.0, -1.1], [0.0, 1.0]]))
+    assert not diagonally_dominant(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0], [-1.0, 0.0, 1.0]]) - np.diag([0.0, 0.0, 0.5]))
+
+
+def test_a_dominant_matrix_needs_no_linear_program(monkeypatch):
+    monkeypatch.setattr("scipy.optimize.linprog", lambda *_, **__: pytest.fail("a linear program was solved"))
+    A = np.array([[2.0, -1.0], [-1.0, 1.0]])
+    for lower, upper in ((0.0, np.inf), (-np.inf, 0.0), (-np.inf, np.inf)):
+        assert not inconsistent(DenseProblem(np.arange(2), A, np.array([-3.0, 1.0]), np.full(2, lower), np.full(2, upper)))

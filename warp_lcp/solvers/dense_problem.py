@@ -230,6 +230,30 @@ def certifies(data: DenseProblem, z: np.ndarray) -> bool:
         return bool(data.b @ z + gains.sum() < -doubt)
 
 
+def diagonally_dominant(A: Any) -> bool:
+    """Return whether A is diagonally dominant, with a positive diagonal, and every row leads to a strictly dominant one.
+
+    Such a matrix is nonsingular, and a P-matrix: its problem has a solution, whatever b and the bounds are (Cottle, Pang and Stone
+    1992, section 3.3). Row i leads to row j if a_ij is not 0. Sums of rows are known to rounding; strictly: by `SHARE` of a_ii.
+
+    Args:
+        A: dense or sparse, shape (n, n).
+    """
+    matrix = scipy.sparse.csr_array(A)
+    diagonal, n = matrix.diagonal(), matrix.shape[0]
+    beside = np.asarray(abs(matrix).sum(axis=1)).ravel() - np.abs(diagonal)
+    noise = ROUNDING * EPS * np.sqrt(np.maximum(np.diff(matrix.indptr), 1))
+    if not ((diagonal > 0) & (diagonal * (1.0 + noise) >= beside)).all():
+        return False
+    strict = np.flatnonzero(diagonal - beside > SHARE * diagonal)
+    # Search from a node n that leads to all strictly dominant rows, against the direction of the entries.
+    start = scipy.sparse.csr_array((np.ones(len(strict)), (np.full(len(strict), n), strict)), shape=(n + 1, n + 1))
+    entries = scipy.sparse.coo_array(abs(matrix))
+    backward = scipy.sparse.coo_array((entries.data, (entries.col, entries.row)), shape=(n + 1, n + 1))
+    reached = scipy.sparse.csgraph.breadth_first_order((start + backward).tocsr(), n, return_predecessors=False)
+    return len(reached) == n + 1
+
+
 def inconsistent(data: DenseProblem) -> bool:
     """Return whether it is proved that no solution exists: `certifies` accepts multipliers that a linear program suggests.
 
@@ -246,7 +270,7 @@ def inconsistent(data: DenseProblem) -> bool:
     below, above = np.isfinite(data.lower), np.isfinite(data.upper)
     rows = np.flatnonzero(~(below & above))
     A, b = data.A[rows], data.b[rows]
-    if not len(rows):
+    if not len(rows) or diagonally_dominant(data.A):
         return False
     R, C, beta = _units_with_right_side(A, b)
     up, low = np.flatnonzero(above), np.flatnonzero(below)
