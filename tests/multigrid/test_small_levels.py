@@ -188,6 +188,7 @@ def test_levels_follow_when_the_cells_change(device):
             assert np.abs(expected).max() > 0.1
 
 
+@pytest.mark.cpu_form("compiles for GPUs, emulated or not")
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_path):
     """Barriers are in the GPU's source only, and no load goes past the cache that sees a block's own writes."""
