@@ -1,5 +1,6 @@
 """Shared by all tests: quiet Warp, devices, and how many examples Hypothesis draws."""
 
+import gc
 import os
 import signal
 
@@ -32,6 +33,17 @@ def pytest_collection_modifyitems(items):
         for item in items:
             if "cuda" in item.keywords:
                 item.add_marker(skip)
+
+
+@pytest.fixture
+def only_new_objects():
+    """Exclude existing objects from garbage collection and counts of memory.
+
+    A search of the objects of all other tests, millions, takes a second.
+    """
+    gc.freeze()
+    yield
+    gc.unfreeze()
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])

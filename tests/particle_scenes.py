@@ -1,9 +1,12 @@
 """The built-in scenes of a material that particles carry: all but those of rigid bodies alone."""
 
+import functools
+
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 
 
+@functools.cache
 def particle_scenes() -> list[str]:
     """Return their names."""
     return [name for name in built_in_scenes() if isinstance(load_scene(name), ParticleScene)]

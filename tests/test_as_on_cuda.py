@@ -1,10 +1,10 @@
 """Steps of every built-in scene in CUDA's form against the CPU's; only with the plugin `emulated_cuda`, see there."""
 
-import functools
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,12 @@ from warp_lcp.scene.simulator import simulators
 
 CELLS = {"jet": 128, "river": 256, "mesh-obstacle": 30, "retracting-wall": 50, "stirred-tank": 24, "water-labyrinth": 48, "wave-maker": 60}
 STEPS, DT = 3, 0.004
-PLAIN = "import json, test_as_on_cuda as t; print(json.dumps({name: t.stepped(name) for name in t.built_in_scenes()}))"
+PLAIN = """
+import json, sys
+from test_as_on_cuda import stepped
+for line in sys.stdin:
+    print(json.dumps(stepped(line.strip())), flush=True)
+"""
 
 
 def made(name: str) -> Any:
@@ -38,14 +43,25 @@ def stepped(name: str) -> dict[str, list[float]]:
     return {key: [float(v) for v in values] for key, values in found.items()}
 
 
-@functools.cache
-def on_the_cpu() -> dict[str, dict[str, list[float]]]:
-    """Return what another process finds without the plugin."""
+@pytest.fixture(scope="module")
+def on_the_cpu() -> Iterator[Callable[[str], dict[str, list[float]]]]:
+    """Return a function that steps a scene in another process, which has no plugin."""
     keep = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
     command = [sys.executable, "-c", PLAIN]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=600, env={**keep, "PYTHONPATH": paths})
-    return json.loads(done.stdout.splitlines()[-1])
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**keep, "PYTHONPATH": paths})
+    asked, said = process.stdin, process.stdout
+    assert asked is not None
+    assert said is not None
+
+    def ask(name: str) -> dict[str, list[float]]:
+        print(name, file=asked, flush=True)
+        line = next((line for line in said if line.startswith("{")), "")
+        assert line, f"the process without the plugin ended with {process.wait()}"
+        return json.loads(line)
+
+    with process:
+        yield ask
 
 
 SMALL = 1e-2  # of velocities [m/s] and their gradients [1/s], which stresses solved to 1e-3 leave uncertain in sand that begins to move
@@ -55,8 +71,8 @@ EMULATED = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the pl
 
 @EMULATED
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in built_in_scenes()])
-def test_a_scene_goes_as_on_the_cpu(name: str) -> None:
-    found, expected = stepped(name), on_the_cpu()[name]
+def test_a_scene_goes_as_on_the_cpu(name: str, on_the_cpu: Callable[[str], dict[str, list[float]]]) -> None:
+    found, expected = stepped(name), on_the_cpu(name)
     assert found.keys() == expected.keys()
     for key, values in found.items():
         assert values[0] == expected[key][0], key

@@ -14,6 +14,8 @@ from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import BOUNDS, natural, splash
 from warp_lcp.cli import commands as cli
 
+pytestmark = pytest.mark.usefixtures("only_new_objects")
+
 
 def test_exponent_is_that_of_a_power_law():
     unknowns = np.array([64.0, 128.0, 256.0]) ** 3

@@ -10,6 +10,8 @@ from typer.testing import CliRunner
 from warp_lcp.cli import commands as cli
 from warp_lcp.cli.suites import benchmarks
 
+pytestmark = pytest.mark.usefixtures("only_new_objects")
+
 
 def call(*arguments):
     return CliRunner().invoke(cli.app, ["bench", *map(str, arguments)])

@@ -1,8 +1,6 @@
 """What accuracy costs: the settings, the Pareto front, and small suites."""
 
-import gc
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,8 @@ from warp_lcp.benchmarks.tradeoff.runs import Runs, front_of
 from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
 from warp_lcp.cli import commands as cli
 from warp_lcp.scene.scene_file import load_scene
+
+pytestmark = pytest.mark.usefixtures("only_new_objects")
 
 
 def options(**changes: object) -> Options:
@@ -65,14 +65,6 @@ def test_a_run_is_compared_with_its_own_reference_and_the_finest() -> None:
     assert refused.trial is None
     assert "liquid" in refused.failed
     assert runs.figures(refused) == {}
-
-
-@pytest.fixture(autouse=True)
-def only_new_objects() -> Iterator[None]:
-    """Let counts of memory, which search all objects many times, pass over those of other tests."""
-    gc.freeze()
-    yield
-    gc.unfreeze()
 
 
 @pytest.fixture

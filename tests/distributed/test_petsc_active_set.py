@@ -80,7 +80,7 @@ def run(mpi, told, ranks):
     return told[ranks]
 
 
-@pytest.mark.parametrize("ranks", [2, 4])
+@pytest.mark.parametrize("ranks", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_results_do_not_depend_on_the_ranks(mpi, told, ranks):
     alone, shared = run(mpi, told, 1), run(mpi, told, ranks)
     assert alone.keys() == shared.keys()

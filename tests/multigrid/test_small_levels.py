@@ -43,8 +43,14 @@ def run_cycle(hierarchy, cells, projected):
     return hierarchy.finest.x.numpy() * inside
 
 
-@pytest.mark.parametrize("real", [wp.float32, wp.float64])
-@pytest.mark.parametrize("faces", FACES)
+@pytest.mark.parametrize(  # each pair compiles kernels; slow pairs differ from quick ones in a type
+    ("faces", "real"),
+    [
+        *((faces, wp.float32) for faces in FACES),
+        ("arrays", wp.float64),
+        *(pytest.param(faces, wp.float64, marks=pytest.mark.slow) for faces in FACES[:2]),
+    ],
+)
 @pytest.mark.parametrize(("shape", "periodic"), GRIDS)
 def test_cycles_and_levels_are_those_of_single_launches(shape, periodic, faces, real, device):
     """A stage left out, out of order or on a wrong array changes the cycle by far more than rounding."""
@@ -182,6 +188,7 @@ def test_levels_follow_when_the_cells_change(device):
             assert np.abs(expected).max() > 0.1
 
 
+@pytest.mark.cpu_form("compiles for GPUs, emulated or not")
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_path):
     """Barriers are in the GPU's source only, and no load goes past the cache that sees a block's own writes."""

@@ -85,6 +85,7 @@ def test_an_mp4_holds_the_images(encoder, tmp_path):
         assert np.abs(pixels - np.asarray(picture(number))).mean() < 2.0  # H.264 loses a little
 
 
+@pytest.mark.usefixtures("only_new_objects")
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_images_are_drawn_one_at_a_time(encoder, tmp_path, suffix):
     """No image is asked for before the one before was taken, and none stays in memory."""

@@ -25,6 +25,7 @@ def call(*arguments: object) -> Result:
     return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
+@pytest.mark.usefixtures("only_new_objects")
 @pytest.mark.parametrize(("name", "every"), [("dam-break-2d", 0), ("dam-break", 1), ("mesh-obstacle", 1)])
 def test_the_parts_add_up_to_what_a_simulation_takes(name: str, every: int) -> None:
     """Without the table the density correction takes its part when it first acts."""

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from warp_lcp.scene.simulator import plug_ins
+from warp_lcp.scene.simulator import entry_points, plug_ins
 
 GROUP = "warp_lcp.benchmarks"
 
