@@ -1,4 +1,4 @@
-"""The surface of material that fills what solids leave of a domain ends at their true walls: planes, balls, bowls and boxes, anyhow placed."""
+"""The surface of material that fills what solids leave of a domain ends at their true walls, anyhow placed."""
 
 import numpy as np
 import pytest

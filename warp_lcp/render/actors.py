@@ -32,6 +32,8 @@ GLINT = (LIGHT + THREE_QUARTERS) / np.linalg.norm(LIGHT + THREE_QUARTERS)  # the
 HIDDEN_SLOPE, HIDDEN_DENSITY = 0.6, 6.0  # of the density in particles a cell: flatter and denser is deeper inside than two cells
 SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
 
+FLUSH = 1e-5  # of the domain's longest side: how far from a side a point on it may lie
+
 Drawn = tuple[Any, dict[str, Any]]  # a mesh of pyvista's, and how its plotter is to draw it
 
 
@@ -55,7 +57,9 @@ class Actors:
 
 
 def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_width: float) -> list[Drawn]:
-    """Return the surface of a material; in 2-D its inside, deeper in color toward the bottom, and its outline, behind the solids.
+    """Return the surface of a material, the part on each of the domain's sides by itself.
+
+    In 2-D it is the inside, deeper in color toward the bottom, and the outline, behind the solids.
 
     Args:
         surface: triangles, or closed chains of segments.
@@ -65,9 +69,13 @@ def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_w
     """
     if not len(surface.corners):
         return []
-    mesh = poly_data(surface.points, surface.corners)
     if len(size) == 3:
-        return [(mesh, {"smooth_shading": True, **SURFACES[palette]})]
+        ends = np.abs(surface.points - np.stack([np.zeros(3), size])[:, None]) < FLUSH * max(size)
+        on_side = ends[:, surface.corners].all(axis=2).transpose(1, 0, 2).reshape(-1, 6)
+        side = np.where(on_side.any(axis=1), on_side.argmax(axis=1), 6)
+        parts = [surface.corners[side == number] for number in np.unique(side)]  # each with its own normals: their edges are sharp
+        return [(poly_data(surface.points, part), {"smooth_shading": True, **SURFACES[palette]}) for part in parts]
+    mesh = poly_data(surface.points, surface.corners)
     from matplotlib.colors import LinearSegmentedColormap
 
     behind = -2e-3 * max(size)

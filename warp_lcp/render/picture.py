@@ -140,7 +140,8 @@ class Picture:
         """Draw the domain and the solids that stand, and prepare those that move."""
         solids = prescribed_solids(self.scene)
         sides, width = self.scene.domain.size, 2 * self.samples
-        self._solids: Any = FlatSolids(sides, width, self.front) if self.flat else RoomSolids(sides, width)
+        drawer: Any = FlatSolids(sides, width, self.front) if self.flat else RoomSolids(sides, width)
+        self._solids = drawer
         standing = [(self._solids.prepared(solid), Pose.identity()) for solid in solids if not solid.motion]
         meshes = self._solids.meshes(standing)
         self.actors.exchange("standing", [*self._solids.domain(), *meshes])
