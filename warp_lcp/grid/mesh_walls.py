@@ -62,12 +62,12 @@ class Walls:
     def distance_and_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return d [cells], shape (n,), and grad d, shape (n, 3), from d at the corners of a small simplex around each point."""
         directions = TETRAHEDRON if self.dimension == 3 else TRIANGLE
-        step = max(STEP, ROUNDING * float(np.abs(points).max(initial=0.0)))
-        around = (points[:, None] + step * directions).reshape(-1, 3)
+        step = np.maximum(STEP, ROUNDING * np.abs(points).max(axis=1, initial=0.0))[:, None]
+        around = (points[:, None] + step[..., None] * directions).reshape(-1, 3)
         d = self.distance(around).reshape(len(points), -1)
         known = np.isfinite(d).all(axis=1)
         slope = np.where(known[:, None], d, 0.0) @ directions
-        return np.where(known, d.mean(axis=1), np.inf), (self.dimension / (len(directions) * step)) * slope
+        return np.where(known, d.mean(axis=1), np.inf), self.dimension / (len(directions) * step) * slope
 
 
 def fit_to_walls(points: np.ndarray, corners: np.ndarray, on_solid: np.ndarray, fixed: np.ndarray, walls: Walls) -> np.ndarray:
