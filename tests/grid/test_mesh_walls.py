@@ -102,3 +102,17 @@ def test_a_boundary_has_the_shapes_where_its_solids_are():
     assert [distance(shape, center)[0] for shape in boundary.shapes()] == pytest.approx([-2.0, -2.0], abs=1e-4)
     boundary.place(0.5)
     assert [distance(shape, center)[0] for shape in boundary.shapes()] == pytest.approx([-2.0, -1.0], abs=1e-4)
+
+
+def test_no_point_leaves_the_domain_where_a_solid_ends_at_its_corner():
+    """Points on a side move along it to the wall, which lies beyond the side's end here."""
+    normal = np.array([-0.476027, 0.879431, 0.0])
+    solid = Plane(point=0.0917 * DX * normal, normal=normal)
+    grid = StaggeredGrid((COUNT, COUNT, 1), DX, 2)
+    cut = CutCells(grid, [PlacedSolid(geometry=solid, separating=False, name="solid")], wall_separating=False)
+    x = lattice(grid, 2, 0.25, 9300, 0)
+    particles = wp.array(x[distance(solid, x) > 1e-3].astype(np.float32), dtype=wp.vec3, device="cpu")
+    mesh = SurfaceMesh(grid, per_axis=2, obstacles=Obstacles(cut.base, cut.distance, False, lambda: [solid])).find(particles)
+    points = mesh.points.numpy()
+    assert points.min() >= 0.0
+    assert distance(solid, points).min() > -0.1

@@ -164,7 +164,8 @@ class SurfaceMesh:
         walls = Walls(shapes, spacing, lattice.dimension, lattice.device)
         on_solid = (held & ON_SOLID) > 0
         fitted = fit_to_walls(points, mesh.corners.numpy(), on_solid, fixed, walls)
-        mesh.points.assign((fitted * spacing).astype(np.float32))
+        size = np.asarray(lattice.extent)  # along a side a point could leave the domain beyond a corner
+        mesh.points.assign(np.clip(fitted * spacing, 0.0, size).astype(np.float32))
 
     def _place(self, obstacles: Obstacles) -> None:
         """Find what the solids leave of each kernel."""
