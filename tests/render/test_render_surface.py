@@ -6,7 +6,7 @@ from typer.testing import CliRunner, Result
 
 from small_runs import ball, box, sphere, write_run
 from warp_lcp.cli import commands as cli
-from warp_lcp.render.actors import is_round
+from warp_lcp.render.actors import is_round, surface_meshes
 from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, render_run
 from warp_lcp.render.solid_meshes import prescribed_solids
@@ -227,3 +227,20 @@ def test_a_camera_from_the_command_line(pyvista, dots, tmp_path):
         seen.append(np.nonzero(is_blue(pixels(out / "frame_000000.png")))[1].mean())
     assert seen[0] == pytest.approx(200, abs=3)
     assert seen[1] < 150
+
+
+def test_each_side_of_the_domain_has_its_own_part_of_a_surface():
+    """Shared normals would smear light over the edges between walls, and between a wall and the free surface."""
+    pytest.importorskip("pyvista")
+    pool = box([0.0, 0.0, 0.0], [1.0, 0.4, 1.0])
+    pool = Surface("surface", *welded(pool.points, pool.corners), {})
+    parts = [mesh for mesh, _ in surface_meshes(pool, "water", (1.0, 1.0, 1.0), 1.0)]
+    assert sum(mesh.n_cells for mesh in parts) == len(pool.corners)
+    spans = sorted(tuple(np.ptp(mesh.points, axis=0).astype(float).round(3).tolist()) for mesh in parts)
+    assert spans == [(0.0, 0.4, 1.0), (0.0, 0.4, 1.0), (1.0, 0.0, 1.0), (1.0, 0.0, 1.0), (1.0, 0.4, 0.0), (1.0, 0.4, 0.0)]
+
+
+def welded(points, corners):
+    """Return a mesh whose triangles share the points that lie at one place."""
+    own, number = np.unique(points, axis=0, return_inverse=True)
+    return own, number.ravel()[corners].astype(np.int32)

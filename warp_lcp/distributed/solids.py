@@ -159,18 +159,20 @@ def boundary_of_part(scene: ParticleScene, part: Subdomain, solids: Sequence[Pla
     ends = part.cuts | side_bits(domain.open)
     walls: dict[str, Any] = {"wall_separating": domain.wall == "separating", "remarks": False}
     sides = PeriodicSides(grid, scene.endless, part.decomposition.joined) if scene.endless else None
+    shapes: list[Geometry] = []
     if domain.solids == "cut-cell":
         cut = CutCellsOfPart(part, solids, open_sides=ends, **walls)
         if ranks.any(not cut.whole_cells):
             boundary: Boundary = CutBoundaryOfPart(part, cut, sides)
             _check_open(part, boundary)
             return boundary, list(cut.notes)
+        shapes = [solid.geometry for solid in solids]
     notes = start_notes(solids, grid)
     voxels = voxelize(grid, solids, open_sides=with_periodic(ends, sides), **walls)
     notes += small_notes((solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing)
     part.fill(voxels.index)
     still = np.zeros((1 + len(solids), 3)) if scene.source else None
-    boundary = WholeCells(grid, voxels, still, open_sides=ends, sides=sides)
+    boundary = WholeCells(grid, voxels, still, open_sides=ends, sides=sides, shapes=shapes)
     part.fill(*boundary.placed())
     _check_open(part, boundary)
     return boundary, notes

@@ -10,6 +10,7 @@ from warp_lcp.grid.particle_loops import cell_pass, chunks
 from warp_lcp.grid.staggered import StaggeredGrid
 
 TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
+ON_SIDE, ON_SOLID = 1, 2  # bits of a mark
 NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can tell
 
 _SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
@@ -22,17 +23,17 @@ SEE_NEIGHBORS = cell_pass("warp_lcp.grid.mesh_smoothing.see_neighbors", "", {"co
 @wp.kernel(**_options)
 @typing.no_type_check
 def hold_kernel(planes: int, dx: float, origin: wp.vec3, points: POINTS, room: F32, counts: wp.vec3, held: _BYTES):
-    """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids."""
+    """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids, with ON_SIDE + ON_SOLID."""
     p = wp.tid()
     x = points[p] / dx
-    stays = bool(False)
+    mark = int(0)
     for axis in range(planes + 1):
         if x[axis] < TOUCHING or x[axis] > counts[axis] - TOUCHING:
-            stays = True
+            mark = ON_SIDE
     if room:
         if interpolated(room, planes, x[0] + 0.5 - origin[0], x[1] + 0.5 - origin[1], x[2] + 0.5 - origin[2]) < NEAR:
-            stays = True
-    held[p] = wp.where(stays, wp.uint8(1), wp.uint8(0))
+            mark = mark + ON_SOLID
+    held[p] = wp.uint8(mark)
 
 
 @wp.kernel(**_options)
@@ -56,8 +57,8 @@ FORTH, BACK = 0.5, -0.53  # shares of the way to the neighbors' mean: waves long
 MOST = 0.3  # lattice cells that a point may move: facets are shallower, drops of few points are not squeezed to nothing
 
 
-def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, rounds: int) -> None:
-    """Move the points of a surface but for those on the domain's sides and on solids.
+def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, rounds: int) -> wp.array:
+    """Move the points of a surface but for those on the domain's sides and on solids; return marks of these, uint8, a point each.
 
     Args:
         mesh: a closed surface from `warp_lcp.grid.marching_cubes` (updated).
@@ -66,9 +67,9 @@ def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, roun
         rounds: steps forth and back; each lets a point look two points farther.
     """
     device, count = lattice.device, len(mesh.points)
-    if not count or not rounds:
-        return
-    held = wp.empty(count, dtype=wp.uint8, device=device)
+    held = wp.zeros(count, dtype=wp.uint8, device=device)
+    if not count:
+        return held
     ends = [wp.vec3(*numbers) for numbers in (lattice.origin, lattice.domain_counts)]
     wp.launch(hold_kernel, count, [lattice.planes, lattice.spacing, ends[0], mesh.points, room, ends[1], held], device=device)
     start, most = wp.clone(mesh.points), MOST * lattice.spacing
@@ -79,3 +80,4 @@ def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, roun
         sums.zero_()
         SEE_NEIGHBORS.bind(rows, corners=mesh.corners, points=mesh.points, sums=sums).launch()
         wp.launch(move_kernel, count, [share, most, sums, held, size, start, mesh.points], device=device)
+    return held

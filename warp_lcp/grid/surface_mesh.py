@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warp_lcp.grid import surface_mesh_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate, weighted_kernel
 from warp_lcp.grid.level_set_kernels import BINOMIAL, SCATTER
 from warp_lcp.grid.marching_cubes import DeviceMesh, MarchingCubes
+from warp_lcp.grid.mesh_smoothing import ON_SOLID, TOUCHING
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
+from warp_lcp.grid.mesh_walls import Walls, fit_to_walls
 from warp_lcp.grid.particle_loops import MARGIN, launch, scatter, touched_planes
+from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
@@ -34,11 +38,14 @@ class Obstacles:
         base: int8, SOLID in cells that hold no material.
         distance: signed distance at the cells' low corners [cells], float32, > 0 in the open; None: solids are whole cells.
         moves: whether they may be somewhere else each time.
+        shapes: returns the solids' shapes where they are; the surface then ends `mesh_walls.OVERLAP` inside them. None: it ends where
+            `distance`, or the cells, have the walls.
     """
 
     base: wp.array
     distance: wp.array | None
     moves: bool
+    shapes: Callable[[], Sequence[Geometry]] | None = None
 
 
 @dataclass(frozen=True)
@@ -141,8 +148,24 @@ class SurfaceMesh:
     def _mesh(self, phi: wp.array, number: wp.array) -> DeviceMesh:
         """Return the smoothed surface phi = 0; `number` is scratch memory."""
         mesh = self._cubes.contour(phi, number)
-        smooth_mesh(mesh, self.lattice, self._room, ROUNDS)
+        held = smooth_mesh(mesh, self.lattice, self._room, ROUNDS)
+        shapes = self.obstacles.shapes() if self.obstacles is not None and self.obstacles.shapes is not None else ()
+        if shapes and len(mesh.points):
+            self._fit(mesh, held.numpy(), shapes)
         return mesh
+
+    def _fit(self, mesh: DeviceMesh, held: np.ndarray, shapes: Sequence[Geometry]) -> None:
+        """Move the points on solids onto their shapes, along the domain's sides where they lie on one."""
+        spacing, lattice = self.grid.spacing, self.lattice
+        points = mesh.points.numpy() / spacing
+        place = points * (spacing / lattice.spacing)
+        fixed = (place < TOUCHING) | (place > np.array(lattice.domain_counts) - TOUCHING)
+        fixed[:, lattice.dimension :] = True
+        walls = Walls(shapes, spacing, lattice.dimension, lattice.device)
+        on_solid = (held & ON_SOLID) > 0
+        fitted = fit_to_walls(points, mesh.corners.numpy(), on_solid, fixed, walls)
+        size = np.asarray(lattice.extent)  # along a side a point could leave the domain beyond a corner
+        mesh.points.assign(np.clip(fitted * spacing, 0.0, size).astype(np.float32))
 
     def _place(self, obstacles: Obstacles) -> None:
         """Find what the solids leave of each kernel."""

@@ -6,6 +6,7 @@ their distance, and whose solids may move.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -16,6 +17,7 @@ from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.level_set import whole_cell_capacity
 from warp_lcp.grid.motion import kinks, top_speed
 from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
+from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
@@ -81,6 +83,9 @@ class Boundary(Protocol):
     def admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m], shape (n, 3), a particle may start at, as far as cells do not say it already."""
 
+    def shapes(self) -> Sequence[Geometry]:
+        """Return the solids' shapes where they are, if walls are where these have them."""
+
 
 class WholeCells:
     """Solids that fill whole cells.
@@ -92,6 +97,7 @@ class WholeCells:
             are. None: all stand still.
         open_sides: those that `solids` was made with, but for the next.
         sides: of axes without an end; `solids` has them open.
+        shapes: of the solids, if they fill whole cells exactly.
 
     Raises:
         ValueError: `wall_velocity` has another shape.
@@ -103,9 +109,9 @@ class WholeCells:
 
     def __init__(
         self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int,
-        sides: PeriodicSides | None = None,
+        sides: PeriodicSides | None = None, shapes: Sequence[Geometry] = (),
     ) -> None:  # fmt: skip
-        self.grid, self.solids, self.sides = grid, solids, sides
+        self.grid, self.solids, self.sides, self._shapes = grid, solids, sides, tuple(shapes)
         self.open_sides, self._endless = with_periodic(open_sides, sides), sides.bits if sides is not None else 0
         if wall_velocity is not None and np.shape(wall_velocity) != (len(solids.separating), 3):
             raise ValueError(f"wall_velocity has shape {np.shape(wall_velocity)}: expected ({len(solids.separating)}, 3)")
@@ -171,6 +177,10 @@ class WholeCells:
         """Return True for all points: open cells say where particles may start."""
         return np.ones(len(points), dtype=bool)
 
+    def shapes(self) -> Sequence[Geometry]:
+        """Return the solids' shapes, if they fill whole cells exactly."""
+        return self._shapes
+
 
 CLOSE = 1.0  # cells from a solid within which the sides of an axis without an end must be alike
 ALIKE = 1e-2  # cells
@@ -195,6 +205,7 @@ class CutBoundary:
     def __init__(self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None) -> None:
         self.grid, self.cut, self.moves, self.sides = grid, cut, cut.moves, sides
         self.open_sides, self._endless = with_periodic(cut.open_sides, sides), sides.bits if sides is not None else 0
+        self._time = 0.0
         self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
         self.velocity: Faces = cut.velocity or []
         self.touch = grid.field(wp.uint8)
@@ -258,9 +269,14 @@ class CutBoundary:
     def place(self, time: float) -> None:
         """Put the solids where they are at `time` [s]."""
         if self.moves:
+            self._time = time
             self.cut.place(time)
             self._find_walls()
             self._join_sides()
+
+    def shapes(self) -> Sequence[Geometry]:
+        """Return the solids' shapes where they are."""
+        return [s.geometry if s.motion is None else s.geometry.moved(s.motion.pose(self._time)) for s in self.cut.solids]
 
     def admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m] of the domain, shape (n, 3), keep the distance that particles keep from walls."""

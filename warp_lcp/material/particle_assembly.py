@@ -104,17 +104,19 @@ def make_boundary(
     placed = placed_solids(scene, folder) if solids is None else solids
     around = PeriodicSides(grid, scene.endless) if scene.endless else None
     separating, sides, part = scene.domain.wall == "separating", open_sides_of(grid, side_bits(scene.domain.open)), grid.whole is not None
+    shapes: list[Geometry] = []
     if scene.domain.solids == "cut-cell":
         if wall_velocity is not None:
             raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')
         cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not part)
         if not cut.whole_cells or (part and placed):  # solids may cut cells elsewhere
             return CutBoundary(grid, cut, sides=around), cut.notes
+        shapes = [solid.geometry for solid in placed]
     ends = side_bits(periodic_sides(scene.endless))
     voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not part)
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
-    return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around), voxels.notes
+    return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around, shapes=shapes), voxels.notes
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ def make_surface_mesh(
         return None
     return make(
         grid, per_axis=scene.particles.per_axis, resolution=scene.output.surface_resolution, smoothing=scene.output.surface_smoothing,
-        obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves) if scene.solid else None,
+        obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves, boundary.shapes) if scene.solid else None,
     )  # fmt: skip
 
 

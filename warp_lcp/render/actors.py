@@ -32,6 +32,8 @@ GLINT = (LIGHT + THREE_QUARTERS) / np.linalg.norm(LIGHT + THREE_QUARTERS)  # the
 HIDDEN_SLOPE, HIDDEN_DENSITY = 0.6, 6.0  # of the density in particles a cell: flatter and denser is deeper inside than two cells
 SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
 
+FLUSH = 1e-5  # of the domain's longest side: how far from a side a point on it may lie
+
 Drawn = tuple[Any, dict[str, Any]]  # a mesh of pyvista's, and how its plotter is to draw it
 
 
@@ -55,7 +57,9 @@ class Actors:
 
 
 def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_width: float) -> list[Drawn]:
-    """Return the surface of a material; in 2-D its inside, deeper in color toward the bottom, and its outline, behind the solids.
+    """Return the surface of a material, the part on each of the domain's sides by itself.
+
+    In 2-D it is the inside, deeper in color toward the bottom, and the outline, behind the solids.
 
     Args:
         surface: triangles, or closed chains of segments.
@@ -65,9 +69,13 @@ def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_w
     """
     if not len(surface.corners):
         return []
-    mesh = poly_data(surface.points, surface.corners)
     if len(size) == 3:
-        return [(mesh, {"smooth_shading": True, **SURFACES[palette]})]
+        ends = np.abs(surface.points - np.stack([np.zeros(3), size])[:, None]) < FLUSH * max(size)
+        on_side = ends[:, surface.corners].all(axis=2).transpose(1, 0, 2).reshape(-1, 6)
+        side = np.where(on_side.any(axis=1), on_side.argmax(axis=1), 6)
+        parts = [surface.corners[side == number] for number in np.unique(side)]  # each with its own normals: their edges are sharp
+        return [(poly_data(surface.points, part), {"smooth_shading": True, **SURFACES[palette]}) for part in parts]
+    mesh = poly_data(surface.points, surface.corners)
     from matplotlib.colors import LinearSegmentedColormap
 
     behind = -2e-3 * max(size)
@@ -79,13 +87,14 @@ def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_w
     return [(inside.translate((0.0, 0.0, behind)), depth), (outline.translate((0.0, 0.0, 0.95 * behind)), line)]
 
 
-def body_meshes(bodies: Surface | None, at_first: Surface | None, line_width: float) -> list[Drawn]:
+def body_meshes(bodies: Surface | None, at_first: Surface | None, line_width: float, front: float) -> list[Drawn]:
     """Return rigid bodies where they are, each in a color of its own.
 
     Args:
         bodies: with the field `body`; None: there are none.
         at_first: the bodies in the run's first frame, which tells the eighths of balls.
         line_width: of the outlines of bodies in 2-D [pixels].
+        front: how far bodies in 2-D stand before the particles [m].
     """
     if bodies is None:
         return []
@@ -94,7 +103,7 @@ def body_meshes(bodies: Surface | None, at_first: Surface | None, line_width: fl
     for number, body in enumerate(np.unique(of_corner)):
         color, corners = BODY_COLORS[number % len(BODY_COLORS)], bodies.corners[of_corner == body]
         if corners.shape[1] == 2:
-            meshes += _flat_body(bodies.points, corners, color, line_width)
+            meshes += _flat_body(bodies.points, corners, color, line_width, front)
         else:
             meshes.append(_solid_body(bodies.points, corners, color, at_first))
     return meshes
@@ -114,15 +123,14 @@ def _solid_body(points: np.ndarray, corners: np.ndarray, color: str, at_first: S
     return mesh, {"scalars": side, "cmap": [color, pale], "n_colors": 2, "clim": np.abs(side).max() * np.array([-1.0, 1.0]), **looks}
 
 
-def _flat_body(points: np.ndarray, corners: np.ndarray, color: str, line_width: float) -> list[Drawn]:
-    """Return the inside and the outline of a body, a little before the particles."""
+def _flat_body(points: np.ndarray, corners: np.ndarray, color: str, line_width: float, front: float) -> list[Drawn]:
+    """Return the inside and the outline of a body, a little before the particles and the walls."""
     outline = poly_data(points, corners).clean()
-    before = 1e-3 * float(np.ptp(outline.points, axis=0).max())
-    inside = outline.triangulate_contours().translate((0.0, 0.0, before))
+    inside = outline.triangulate_contours().translate((0.0, 0.0, front))
     if is_round(points, corners):  # a radius, which shows how the disc turns
         outline = outline.merge(poly_data(np.stack([points[corners[:, 0]].mean(axis=0), points[corners[0, 0]]]), np.array([[0, 1]])))
     line = {"color": BODY_EDGE, "line_width": line_width, "lighting": False}
-    return [(inside, {"color": color, "lighting": False}), (outline.translate((0.0, 0.0, 2.0 * before)), line)]
+    return [(inside, {"color": color, "lighting": False}), (outline.translate((0.0, 0.0, 1.2 * front)), line)]
 
 
 def poly_data(points: np.ndarray, corners: np.ndarray) -> Any:

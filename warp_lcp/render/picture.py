@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,13 @@ import numpy as np
 from warp_lcp.grid.motion import Pose
 from warp_lcp.render.actors import SHADES, Actors, Drawn, body_meshes, shaded, surface_meshes
 from warp_lcp.render.grains import grains
-from warp_lcp.render.recording import WITH_SURFACE, Color, Frame, Recording, Show
+from warp_lcp.render.recording import WITH_PARTICLES, WITH_SURFACE, Color, Frame, Recording, Show
 from warp_lcp.render.solid_meshes import FlatSolids, RoomSolids, apart, prescribed_solids
 from warp_lcp.render.sunlight import LIGHT, SHADE, Sunlight, scattered
-from warp_lcp.scene.camera import viewpoint
+from warp_lcp.scene.camera import Viewpoint, viewpoint
 
 SAMPLES = 2  # per pixel and direction: images are drawn larger and averaged down, since splats have no other anti-aliasing
+FRONT, TILT = 1e-3, 0.3  # how far walls stand before 2-D particles, over the longest side, and over a disc's radius: discs face the camera
 SMALL = 0.25  # radius of particles that a surface is shown around, over their spacing
 BACKDROPS = {"water": "#c9d5df", "other": "#e3e2df"}  # of rooms at the bottom, fading into white, which would hide water
 
@@ -61,10 +63,13 @@ class Picture:
         for position, kind, intensity in [(LIGHT, "scene light", 0.45), (np.array([0.0, 0.0, 1.0]), "headlight", 0.25)]:
             light = pyvista.Light(position=tuple(position), focal_point=(0, 0, 0), light_type=kind, intensity=intensity)
             self.plotter.add_light(light)
+        view = viewpoint(scene, size[0] / size[1])
+        outside = None if plotter or recording.show not in WITH_PARTICLES else self._outside(view, size)
+        self._blank = None if outside is None else (outside, self._pixels()[outside])
         self.actors = Actors(self.plotter)
+        self.front = max(FRONT * max(scene.domain.size), TILT * self.radius)
         self._place_standing()
         self.bodies_at_first = recording.bodies(recording.numbers[0])
-        view = viewpoint(scene, size[0] / size[1])
         camera = self.plotter.camera
         camera.position, camera.focal_point, camera.up = tuple(view.position), tuple(view.focus), tuple(view.up)
         camera.view_angle = view.angle
@@ -81,7 +86,7 @@ class Picture:
             shown = apart(shown, poses, self.scene.spacing)
         surface = [] if shown is None else surface_meshes(shown, self.scene.palette, size, width)
         self.actors.exchange("surface", surface)
-        bodies = body_meshes(frame.bodies, self.bodies_at_first, 1.5 * width)
+        bodies = body_meshes(frame.bodies, self.bodies_at_first, 1.5 * width, 2.0 * self.front)
         self.actors.exchange("bodies", bodies)
         sun = None
         if not self.flat:
@@ -99,18 +104,44 @@ class Picture:
 
         self.place(frame)
         self.plotter.renderer.reset_camera_clipping_range()
-        self.plotter.render()
-        return np.asarray(Image.fromarray(self.plotter.screenshot(return_img=True)).reduce(SAMPLES))
+        pixels = self._pixels()
+        if self._blank is not None:  # balls that reach beyond the domain's walls would make its edges a row of beads
+            outside, background = self._blank
+            pixels[outside] = background
+        return np.asarray(Image.fromarray(pixels).reduce(SAMPLES))
 
     def close(self) -> None:
         """Free the window that pyvista draws into."""
         self.plotter.close()
 
+    def _pixels(self) -> np.ndarray:
+        """Render, and return the pixels, SAMPLES of them per pixel of an image along each axis."""
+        self.plotter.render()
+        return np.array(self.plotter.screenshot(return_img=True))
+
+    def _outside(self, view: Viewpoint, size: tuple[int, int]) -> np.ndarray | None:
+        """Return which pixels lie outside the outline of a 3-D domain; None: the scene is 2-D, or a corner is behind the camera."""
+        from scipy.spatial import ConvexHull
+
+        if self.flat:
+            return None
+        corners = np.stack(np.meshgrid(*((0.0, side) for side in self.scene.domain.size)), axis=-1).reshape(-1, 3)
+        x, y, depth = ((corners - view.position) @ view.axes.T).T
+        if depth.min() <= 0.0:
+            return None
+        width, height = (self.samples * side for side in size)
+        focal = 0.5 * height / math.tan(math.radians(view.angle / 2.0))  # of a pinhole [pixels]
+        hull = ConvexHull(np.stack([0.5 * width + focal * x / depth, 0.5 * height - focal * y / depth], axis=-1))
+        column, row = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+        beyond = [a * column + b * row + c > self.samples for a, b, c in hull.equations]  # the lines of the box are drawn on its outline
+        return np.any(beyond, axis=0)
+
     def _place_standing(self) -> None:
         """Draw the domain and the solids that stand, and prepare those that move."""
         solids = prescribed_solids(self.scene)
-        kind: Any = FlatSolids if self.flat else RoomSolids
-        self._solids = kind(self.scene.domain.size, 2 * self.samples)
+        sides, width = self.scene.domain.size, 2 * self.samples
+        drawer: Any = FlatSolids(sides, width, self.front) if self.flat else RoomSolids(sides, width)
+        self._solids = drawer
         standing = [(self._solids.prepared(solid), Pose.identity()) for solid in solids if not solid.motion]
         meshes = self._solids.meshes(standing)
         self.actors.exchange("standing", [*self._solids.domain(), *meshes])

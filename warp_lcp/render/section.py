@@ -106,8 +106,8 @@ class Section:
         nearest = nearest_distance(poses, wp.array(plane.reshape(-1, 3), dtype=wp.vec3, device="cpu"))
         if nearest.min() < 0.0 < nearest.max():
             level = nearest.reshape(len(y), len(x))
-            axes.contourf(x, y, level, levels=[-math.inf, 0.0], colors=[SOLID], zorder=2)
-            axes.contour(x, y, level, levels=[0.0], colors=[EDGE], linewidths=1.0, zorder=2)
+            axes.contourf(x, y, level, levels=[-math.inf, 0.0], colors=[SOLID], zorder=3.5)
+            axes.contour(x, y, level, levels=[0.0], colors=[EDGE], linewidths=1.0, zorder=3.5)
         elif nearest.max() <= 0.0:
             axes.set_facecolor(SOLID)
 

@@ -20,22 +20,26 @@ from warp_lcp.simulation import Surface
 
 OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
 TOUCHING = 0.75
+AROUND, LINE_FRONT = 20.0, 1.2  # of the longest side: how far the white reaches; of `front`: where lines stand
 FLAT_SOLID, SOLID, EDGE = "#bfc3c8", "#cdd1d5", "#6b7075"
 
 
 class FlatSolids:
-    """A rectangle; solids are filled where the signed distance to them is negative, a little behind the particles.
+    """A rectangle with white around it; solids are filled where the signed distance to them is negative.
+
+    Both stand before the particles and hide what of their discs reaches across a wall, which would look like a saw.
 
     Args:
         size: of the domain [m].
         line_width: of the domain's edges [pixels].
+        front: how far walls stand before the particles [m].
     """
 
-    def __init__(self, size: Sequence[float], line_width: float) -> None:
+    def __init__(self, size: Sequence[float], line_width: float, front: float) -> None:
         """Choose where distances are sampled."""
         import pyvista
 
-        self.size, self.line_width = size, line_width
+        self.size, self.line_width, self.front = size, line_width, front
         self._step = max(size) / OUTLINE_POINTS
         counts = [math.ceil(side / self._step) + 1 for side in size]
         spacing = [side / (count - 1) for side, count in zip(size, counts, strict=True)]
@@ -43,11 +47,16 @@ class FlatSolids:
         self._points = wp.array(self._plane.points, dtype=wp.vec3, device="cpu")
 
     def domain(self) -> list[Drawn]:
-        """Return the edges of the domain."""
+        """Return what hides everything around the domain, and its edges."""
         import pyvista
 
-        edges = pyvista.Rectangle([(0.0, 0.0, 0.0), (self.size[0], 0.0, 0.0), (*self.size, 0.0)]).extract_all_edges()
-        return [(edges, {"color": EDGE, "line_width": self.line_width, "lighting": False})]
+        (right, top), far, z = self.size, AROUND * max(self.size), self.front
+        boxes = [(-far, 0.0, -far, far), (right, far, -far, far), (0.0, right, -far, 0.0), (0.0, right, top, far)]
+        corners = [np.array([[a, c, z], [b, c, z], [b, d, z], [a, d, z]]) for a, b, c, d in boxes]
+        around = pyvista.PolyData.from_regular_faces(np.concatenate(corners), np.arange(16).reshape(4, 4))
+        z *= LINE_FRONT
+        edges = pyvista.Rectangle([(0.0, 0.0, z), (right, 0.0, z), (right, top, z)]).extract_all_edges()
+        return [(around, {"color": "white", "lighting": False}), (edges, {"color": EDGE, "line_width": self.line_width, "lighting": False})]
 
     def prepared(self, solid: Shape) -> Geometry:
         """Return what is needed to draw a solid."""
@@ -58,10 +67,9 @@ class FlatSolids:
         nearest = nearest_distance(solids, self._points)
         if nearest.min() >= 0.0:
             return []
-        behind = -1e-3 * max(self.size)
         self._plane["distance"] = np.minimum(nearest, 1e3 * self._step)
-        inside = self._plane.clip_scalar(scalars="distance", value=0.0).translate((0.0, 0.0, behind))
-        line = self._plane.contour([0.0], scalars="distance").translate((0.0, 0.0, 0.5 * behind))
+        inside = self._plane.clip_scalar(scalars="distance", value=0.0).translate((0.0, 0.0, self.front))
+        line = self._plane.contour([0.0], scalars="distance").translate((0.0, 0.0, LINE_FRONT * self.front))
         edge = {"color": EDGE, "line_width": 0.75 * self.line_width, "lighting": False}
         return [(inside, {"color": FLAT_SOLID, "lighting": False}), (line, edge)]
 

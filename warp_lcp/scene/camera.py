@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from warp_lcp.scene.scene import Scene
 
 VIEW_ANGLE = 25.0  # degrees, over the height of an image
-MARGIN = 1.04
+MARGIN = 1.08  # of the image, over what is shown
 THREE_QUARTERS = np.array([0.55, 0.5, 1.0]) / np.linalg.norm([0.55, 0.5, 1.0])  # from the domain to the camera
 Y_AXIS, Z_AXIS = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 ROOM_KEYS, WINDOW_KEYS = ("position", "look_at", "up", "field_of_view"), ("low", "high")
