@@ -86,7 +86,7 @@ def solve_recorded(
         path: the file.
         method: a name in `METHODS`; the default method for grids if None.
         tolerance: of the residual, relative to the one at clip(0, lower, upper).
-        max_iterations: the most steps.
+        max_iterations: maximum number of steps.
         max_seconds: the most wall time of the solve.
         device: a Warp device.
         ranks: who solve it together, each of them its own box of cells; collective. None: this process alone.
@@ -119,7 +119,7 @@ def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, up
         if value is not None:
             raise ProblemError(f"--{option} {value}: {path} has bounds of its own")
     if out is not None and out.suffix != FIELD:
-        raise ProblemError(f"--out {out}: x of a grid becomes a NumPy array: name a {FIELD} file")
+        raise ProblemError(f"--out {out}: x of a grid is written as a NumPy array: the name must end in {FIELD}")
 
 
 def file_digest(path: Path) -> str | None:
@@ -166,7 +166,7 @@ def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decompositio
 
     comm, boxes = decomposition.ranks.comm, decomposition.boxes
     if not decomposition.ranks.is_root:
-        with waiting("the root rank, which writes"):
+        with waiting("writing by the root rank"):
             comm.Send(np.ascontiguousarray(x, dtype=np.float64), dest=0)
         return
     with replacing_by_name(path) as temporary:

@@ -1,4 +1,7 @@
-"""Smooth a closed surface without shrinking it, as Taubin does: a step of Laplacian smoothing, then a slightly longer one back."""
+"""Taubin smoothing of a closed surface: no shrinking.
+
+A step of Laplacian smoothing, then a slightly longer one back.
+"""
 
 import typing
 
@@ -57,7 +60,7 @@ MOST = 0.3  # lattice cells that a point may move: facets are shallower, drops o
 
 
 def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, rounds: int) -> None:
-    """Move the points of a surface but for those on the domain's sides and on solids.
+    """Smooth a surface; points on the domain's sides and on solids are fixed.
 
     Args:
         mesh: a closed surface from `warp_lcp.grid.marching_cubes` (updated).

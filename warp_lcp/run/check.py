@@ -68,9 +68,9 @@ def check_ranks(scene: Scene) -> None:
     if not isinstance(simulators()[name], DistributedSimulator):
         problems.append(KeyFault("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
     if scene.output.format != "vtu":
-        problems.append(KeyFault("output.format", "--engine petsc writes .vtu pieces alone", written(scene.output.format)))
+        problems.append(KeyFault("output.format", "--engine petsc writes only .vtu pieces", written(scene.output.format)))
     if scene.output.surface_ply:
-        problems.append(KeyFault("output.surface_ply", "--engine petsc writes surfaces as .vtu pieces alone", "true"))
+        problems.append(KeyFault("output.surface_ply", "--engine petsc writes surfaces only as .vtu pieces", "true"))
     if problems:
         raise SceneError(scene.scene.name, problems)
 
@@ -86,7 +86,8 @@ def check_output(scene: Scene) -> list[str]:
         return []
     if output.format == "ply" and output.surface_ply:
         raise SceneError(
-            scene.scene.name, [KeyFault("output.surface_ply", 'output.format = "ply" writes surfaces so; leave one out', "true")]
+            scene.scene.name,
+            [KeyFault("output.surface_ply", 'is redundant: output.format = "ply" writes surfaces as PLY, too; leave one out', "true")],
         )
     has_bodies, cells = any(solid.is_body for solid in scene.solid), output.grid_format == "vtu"
     kinds: dict[str, tuple[bool, type, int]] = {
@@ -98,7 +99,7 @@ def check_output(scene: Scene) -> list[str]:
     found = {name: holds(output.format, kind, dimension) for name, (wanted, kind, dimension) in kinds.items() if wanted}
     refused = {name: held.why for name, held in found.items() if held.dress is None}
     if refused:
-        what = f"does not hold {' and '.join(refused)}"
+        what = f"cannot store {' and '.join(refused)}"
         why = next((f" ({one_line(why.strip())})" for why in refused.values() if why.strip()), "")
         off = [f"output.{name} = false" for name in refused if name in type(output).model_fields]
         others = " or ".join(name for name in EVERYTHING if name != output.format)
@@ -111,7 +112,7 @@ def check_output(scene: Scene) -> list[str]:
             ],
         )
     bare = [name for name, held in found.items() if held.dress is Dress.BARE]
-    return [f'output.format = "{output.format}" holds the shape of {" and ".join(bare)}, without their fields'] if bare else []
+    return [f'output.format = "{output.format}" writes the geometry of {" and ".join(bare)}, without fields'] if bare else []
 
 
 def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:

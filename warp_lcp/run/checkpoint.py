@@ -196,16 +196,16 @@ class CheckpointFolder:
                     raise CheckpointError(f"{path}: belongs to another scene")
                 foreign = [name for name in archive.headers if name != META and not name.startswith(STATE)]
                 if foreign:
-                    raise CheckpointError(f"{path}: holds arrays that no run writes: {', '.join(map(repr, foreign))}")
+                    raise CheckpointError(f"{path}: holds unexpected arrays: {', '.join(map(repr, foreign))}")
                 arrays = archive.read([name for name in archive.headers if name != META])
         except ArchiveError as error:
             raise CheckpointError(f"{path}: cut short, damaged or not a checkpoint ({error})") from error
         state = {name.removeprefix(STATE): array for name, array in arrays.items()}
         checkpoint = Checkpoint(step, float(meta["time"]), state, meta["keys"])
         if meta["checksum"] != checkpoint.checksum or np.ndim(state.get(PIECES, [])) != 1:
-            raise CheckpointError(f"{path}: damaged (its checksum does not fit)")
+            raise CheckpointError(f"{path}: damaged (wrong checksum)")
         if meta["step"] != step:
-            raise CheckpointError(f"{path}: holds step {meta['step']}, renamed")
+            raise CheckpointError(f"{path}: holds step {meta['step']}; the file was renamed")
         return checkpoint
 
     def verify(self, checkpoint: Checkpoint) -> None:

@@ -26,9 +26,9 @@ class Change(Enum):
     """What another value of a key means for a run that goes on."""
 
     SAME_STEPS = "the steps are those of a run that had this value from the start"
-    OTHER_STEPS = "from here on the steps are not those of the run that began"
-    RESAMPLED = "the state goes to another grid"
-    REFUSED = "it would be another run"
+    OTHER_STEPS = "later steps differ from those of the original run"
+    RESAMPLED = "the state is resampled to another grid"
+    REFUSED = "not allowed: it would be a different run"
 
 
 RULES = (

@@ -40,7 +40,7 @@ Status = Literal["running", "finished", "stopped", "failed"]
 RECORD = "run.json"
 SCENE = "scene.toml"
 ROUNDING = 1e-9
-BEFORE = "before its first step had ended"
+BEFORE = "during the first step"
 LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
 OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd|{POST}")
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
@@ -185,9 +185,13 @@ class RunFolder:
             return
         if foreign or not holds_run(self.path):
             shown = ", ".join(one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3])
-            raise OutputError(f"{self.path}: holds files that are no run's ({shown}), which --force does not delete; choose another folder")
+            raise OutputError(
+                f"{self.path}: holds files that do not belong to a run ({shown}), which --force does not delete; choose another folder"
+            )
         if not force:
-            raise OutputError(f"{self.path}: holds a run already; --resume continues it, --force deletes it, --out takes another folder")
+            raise OutputError(
+                f"{self.path}: holds a run already; use --resume to continue it, --force to delete it, or --out for another folder"
+            )
 
     def start(self, record: RunRecord) -> None:
         """Begin a run in a folder that `check_new` found fit: what an earlier run left is deleted.
@@ -241,27 +245,27 @@ class RunFolder:
         self._check_same_scene()
         checkpoint, refused = self.checkpoints.newest()
         if checkpoint is None and not refused and not self._has_steps():
-            return Continuation(None, [f"{self.path}: the run that was interrupted had no checkpoint yet; it begins anew"])
+            return Continuation(None, [f"{self.path}: the interrupted run had no checkpoint; it starts again"])
         if checkpoint is None:
             reasons = refused or ["none was written"]
             raise OutputError("\n  ".join([f"{self.path}: no checkpoint to resume from; --force starts again", *reasons]))
         end = self.scene.time.frame_time(self.scene.time.frame_count)
         if checkpoint.time > end * (1.0 + ROUNDING):
             raise OutputError(
-                f"{self.path}: time.duration = {self.scene.time.duration:g} s ends before the checkpoint's time, {checkpoint.time:.6g} s: "
-                "frames would be lost; choose a longer one"
+                f"{self.path}: time.duration = {self.scene.time.duration:g} s is less than the checkpoint's time, {checkpoint.time:.6g} s: "
+                "frames would be lost; choose a longer duration"
             )
         lost = [name for name, found in ((RECORD, read_record(self.path)), (SCENE, recorded_keys(self.path / SCENE))) if not found]
-        remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; written anew" for name in lost)]
+        remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; rewritten" for name in lost)]
         if RECORD in lost:
-            remarks.append("what --set gave the run before is not known: what is not given again is the scene's")
+            remarks.append("earlier --set values are unknown: pass them again, else those of the scene are used")
         if refused:
             remarks.append(f"continuing from step {checkpoint.step} instead; refused checkpoints stay as checkpoints/refused_*.npz")
         now = keys(self.scene)
         before = checkpoint.keys or now
         steps = differences(before, now, Change.OTHER_STEPS)
         if steps:
-            remarks.append(f"from step {checkpoint.step} on the steps are not those of the run that began: {'; '.join(steps)}")
+            remarks.append(f"from step {checkpoint.step} on, steps differ from those of the original run: {'; '.join(steps)}")
         old = int(before.get(RESOLUTION, now[RESOLUTION]))
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
@@ -368,11 +372,11 @@ class RunFolder:
         wrong = [self.path / name for name in OWN_FOLDERS if (self.path / name).exists() and not (self.path / name).is_dir()]
         wrong += [path for path in (self.path / RECORD, self.path / SCENE, self.log) if path.is_dir()]
         if wrong:
-            kind = "is a folder where a run has a file" if wrong[0].is_dir() else "is a file where a run has a folder"
+            kind = "is a folder, expected a file" if wrong[0].is_dir() else "is a file, expected a folder"
             raise OutputError(f"{wrong[0]}: {kind}; move it away")
         links = [path for path, pattern in _walk(self.path) if path.is_symlink() and _is_of_run(path, self.path, pattern)]
         if links:
-            raise OutputError(f"{links[0]}: is a link, which no run makes, and a run writes into its own folder alone; move it away")
+            raise OutputError(f"{links[0]}: is a link: a run writes only into its own folder; move it away")
 
     def _check_same_scene(self) -> None:
         """Refuse other values of keys that must not change, and mesh files that hold something else."""
@@ -385,12 +389,12 @@ class RunFolder:
                 before[key] = now[key]  # the same mesh in another place
             elif key in files and before.get(key) == now[key]:
                 raise OutputError(
-                    f"{self.path}: {key} = {now[key]!r}: what is in the file has changed since the run began; put the old one back, or "
+                    f"{self.path}: {key} = {now[key]!r}: the content of the file has changed since the run began; restore it, or "
                     "start again with --force"
                 )
         changes = differences(before, now, Change.REFUSED)
         if changes:
-            head = f"{self.path}: --resume continues the same scene, and these keys have other values"
+            head = f"{self.path}: --resume needs the same scene, but these keys have changed"
             raise OutputError("\n  ".join([head, *changes, f"may change: {MAY_CHANGE}"]))
 
     def _has_steps(self) -> bool:
@@ -406,7 +410,7 @@ class RunFolder:
         before, now = read_record(self.path).get("versions", {}), versions()
         now.pop("platform", None)  # its name tells the kernel, not the processor
         other = [f"{name} {before[name]}, now {now[name]}" for name in sorted(before.keys() & now.keys()) if before[name] != now[name]]
-        return [f"written with other software ({'; '.join(other)}): results need not be the same bit for bit"] if other else []
+        return [f"written with other software ({'; '.join(other)}): results may not be bitwise identical"] if other else []
 
     def _contents(self) -> tuple[list[Path], list[Path]]:
         """Return the files that a run makes, and everything else."""

@@ -42,7 +42,7 @@ def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None)
     if isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation):
         steps = expected_steps(scene, simulation)
         if seconds is None:
-            seconds, where = expected_step(scene, simulation), "by the list of prices, on one core"
+            seconds, where = expected_step(scene, simulation), "by the cost table, on one core"
     else:
         steps = longest_steps(scene, simulation)
     size = expected_bytes(scene, simulation, steps)
@@ -145,7 +145,7 @@ def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
     yield from check_output(scene)
     frames, rate = scene.time.frame_count, scene.time.frames_per_second
     if frames > MANY_FRAMES:
-        yield f"{frames:,} frames: time.duration {scene.time.duration:g} s at time.frames_per_second {rate:g}; were so many meant?"
+        yield f"{frames:,} frames: time.duration {scene.time.duration:g} s at time.frames_per_second {rate:g}; is this intended?"
     if not (isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation)):
         return
     if not scene.solid:
@@ -155,9 +155,9 @@ def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
     points = np.concatenate([lattice(grid, 1, 0.0, 0, plane) for plane in planes])  # one a cell
     free = simulation.admits(points)
     if free.mean() < 1.0 - FULL:
-        yield f"solids fill {100.0 - 100.0 * free.mean():.4g} % of the domain; a shape with invert = true is everything but itself"
+        yield f"solids fill {100.0 - 100.0 * free.mean():.4g} % of the domain; with invert = true, the outside of a shape is solid"
     for number, material in enumerate(materials):
         mine = inside([material.to_geometry(Path.cwd(), scene.dimension)], points, device=grid.device)
         covered = 1.0 - float(np.mean(free[mine])) if mine.any() else 0.0
         if covered > BURIED:
-            yield f"{key}[{number}] ({material.shape}): {100.0 * covered:.0f} % of it lies inside solids, and is left out"
+            yield f"{key}[{number}] ({material.shape}): {100.0 * covered:.0f} % of it lies inside solids and is left out"

@@ -61,7 +61,7 @@ class Launcher:
         out = options.get("--out")
         if not options.get("--resume"):
             if scene is None:
-                raise OutputError("SCENE is missing: a scene file or the name of a built-in one; --resume --out DIR goes on without")
+                raise OutputError("SCENE is missing: give a scene file or the name of a built-in scene; only --resume --out DIR needs none")
             return given_scene(scene, overrides)
         if out is None and scene is None:
             raise OutputError("--resume: needs SCENE or --out DIR, the folder of the run")

@@ -58,7 +58,7 @@ class NoFolder(RunFolder):
             OutputError: there is no run to resume.
         """
         if resume:
-            raise OutputError("resume: a run without a folder has left nothing to resume from")
+            raise OutputError("resume: a run without a folder has no checkpoints")
         yield []
 
     def check_new(self, *, force: bool) -> None:

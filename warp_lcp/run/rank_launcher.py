@@ -139,8 +139,8 @@ def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
     started = next((os.environ[name] for name in SIZES if name in os.environ), "1")
     if started != "1" and ranks.size == 1:
         raise EngineError(
-            f"--engine petsc: {started} processes were started, but mpi4py knows only one: they are of different MPIs; use the mpiexec "
-            "of the MPI that mpi4py was built with, or the --mpi of srun that it knows"
+            f"--engine petsc: {started} processes were started, but mpi4py sees only one: the MPI libraries differ; use the mpiexec "
+            "of the MPI that mpi4py was built with, or the matching --mpi option of srun"
         )
     if ranks.size > 1:
         atexit.register(signal.alarm, PARTING)  # Python's threads have ended by then: the system's own clock ends what does not

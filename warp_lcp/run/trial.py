@@ -83,7 +83,7 @@ class Trial:
         shares = []
         for own, other in zip(self.looks[1:], reference.looks[1:], strict=True):
             if own.mass.shape != other.mass.shape or abs(own.time - other.time) > SAME_TIME:
-                raise ValueError("the two runs were looked at in other boxes or at other times")
+                raise ValueError("the two runs were sampled in different boxes or at different times")
             total = float(other.mass.sum())
             shares.append(0.5 * float(np.abs(own.mass - other.mass).sum()) / total if total > 0.0 else 0.0)
         return float(np.mean(shares))
@@ -183,7 +183,7 @@ class _Trial:
     def _points(self) -> np.ndarray:
         points = next((part.points for part in self.simulation.frame() if isinstance(part, Points)), None)
         if points is None:
-            raise SceneError(self.scene.scene.name, [KeyFault("scene.simulator", "shows no particles, which runs are compared by")])
+            raise SceneError(self.scene.scene.name, [KeyFault("scene.simulator", "has no particles, which the comparison of runs needs")])
         return points
 
     def _penetration(self) -> float | None:

@@ -40,7 +40,7 @@ class Camera(Table):
         for key in wrong:
             if getattr(self, key) is not None:
                 allowed = ", ".join(type(self).model_fields[name].alias or name for name in right)
-                message = f"is of no use in a scene of {dimension} dimensions; it may have {allowed}"
+                message = f"cannot be used in {dimension}-D; allowed are {allowed}"
                 found.append(Complaint((type(self).model_fields[key].alias or key,), getattr(self, key), message))
         for key in right:
             value = getattr(self, key)

@@ -94,6 +94,6 @@ def model_lines(
             text += f"; {share:.0f} % of memory, {1e3 * scale * seconds:.2g} ms a step ({part:.0f} %)"
         lines.append(("model" if model.built else "not built", text))
     if predicted > 0.0:
-        where = "here" if measured is not None else "by the list of prices, on one core"
+        where = "here" if measured is not None else "by the cost table, on one core"
         lines.append(("step", f"about {1e3 * scale * predicted:.3g} ms {where}, all models together"))
     return lines

@@ -96,7 +96,7 @@ class Domain(Table):
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
     size: list[Positive] = Field(min_length=2, max_length=3, description="sides [m], [x, y] or [x, y, z]; omitted with spacing")
     resolution: int = Field(ge=2, le=MOST_CELLS, description="cells along the longest side; omitted with spacing")
-    spacing: Positive | None = Field(default=None, description="cell size [m] of a domain without far ends, instead of size and resolution")
+    spacing: Positive | None = Field(default=None, description="cell size [m] of an unbounded domain, instead of size and resolution")
     dimension: Literal[2, 3] | None = Field(default=None, description="number of axes, with spacing; default: 3")
     wall: Wall = Field(default="separating", description="boundary condition on the domain's walls")
     solids: Literal["cut-cell", "voxel"] = Field(
@@ -125,10 +125,12 @@ class Domain(Table):
         """Return what stands against `spacing` and `dimension`."""
         place, axes = ("domain", "spacing"), int(self.dimension or 0)
         if self.spacing is None:
-            return [Complaint(("domain", "dimension"), axes, "is of a domain with spacing; size says it otherwise")] if axes else []
+            return [Complaint(("domain", "dimension"), axes, "is only for a domain with spacing; otherwise size gives it")] if axes else []
         if (self.size, self.resolution) != ([MOST_CELLS * self.spacing] * axes, MOST_CELLS):
-            return [Complaint(place, self.spacing, "stands instead of size and resolution: leave these out, or it")]
-        return [] if self.follow else [Complaint(("domain", "follow"), False, "must be true with spacing: no grid covers such a domain")]
+            return [Complaint(place, self.spacing, "replaces size and resolution: give either spacing or these")]
+        return (
+            [] if self.follow else [Complaint(("domain", "follow"), False, "must be true with spacing: no grid covers an unbounded domain")]
+        )
 
 
 class Physics(Table):
@@ -277,7 +279,7 @@ class Scene(Table):
         for index, shape in enumerate(shapes):
             own = shape.complaints(self.dimension)
             if inside and not own and self.enclosed_volume(shape) == 0.0:
-                own = [Complaint((), None, f"lies outside the domain, which reaches from the origin to {self.domain.size} m")]
+                own = [Complaint((), None, f"lies outside the domain, which extends from the origin to {self.domain.size} m")]
             found += [Complaint((key, index, *complaint.place), complaint.value, complaint.message) for complaint in own]
         return found
 
@@ -305,8 +307,8 @@ class Scene(Table):
             if turned is not None and turned[0] > STRAY * self.spacing:
                 center = [float(f"{coordinate:.6g}") for coordinate in turned[1]]
                 found.append(
-                    f"{place} ({shape.shape}): rotate turns it about the origin, {turned[0]:.4g} m out of the domain; about its center it "
-                    f"turns with about = {center}"
+                    f"{place} ({shape.shape}): rotate about the origin moves it {turned[0]:.4g} m out of the domain; to rotate it "
+                    f"about its center, set about = {center}"
                 )
         return [*found, *scene_notes(self)]
 
@@ -327,7 +329,7 @@ class Scene(Table):
         preset = preset_line(self)
         return [
             *([("preset", preset)] if preset else []),
-            ("grid", f"no far ends, cells of {spacing}, at most {MOST_CELLS} along an axis" if self.domain.boundless else extent),
+            ("grid", f"unbounded, cells of {spacing}, at most {MOST_CELLS} along an axis" if self.domain.boundless else extent),
             ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
             *([("open", ", ".join(self.domain.open))] if self.domain.open else []),
             *([("moving", moving)] if moving else []),
@@ -349,7 +351,7 @@ class Scene(Table):
     def _outside_complaints(self) -> list[Complaint]:
         """Return which rigid bodies lie wholly outside the domain, as far as their keys tell."""
         return [
-            Complaint(("solid", index), None, f"lies outside the domain, which reaches from the origin to {self.domain.size} m")
+            Complaint(("solid", index), None, f"lies outside the domain, which extends from the origin to {self.domain.size} m")
             for index, solid in enumerate(self.solid)
             if solid.is_body and not solid.complaints(self.dimension) and self.enclosed_volume(solid) == 0.0
         ]

@@ -47,7 +47,7 @@ def installed_simulators() -> dict[str, Simulator]:
     try:
         return simulators()
     except (AttributeError, ImportError, TypeError) as error:
-        problem = KeyFault("", f"a simulator cannot be loaded: {error}; `warp-lcp info` tells whether another package has its name")
+        problem = KeyFault("", f"a simulator cannot be loaded: {error}; `warp-lcp info` shows whether another package has its name")
         raise SceneError("warp-lcp", [problem]) from error
 
 
@@ -149,7 +149,7 @@ def fix_file(source: str) -> list[str]:
     """
     file = Path(source)
     if not file.is_file() or source in built_in_scenes():
-        raise SceneError(source, [KeyFault("", "--fix rewrites scene files: this is none")])
+        raise SceneError(source, [KeyFault("", "--fix needs a scene file")])
     model = _scene_model(_parse(file, source), source)
     text, renamed = fix_text(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"), model, source)
     if renamed:
@@ -252,7 +252,7 @@ def _refuse_extremes(data: dict[str, Any], source: str) -> None:
         if isinstance(value, dict):
             waiting += [(f"{path}.{key}", entry, depth + 1) for key, entry in value.items()]
         elif isinstance(value, list) and len(value) > MOST_TABLES and isinstance(value[0], dict):
-            message = f"has {len(value):,} entries, of which a scene may have {MOST_TABLES:,}; a mesh holds more of them in one"
+            message = f"has {len(value):,} entries: at most {MOST_TABLES:,} are allowed; combine shapes in a mesh"
             problems.append(KeyFault(path, message))
         elif isinstance(value, list):
             waiting += [(f"{path}[{index}]", entry, depth + 1) for index, entry in enumerate(value)]

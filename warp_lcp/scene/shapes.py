@@ -263,7 +263,7 @@ class SolidProperties(Shape):
         moves = self.motion.complaints(dimension) if self.motion else []
         found = super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
         if self.drag is not None and self.rubs:
-            found.append(Complaint(("drag",), self.drag, "is for liquids: sand has friction"))
+            found.append(Complaint(("drag",), self.drag, "is for liquids; sand uses friction"))
         return found + (self._body_complaints() if self.is_body else self._still_complaints())
 
     def _body_complaints(self) -> list[Complaint]:
@@ -271,11 +271,11 @@ class SolidProperties(Shape):
         key = "mass" if self.mass is not None else "density"
         found = []
         if self.mass is not None and self.density is not None:
-            found.append(Complaint(("density",), self.density, "goes without mass: give one of them"))
+            found.append(Complaint(("density",), self.density, "cannot be combined with mass: give one of them"))
         if self.motion is not None:
-            found.append(Complaint(("motion",), None, f"goes without {key}: a rigid body moves as forces ask"))
+            found.append(Complaint(("motion",), None, f"cannot be combined with {key}: a rigid body is moved by forces"))
         if self.invert:
-            found.append(Complaint(("invert",), True, f"goes without {key}: everything but a shape has no mass"))
+            found.append(Complaint(("invert",), True, f"cannot be combined with {key}: the outside of a shape has no mass"))
         if self.shape == "plane":
             found.append(Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass"))
         return found
@@ -290,7 +290,7 @@ class SolidProperties(Shape):
         message = "needs mass or density, which make the solid a rigid body"
         found = [Complaint((name,), value, message) for name, value in given.items() if value is not None]
         if self.friction is not None and not self.rubs:
-            found.append(Complaint(("friction",), self.friction, f"{message}: a liquid does not rub against solids"))
+            found.append(Complaint(("friction",), self.friction, f"{message}: a liquid has no friction with solids"))
         return found
 
 
