@@ -59,7 +59,7 @@ def parsed(file: Path) -> ast.Module:
 
 
 def documented() -> dict[str, str]:
-    """Return the summary line of everything that docs/api shows: modules, classes, functions, methods."""
+    """Return the summary line of everything that docs/api shows or that `run` and `scene` have: modules, classes, functions."""
     found: dict[str, str] = {}
     for reference in re.findall(r"^::: (\S+)", "\n".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md")), re.MULTILINE):
         parts = reference.split(".")
@@ -69,6 +69,8 @@ def documented() -> dict[str, str]:
         for part in parts[len(file.relative_to(ROOT).with_suffix("").parts) :]:
             node = next(inner for inner in ast.iter_child_nodes(node) if getattr(inner, "name", "") == part)
         _add_summaries(found, reference, node)
+    for file in (file for package in ("run", "scene") for file in (ROOT / "warp_lcp" / package).glob("*.py")):
+        _add_summaries(found, f"{file.parent.name}.{file.stem}", parsed(file))
     return found
 
 

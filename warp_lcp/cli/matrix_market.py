@@ -1,4 +1,7 @@
-"""Matrix Market files of real numbers, read so that no file harms: SciPy's reader (1.17) ends the process where a number is cut short."""
+"""Safe reader of real Matrix Market files.
+
+SciPy's reader (1.17) ends the process where a number is cut short.
+"""
 
 from __future__ import annotations
 

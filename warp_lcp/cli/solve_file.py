@@ -33,7 +33,7 @@ FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was solved and how it went.
+    """Result of a solve and the problem solved.
 
     Attributes:
         problem: the problem.

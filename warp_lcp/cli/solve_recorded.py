@@ -1,4 +1,7 @@
-"""A problem of a grid from a file that `run --record-problems` wrote, solved by this process or by the ranks: `warp-lcp solve FILE.npz`."""
+"""Solve a recorded grid problem: `warp-lcp solve FILE.npz`.
+
+The file is written by `run --record-problems`; this process or ranks solve it.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ FIELD = ".npy"  # of their solutions
 
 @dataclass(frozen=True)
 class GridOutcome(Outcome):
-    """What was solved and how it went.
+    """Result of a solve and the grid problem solved.
 
     Attributes:
         shape: of the whole grid's cells, (nz, ny, nx) or (ny, nx).
@@ -54,7 +57,9 @@ class GridOutcome(Outcome):
         return f"{line}, ranks: {self.decomposition.ranks.size}, {boxes} boxes"
 
     def write(self, path: Path) -> None:
-        """Write x as a NumPy array of the shape of the cells; on ranks collective, the first one writes what the others send.
+        """Write x as a NumPy array of the shape of the cells; collective.
+
+        The first rank writes the parts of all.
 
         Raises:
             ProblemError: the file cannot be written.
@@ -123,7 +128,7 @@ def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, up
 
 
 def file_digest(path: Path) -> str | None:
-    """Return what tells a file's content from another's; None if it cannot be read, or has no end as a device has none."""
+    """Return a digest of a file's content; None if it cannot be read."""
     if not path.is_file():
         return None
     try:

@@ -1,4 +1,4 @@
-"""What can be told of a scene before its run: whether it is valid, and what a run of it would do."""
+"""Check a scene before its run, and summarize the run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ EVERYTHING = ("vtu", "xdmf", "vtk", "gmsh")  # formats that hold all parts with 
 
 
 def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene, list[tuple[str, str]]]:
-    """Return a scene, its shapes built once, and what a run of it would do, as pairs of a word and a line.
+    """Return a scene, with its shapes built once, and a summary of its run.
+
+    The summary has pairs of a word and a line.
 
     Args:
         path_or_name: as of `load_scene`.
@@ -58,7 +60,7 @@ def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
 
 
 def check_ranks(scene: Scene) -> None:
-    """Refuse a scene that nothing simulates on ranks, or whose output cannot be written in pieces.
+    """Refuse a scene that cannot run on ranks, or whose output cannot be in pieces.
 
     Raises:
         SceneError: listing what stands against it.
@@ -76,7 +78,9 @@ def check_ranks(scene: Scene) -> None:
 
 
 def check_output(scene: Scene) -> list[str]:
-    """Refuse a format of frames that does not hold what the scene writes; return a line for parts whose fields it does not hold.
+    """Refuse a format that cannot store the scene's output; return notes.
+
+    A note names the parts whose fields the format does not store.
 
     Raises:
         SceneError: naming the parts, why, and what the format holds.
@@ -116,7 +120,9 @@ def check_output(scene: Scene) -> list[str]:
 
 
 def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
-    """Return the simulation of a scene where a run begins, which refuses what a run would refuse before its first step.
+    """Return the simulation of a scene at its start.
+
+    Errors that a run would raise before its first step are raised.
 
     Args:
         scene: what would run.

@@ -34,7 +34,10 @@ from warp_lcp.simulation import InputError, Part, Simulation, SimulationFailed
 
 
 class RunError(InputError):
-    """What a program asks of its run is wrong. The message names the argument and says what is allowed."""
+    """Wrong argument of a run in Python.
+
+    The message names the argument and what is allowed.
+    """
 
 
 @dataclass(frozen=True)

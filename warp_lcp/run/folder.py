@@ -51,7 +51,7 @@ OWN_FOLDERS = {"frames": FRAME_FILE, CHECKPOINTS: STORED_STATE, "images": IMAGE_
 
 @dataclass
 class RunRecord:
-    """What run.json says of a run.
+    """Record of a run, as in run.json.
 
     Args:
         scene: the scene's name.
@@ -96,7 +96,7 @@ class RunRecord:
 
 @dataclass(frozen=True)
 class Continuation:
-    """Where a run goes on.
+    """State from which a run continues.
 
     Args:
         checkpoint: to continue from; None: nothing was computed yet.
@@ -141,7 +141,7 @@ class RunFolder:
 
     @contextmanager
     def held(self, *, resume: bool) -> Iterator[list[str]]:
-        """Keep other processes out of the folder, which is made if a new run needs it; yields remarks.
+        """Hold the lock of the folder, created if a new run needs it; yields remarks.
 
         Args:
             resume: there must be a run.
@@ -194,7 +194,7 @@ class RunFolder:
             )
 
     def start(self, record: RunRecord) -> None:
-        """Begin a run in a folder that `check_new` found fit: what an earlier run left is deleted.
+        """Start a run in a checked folder: delete the files of an earlier run.
 
         Raises:
             OSError: a file cannot be deleted or written.
@@ -218,7 +218,9 @@ class RunFolder:
         write_text(self.path / SCENE, dump_scene(self.scene))
 
     def resume(self) -> Continuation:
-        """Return where to continue: the newest checkpoint of which all is valid; one of a single process is on all ranks.
+        """Return the state to continue from: the newest valid checkpoint.
+
+        A checkpoint of a single process is read on all ranks.
 
         Raises:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
@@ -271,7 +273,9 @@ class RunFolder:
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
 
     def gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
-        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.run.gaps`; tables as of `open_log`.
+        """Return a line for each gap in the files up to a step.
+
+        See `warp_lcp.run.gaps`; tables as of `open_log`.
 
         Raises:
             OSError: a file cannot be read.
@@ -286,7 +290,9 @@ class RunFolder:
         return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
 
     def lacks(self, index: int, frame: list[Part]) -> bool:
-        """Return whether a file of a frame is missing or cut, given the frame as the run would write it.
+        """Return whether a file of a frame is missing or truncated.
+
+        Given the frame as the run would write it.
 
         Raises:
             OSError: a file cannot be read.
@@ -299,7 +305,9 @@ class RunFolder:
         return any(index in whole.missing(kind, index + 1) for kind in whole.kinds(frame))
 
     def go_on(self, record: RunRecord, step: int) -> None:
-        """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
+        """Prepare the folder to continue after a step.
+
+        Called once everything has been checked; incomplete files of a killed process are deleted.
 
         Raises:
             OSError: a file cannot be written, renamed or deleted.
@@ -322,11 +330,14 @@ class RunFolder:
         return Log(self.log.with_stem(table), columns, after_step=after_step, collective=self.collective)
 
     def frame_writer(self, watch: Stopwatch) -> FrameWriter | RankFrameWriter:
-        """Return what writes the frames while the simulation goes on."""
+        """Return the frame writer, which works while the simulation continues."""
         return RankFrameWriter(self.frames, watch) if isinstance(self.frames, RankFrames) else FrameWriter(self.frames, watch)
 
     def write_record(self, record: RunRecord) -> None:
-        """Write run.json; that of a run that begins keeps room for the one of its end, which is written even if the disk is full.
+        """Write run.json.
+
+        At the start, room for the final record is reserved, so that it can be written on a full
+        disk.
 
         Raises:
             OSError: the disk is full before the run begins, or cannot be written at all; on the root rank.
@@ -423,12 +434,15 @@ class RunFolder:
 
 
 def holds_run(folder: Path) -> bool:
-    """Return whether there is a run in a folder: its record, or a checkpoint where somebody has deleted that."""
+    """Return whether a folder holds a run: its record, or a checkpoint."""
     return (folder / RECORD).is_file() or any(CHECKPOINT_FILE.fullmatch(file.name) for file in folder.glob(f"{CHECKPOINTS}/*"))
 
 
 def mark_ended(folder: Path, status: Status, reason: str) -> None:
-    """Write into run.json how the run has ended, if it says that it is running; for who ends the process and has no record of the run."""
+    """Write the end of a run into run.json, if it says that it is running.
+
+    For code that ends the process without the record of the run.
+    """
     with suppress(OSError):
         record = read_record(folder)
         if record.get("status") == "running":
@@ -436,7 +450,7 @@ def mark_ended(folder: Path, status: Status, reason: str) -> None:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return what run.json says; nothing if it cannot be read, or a value is of a type that no run writes."""
+    """Return the content of run.json; empty if it cannot be read or is invalid."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         for key, kind in _record_types().items():
@@ -454,7 +468,7 @@ def _record_types() -> dict[str, TypeAdapter[Any]]:
 
 
 def recorded_keys(path: Path) -> dict[str, Any] | None:
-    """Return the keys of the scene as it ran; None if there is no such file or it is not a scene's."""
+    """Return the keys of the scene as run; None without a valid file."""
     try:
         return keys(load_scene(path))
     except SceneError:

@@ -1,4 +1,4 @@
-"""One process a run's folder: a lock that ends with its process, however that ends."""
+"""Exclusive lock on a run folder, released when the process exits."""
 
 from __future__ import annotations
 

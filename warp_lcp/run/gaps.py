@@ -1,4 +1,4 @@
-"""What a run's folder lacks of the steps and frames before the one that the run goes on from: somebody has cut or deleted files."""
+"""Find missing log rows and frames when a run is resumed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ def gaps(
     logs: Mapping[Path, Sequence[str]], frames: FrameFolder, checkpoints: CheckpointFolder, *, step: int, times: Sequence[float],
     frame: Sequence[Part],
 ) -> list[str]:  # fmt: skip
-    """Return a line for each file or kind of files that has holes, with what to do about it; the checkpoints that it takes are spared.
+    """Return a line for each kind of files with gaps, with a remedy.
+
+    Checkpoints that the remedy needs are spared.
 
     Args:
         logs: the columns of log.csv and of the tables beside it.

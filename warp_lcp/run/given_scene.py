@@ -1,4 +1,4 @@
-"""The scene that a run is given: a file with what `--set` overrides, also when it goes on, with what was overridden before."""
+"""Scene of a new or resumed run, with its `--set` overrides."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The run loop: frames at their exact times, steps that are tried again, checkpoints, and an honest end."""
+"""Time loop: step retries, exact frame times, checkpoints, exit status."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ SPACE_MARGIN = 1.1
 
 @dataclass(frozen=True, kw_only=True)
 class RunRequest:
-    """What a run is asked for, as the options of `warp-lcp run`.
+    """Options of a run, as of `warp-lcp run`.
 
     Args:
         scene: what to simulate, the same on all ranks.
@@ -107,7 +107,7 @@ def running_scene(
     profile: Profile | None = None,
     collective: Collective | None = None,
 ) -> Generator[RunLoop, None, RunRecord]:
-    """Simulate a scene as far as its frames are asked for; collective where ranks share the run.
+    """Simulate a scene as far as frames are requested; collective on ranks.
 
     Between frames the caller may change the simulation. Once the generator is closed, the run ends as one that was stopped.
 
@@ -256,7 +256,7 @@ class RunLoop:
         self._checkpoint_time = clock.monotonic()
 
     def execute(self, last_frame: int | None, stop: Callable[[], bool | str], *, resumed: bool) -> Generator[RunLoop, None, RunRecord]:
-        """Run from frame to frame to the last, and write in run.json how that ended, whatever happened."""
+        """Run to the last frame and write the exit status into run.json."""
         count = self.time.frame_count
         last = count if last_frame is None else min(last_frame, count)
         start = self._frame()

@@ -1,4 +1,7 @@
-"""The fastest settings for an accuracy: measured on a scene's own first frames, on the device that is to run it."""
+"""Find the fastest settings for an accuracy by trial runs of the first frames.
+
+On the device that will run the scene.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ class Candidate:
 
 @dataclass
 class Tuning:
-    """What a tuning found.
+    """Result of a tuning.
 
     Attributes:
         scene: with the settings chosen.
@@ -75,15 +78,15 @@ class Tuning:
 
     @property
     def met(self) -> bool:
-        """Return whether the settings chosen are as near as the accuracy asks, or as can be told."""
+        """Return whether the chosen settings meet the accuracy, or the noise limit."""
         return self.limit <= 1.0
 
     def near_enough(self, own: Trial) -> bool:
-        """Return whether another run is as near to the reference as those that the fastest was chosen of."""
+        """Return whether another run is within the bounds of the chosen one."""
         return self.bounds.miss(own, self.reference) <= self.limit
 
     def verdict(self, accuracy: str) -> list[str]:
-        """Return in words what is the fastest, whether it keeps the accuracy, and where not, by how much, why, and what would help."""
+        """Return the result in words: settings, accuracy, missed bounds and a remedy."""
         best, asked, volume = self.chosen, self.preset, self.chosen.trial.volume_error(self.reference)
         words = f"{best.words()}: {best.seconds:.3g} s"
         found = f"distance {best.distance:.4f} (at most {asked.distance:g}), volume or packing {volume:.3f} (at most {asked.volume:g})"

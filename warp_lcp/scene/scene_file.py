@@ -1,4 +1,4 @@
-"""Read a scene by its name or path, apply overrides, and write a scene back as it was resolved."""
+"""Read a scene by name or path, apply overrides, and write the resolved scene."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ def installed_simulators() -> dict[str, Simulator]:
 
 
 def load_scene(source: SceneSource, overrides: Sequence[str] = ()) -> Scene:
-    """Return a scene, checked, with absolute paths: the class is the `scene_model` of its simulator.
+    """Return a validated scene with absolute paths.
+
+    Its class is the `scene_model` of its simulator.
 
     Args:
         source: a TOML file, the name of a built-in scene, tables as such a file has them, or a scene.
@@ -112,7 +114,9 @@ def override_value(override: str) -> str:
 
 
 def scene_value(source: SceneSource, override: str) -> str:
-    """Return the value that a scene's file has where an override sets one, in words; `null` if there is none.
+    """Return the value of an overridden key in the scene file, in words.
+
+    `null` if there is none.
 
     Raises:
         SceneError: the file cannot be read.
@@ -127,7 +131,7 @@ def scene_value(source: SceneSource, override: str) -> str:
 
 
 def single_tables(source: SceneSource) -> dict[str, set[str]]:
-    """Return the keys of each table of which a scene of its simulator has one at most, such as `domain`.
+    """Return the keys of each table that a scene has at most once, such as `domain`.
 
     Raises:
         SceneError: the file cannot be read, or names no simulator.
@@ -142,7 +146,9 @@ def single_tables(source: SceneSource) -> dict[str, set[str]]:
 
 
 def fix_file(source: str) -> list[str]:
-    """Replace old names of keys in a scene file; return a line for each, such as "material.angle_of is now ...".
+    """Replace old key names in a scene file; return a line for each.
+
+    Such as "material.angle_of is now ...".
 
     Raises:
         SceneError: the source is no file, cannot be read, or cannot be rewritten.
@@ -179,7 +185,7 @@ def dump_scene(scene: Scene) -> str:
 
 
 def keys(scene: Scene) -> dict[str, Any]:
-    """Return every key of a scene with its value, such as `time.cfl` or `liquid[0].max`."""
+    """Return all keys of a scene with values, such as `time.cfl` or `liquid[0].max`."""
     return table_keys(scene.model_dump(by_alias=True, exclude_none=True))
 
 

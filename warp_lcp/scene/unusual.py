@@ -1,4 +1,4 @@
-"""Settings that look like mistakes: a number in another unit, gravity upward, angles in radians, material beyond the domain.
+"""Suspicious settings: wrong units, gravity upward, material beyond the domain.
 
 They are allowed, and told at the start of a run and by `check`, with the value, what is usual, and the unit.
 """
@@ -25,7 +25,7 @@ MOVED = 0.5  # cells: a motion shorter than this by the end of a run is not visi
 
 @dataclass(frozen=True)
 class Usual:
-    """What a key usually is.
+    """Usual range of a key.
 
     Args:
         low: least value that is not told of.
@@ -57,7 +57,10 @@ BODY_DENSITY = Usual(5.0, 25e3, "kg/m^3", "10 (foam) to 22,600 (osmium)", "g/cm^
 
 
 def radians_meant(place: str, values: float | Sequence[float] | None, unit: str = "degrees") -> Iterator[str]:
-    """Yield a line about angles whose number is one that radians have: a multiple of pi / 4, to three digits, with two decimals or more."""
+    """Yield a line about angles that look like radians.
+
+    A multiple of pi / 4 to three digits, with two decimals or more.
+    """
     for value in np.atleast_1d([] if values is None else values).tolist():
         multiple = round(value / FRACTION)
         near = abs(value - FRACTION * multiple) < DIGITS * abs(value) and round(value, 1) != value
@@ -105,7 +108,7 @@ def _solid_notes(scene: Scene, place: str, solid: Solid) -> Iterator[str]:
 
 
 def material_notes(scene: Scene, key: str, materials: Sequence[MaterialProperties]) -> Iterator[str]:
-    """Yield which material reaches far out of the domain, and whether nothing moves by half a cell."""
+    """Yield material that extends far out of the domain, and scenes without motion."""
     size = np.array(scene.domain.size)
     for number, shape in enumerate(materials):
         box = None if shape.invert else shape.bounds(scene.dimension)
