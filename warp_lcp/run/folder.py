@@ -194,7 +194,7 @@ class RunFolder:
             )
 
     def start(self, record: RunRecord) -> None:
-        """Start a run in a checked folder: delete the files of an earlier run.
+        """Start a run in a checked folder; files of an earlier run are deleted.
 
         Raises:
             OSError: a file cannot be deleted or written.
@@ -218,9 +218,7 @@ class RunFolder:
         write_text(self.path / SCENE, dump_scene(self.scene))
 
     def resume(self) -> Continuation:
-        """Return the state to continue from: the newest valid checkpoint.
-
-        A checkpoint of a single process is read on all ranks.
+        """Return the newest valid checkpoint to continue from; the same on all ranks.
 
         Raises:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
@@ -273,9 +271,7 @@ class RunFolder:
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
 
     def gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
-        """Return a line for each gap in the files up to a step.
-
-        See `warp_lcp.run.gaps`; tables as of `open_log`.
+        """Return a line for each gap in the files up to a step; see `warp_lcp.run.gaps`.
 
         Raises:
             OSError: a file cannot be read.
@@ -290,9 +286,7 @@ class RunFolder:
         return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
 
     def lacks(self, index: int, frame: list[Part]) -> bool:
-        """Return whether a file of a frame is missing or truncated.
-
-        Given the frame as the run would write it.
+        """Return whether a file of a frame, as the run would write it, is missing or cut.
 
         Raises:
             OSError: a file cannot be read.
@@ -305,9 +299,7 @@ class RunFolder:
         return any(index in whole.missing(kind, index + 1) for kind in whole.kinds(frame))
 
     def go_on(self, record: RunRecord, step: int) -> None:
-        """Prepare the folder to continue after a step.
-
-        Called once everything has been checked; incomplete files of a killed process are deleted.
+        """Prepare a checked folder to continue after a step; delete incomplete files.
 
         Raises:
             OSError: a file cannot be written, renamed or deleted.
@@ -439,10 +431,7 @@ def holds_run(folder: Path) -> bool:
 
 
 def mark_ended(folder: Path, status: Status, reason: str) -> None:
-    """Write the end of a run into run.json, if it says that it is running.
-
-    For code that ends the process without the record of the run.
-    """
+    """Write the end of a run into run.json, if it still says that the run goes on."""
     with suppress(OSError):
         record = read_record(folder)
         if record.get("status") == "running":
