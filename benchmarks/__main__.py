@@ -42,7 +42,7 @@ def main() -> None:
     for line in report.write(given.suite, suite.TITLE, results, given.out):
         options.say(line)
     for line in results.failures:
-        options.say(f"not as it must be: {line}")
+        options.say(f"check failed: {line}")
     if results.failures:
         sys.exit(1)
 

@@ -203,7 +203,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.bits", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--part", choices=PARTS, action="append")
-    parser.add_argument("--seed", type=int, default=0, help="of other problems of the same kinds (but scenes and splashes)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random problems (scenes and splashes have none)")
     args = parser.parse_args()
     globals()["SEED"] = args.seed
     parts, lines = args.part or PARTS, list[str]()

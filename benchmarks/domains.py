@@ -137,7 +137,7 @@ def _flight() -> Record:
             grids.append(simulation.grid)
     whole = time.perf_counter() - begun
     figures = {
-        "laying": Figure(100.0 * (watch.seconds["laying the grid"] + watch.seconds["spray"]) / whole, "%"),
+        "laying": Figure(100.0 * (watch.seconds["regridding"] + watch.seconds["spray"]) / whole, "%"),
         "grids": Figure(len(grids)),
         "steps": Figure(simulation.step_count - STEPS),
         "step": Figure(1e3 * whole / (simulation.step_count - STEPS), "ms"),

@@ -289,18 +289,18 @@ def launched(graph: Any) -> None:
 def main() -> int:
     """Try everything; return 1 if a claim fails, 2 if there is no device."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rehearse", action="store_true", help="on the CPU in CUDA's form, small")
+    parser.add_argument("--rehearse", action="store_true", help="small rehearsal on the CPU, with the CUDA code paths")
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--out", type=Path, default=Path("out/gpu"))
     given = parser.parse_args()
     if not given.rehearse and not wp.is_cuda_available():
-        print("no CUDA device here: `--rehearse` shows what would be done", file=sys.stderr)
+        print("no CUDA device: use `--rehearse` for a rehearsal on the CPU", file=sys.stderr)
         return 2
     given.out.mkdir(parents=True, exist_ok=True)
     verdict = Verdict("cpu" if given.rehearse else given.device, rehearsal=given.rehearse, out=given.out.resolve())
     verdict.all()
     verdict.write()
-    print(f"{given.out}/verdict.md, and verdict.json to send in")
+    print(f"{given.out}/verdict.md and verdict.json")
     return int(any(not c.holds for c in verdict.claims))
 
 

@@ -202,8 +202,8 @@ def table(small: Work, large: Work, n: int, times: int = 1) -> str:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, default=128, help="along an axis of what is heard")
-    parser.add_argument("--step-cells", type=int, help="the same of steps; as many")
+    parser.add_argument("--cells", type=int, default=128, help="cells along an axis of the recorded solve")
+    parser.add_argument("--step-cells", type=int, help="cells along an axis of the recorded steps")
     given = parser.parse_args()
     n, cells = given.cells, given.step_cells or given.cells
     (small, _), (large, iterations) = solve(n // 2), solve(n)
@@ -212,7 +212,7 @@ def main() -> None:
     before, after = step(cells // 2), step(cells)
     print(f"\nA step of the dam break [ms]: {after.readbacks / HEARD:.0f} readbacks, {after.stages / HEARD:.0f} stages\n")
     print(table(before, after, cells, HEARD))
-    print("\nWhat moves most in a solve\n")
+    print("\nLargest memory traffic of a solve\n")
     print(large.passes())
 
 

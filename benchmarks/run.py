@@ -33,7 +33,7 @@ STAGES: dict[str, tuple[ModuleType | type, str]] = {
     "to grid": (particle_simulation, "particles_to_faces"),
     "to particles": (particle_simulation, "faces_to_particles"),
     "advection": (WholeCells, "advect"),
-    "extrapolation": (WholeCells, "extend"),
+    "extrapolation": (WholeCells, "extrapolate_velocity"),
     "solve": (wl, "solve"),
 }
 

@@ -48,15 +48,15 @@ class Suite:
     ) -> list[Path]:
         """Measure in a process of its own, as `warp_lcp.cli.suites.Benchmark.run` says; a failed check leaves the files and is an error."""
         if sizes and not self.resizable:
-            raise ValueError(f"size = {sizes[0]}: the suite {self.name} has its own resolutions")
+            raise ValueError(f"size = {sizes[0]}: cannot be given for the suite {self.name}, which has its own resolutions")
         if repeat < 1:
             raise ValueError(f"repeat = {repeat}: must be >= 1")
         if min(sizes, default=8) < 8:
-            raise ValueError(f"size = {min(sizes)}: must be >= 8 cells a side")
+            raise ValueError(f"size = {min(sizes)}: must be >= 8, the cells along a side")
         if scene and not self.scenes:
-            raise ValueError(f"{scene}: the suite {self.name} has scenes of its own; use tradeoff")
+            raise ValueError(f"{scene}: the suite {self.name} has its own scenes; use tradeoff")
         if seed is not None and not self.seeded:
-            raise ValueError(f"--seed {seed}: the suite {self.name} draws no problems; use extremes")
+            raise ValueError(f"--seed {seed}: the suite {self.name} has no random problems; use extremes")
         if seed is not None and seed < 0:
             raise ValueError(f"--seed {seed}: must be >= 0")
         name = RANKS if shared else self.name
@@ -70,7 +70,7 @@ class Suite:
         if shared and launch.rank_here():  # the first of several ranks speaks for all
             raise SystemExit(process.returncode)
         if process.returncode == WRONG_INPUT:
-            raise ValueError(f"the suite {name} refused its input")
+            raise ValueError(f"the suite {name} rejected its input")
         if process.returncode != 0:
             raise RuntimeError(f"the suite {name} ended with exit code {process.returncode}")
         return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".png"))
@@ -96,7 +96,7 @@ SOLVERS = Suite(
 )
 PUBLISHED = Suite(
     "published",
-    "methods that were published for the pressure LCP, as published and as here, on the same splash: iterations and seconds",
+    "published methods for the pressure LCP, as published and as implemented here, on the same splash: iterations and seconds",
     "5 minutes",
 )
 SCALING = Suite(
@@ -121,28 +121,24 @@ DEVICES = Suite(
 )
 DOMAINS = Suite(
     "domains",
-    "the same liquid in domains of 48^3 to 768^3 cells: a step, its memory, a checkpoint; laying grids around a ball that flies",
+    "the same liquid in domains of 48^3 to 768^3 cells: a step, its memory, a checkpoint; regridding around a flying ball",
     "2 minutes",
 )
 PEERS = Suite(
     "peers",
-    "the same problems by PyAMG, AMGCL, SciPy, PETSc, OSQP, PIQP, Clarabel, Warp's CG, as far as they are there",
+    "the same problems by PyAMG, AMGCL, SciPy, PETSc, OSQP, PIQP, Clarabel, Warp's CG, if installed",
     "10 minutes; peers: OSQP, PIQP, Clarabel; PETSc, AMGCL by themselves",
 )
-RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost", "2 minutes")
+RUN = Suite("run", "steps per second of built-in scenes, and the cost of particles", "2 minutes")
 SAND = Suite("sand", "sand: the coupled methods at equal residual, the yield sets, steps of large scenes", "6 minutes")
 CONTACTS = Suite(
     "contacts", "rigid contacts: methods on the scenes of figures 2.9 and 2.11, NNCG against PGS at equal sweeps", "5 minutes", False
 )
-BOOK = Suite(
-    "book", "appendix C of Niebe and Erleben, figures 2.3, 2.10 and 2.12: as the book has them, and as they should be", "8 minutes"
-)
-MODELS = Suite(
-    "models", "what each model that a scene can turn on adds to a step and to memory: the prices that `warp-lcp check` tells", "30 minutes"
-)
+BOOK = Suite("book", "appendix C of Niebe and Erleben, figures 2.3, 2.10 and 2.12: as printed, and corrected", "8 minutes")
+MODELS = Suite("models", "time per step and memory of each model of a scene: the cost table of `warp-lcp check`", "30 minutes")
 TRADEOFF = Suite(
     "tradeoff",
-    "what accuracy costs: seconds, iterations and bytes of runs and solves against residuals, errors and what a user sees",
+    "cost of accuracy: seconds, iterations and bytes of runs and solves against residuals, errors and visible differences",
     "25 minutes",
     scenes=True,
 )
@@ -154,7 +150,7 @@ VALIDATION = Suite(
 )
 EXTREMES = Suite(
     "extremes",
-    "hostile problems and scenes: solved, refused or stopped as is fixed beforehand, checked by NumPy and SciPy; random problems by seed",
+    "hostile problems and scenes with a fixed outcome (solved, refused or stopped), checked by NumPy and SciPy; random problems by seed",
     "5 minutes",
     False,
     seeded=True,

@@ -1,4 +1,4 @@
-"""Rigid bodies in the pressure's problem: what their motions displace, and what the pressure does to them."""
+"""Rigid bodies in the pressure solve: displaced volume and pressure impulses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ SPARE = 1.5  # room for entries, times those there are when there is none left
 
 
 class BodyCoupling:
-    """Move bodies and liquid by one pressure [Batty, Bertails & Bridson 2007].
+    """Coupling of rigid bodies and liquid by one pressure.
+
+    After [Batty, Bertails & Bridson 2007].
 
     A body's velocity is V* + M^-1 I after the pressure's impulse I = rho dx^d U'x of its x [m/s], and the outflow of a cell gains
     U V: U_iq is the sum over the faces of cell i of s_f (1 - a_f) times the velocity of unit motion q at the face's center, s_f = +-1
@@ -28,8 +30,8 @@ class BodyCoupling:
 
         y = b + (A + rho dx^d U M^-1 U') x,
 
-    symmetric and positive semi-definite like A. What pushes the liquid pushes the body back on the same faces: momentum is exchanged
-    without loss, and so is energy but for what y leaves.
+    symmetric and positive semi-definite like A. Liquid and body exchange opposite impulses on the same faces: momentum is conserved
+    exactly, and energy up to the residual y.
 
     Args:
         grid: the grid.
@@ -37,7 +39,7 @@ class BodyCoupling:
         bodies: the bodies.
         density: of the liquid [kg/m^3].
         share: factor on U V in the outflow, where the problem is one of masses, see `fluids.unilateral`.
-        solved: cells that the problem is of, whose fields have a ring around them; None: all of the grid's domain.
+        solved: cells of the problem, whose fields have a ring around them; None: all of the grid's domain.
     """
 
     def __init__(
@@ -62,12 +64,15 @@ class BodyCoupling:
         self._low: wl.LowRankOperator | None = None
 
     def join(self, A: wl.GridPoisson) -> wl.SumOperator:
-        """Return the operator of liquid and bodies, A + rho dx^d U M^-1 U', which `take` keeps up to date."""
+        """Return the operator A + rho dx^d U M^-1 U' of liquid and bodies.
+
+        `take` updates it in place.
+        """
         self._low = wl.LowRankOperator.of_blocks(A, self.columns, self._weights())
         return wl.SumOperator(A, self._low)
 
     def take(self, kind: wp.array) -> None:
-        """Find U for bodies where the solids are placed and M^-1 as it is now.
+        """Update U for the placed solids, and M^-1.
 
         Args:
             kind: int8 of AIR, FLUID, SOLID.
@@ -92,13 +97,15 @@ class BodyCoupling:
             self._low.update(self._weights())
 
     def push(self, x: wp.array) -> None:
-        """Give the bodies the impulses of a pressure x = kick_dt p / (rho dx) [m/s], a stored field."""
+        """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""
         sums = self.columns.gather(x.flatten()).numpy()
         for body, impulse in zip(self.bodies.bodies, self._scale * sums.reshape(-1, self.width), strict=True):
             body.apply_impulse(impulse)
 
     def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Let particles that a body has buried move with it: beneath it, on a floor, gravity alone would act on them for ever.
+        """Move particles buried by a body with it.
+
+        Below a body that rests on a floor, gravity alone would act on them.
 
         Args:
             velocity: of each component [m/s] (updated on closed faces that no liquid is near).

@@ -1,4 +1,4 @@
-"""The models of a liquid that a scene asks for, made: free surface, pressure, surface tension, viscosity."""
+"""Build a liquid's models: surface, pressure, surface tension, viscosity."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ VISCOUS_TOLERANCE = 1e-4  # where the pressure's comes from the time step
 def make_surface(
     scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, fill: Fill | None = None, counted: Window | None = None
 ) -> FreeSurface:
-    """Return the free surface that a scene asks for.
+    """Return the free surface of a scene.
 
     Args:
         scene: the scene.
         grid: its grid.
         boundary: its solids.
-        fill: adds to the particles' density what none of them stands for, as where they are in a band alone.
-        counted: cells whose volume is asked for; None: all.
+        fill: adds the density of liquid without particles, such as below a narrow band.
+        counted: cells whose volume is computed; None: all.
     """
     if scene.stays_full and not boundary.velocity:  # walls that a caller moves might make room
         return NoSurface(grid, boundary, counted)
@@ -48,7 +48,10 @@ def make_surface(
 def make_tension(
     scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, make: Callable[..., SurfaceTension] = SurfaceTension
 ) -> SurfaceTension | None:
-    """Return the surface tension of a scene, made by what takes the arguments of `SurfaceTension`; None: it has none, or no surface."""
+    """Return the surface tension of a scene, or None without tension or surface.
+
+    `make` is called with the arguments of `SurfaceTension`.
+    """
     given = scene.surface_tension
     if given is None or surface.phi is None:
         return None
@@ -57,14 +60,20 @@ def make_tension(
 
 
 def pressure_settings(scene: LiquidScene, surface: FreeSurface, weights: list[wp.array]) -> dict[str, Any]:
-    """Return what a scene sets of `PressureProjection`, with the weights of the particles on each component's faces."""
+    """Return the arguments of `PressureProjection` that a scene sets.
+
+    Includes the particle weights on the faces of each component.
+    """
     settings, gravity = scene.solver, float(np.linalg.norm(scene.physics.gravity))
     resting = {"lets_go": scene.lets_go, "weights": weights if scene.short_steps else None, "phi": surface.phi}
     return {"tolerance": settings.tolerance, "max_iterations": settings.max_iterations, "gravity": gravity} | resting
 
 
 def unilateral_settings(scene: LiquidScene, surface: GhostFluidSurface, weights: list[wp.array]) -> dict[str, Any]:
-    """Return what a scene sets of `UnilateralPressure`; arguments as of `pressure_settings`."""
+    """Return the arguments of `UnilateralPressure` that a scene sets.
+
+    Arguments as in `pressure_settings`.
+    """
     settings = pressure_settings(scene, surface, weights)
     shared = {name: settings[name] for name in ("tolerance", "max_iterations", "gravity")}
     return shared | {"level_set": surface.level_set, "weights": weights}
@@ -73,15 +82,15 @@ def unilateral_settings(scene: LiquidScene, surface: GhostFluidSurface, weights:
 def make_pressure(
     scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array], bodies: RigidBodies | None
 ) -> PressureProjection:
-    """Return the pressure that a scene asks for, of liquid and the bodies in it.
+    """Return the pressure solver of a scene, for the liquid and its rigid bodies.
 
     Args:
         scene: the scene.
         grid: its grid.
         boundary: its solids.
         surface: the free surface.
-        weights: those of the particles on each component's faces.
-        bodies: those that the liquid moves, among the solids; None: there are none.
+        weights: of the particles on the faces of each component.
+        bodies: rigid bodies among the solids; None: there are none.
     """
     solver = wl.METHODS[scene.solver.method](precision=scene.solver.precision)
     coupling, settings = None, pressure_settings(scene, surface, weights)
@@ -97,7 +106,10 @@ def make_viscosity(
     scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, bodies: RigidBodies | None,
     make: Callable[..., Viscosity] = Viscosity,
 ) -> Viscosity | None:  # fmt: skip
-    """Return the viscosity that a scene asks for, if it does, made by what takes the arguments of `Viscosity`."""
+    """Return the viscosity of a scene, or None.
+
+    `make` is called with the arguments of `Viscosity`.
+    """
     if scene.viscosity is None:
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE

@@ -1,4 +1,4 @@
-"""The pressure that keeps a liquid incompressible and lets it leave separating walls: one LCP a step."""
+"""Pressure projection of an incompressible liquid with separating walls: one LCP."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
-from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
+from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary import Boundary
@@ -38,13 +38,13 @@ COUNT = RowPass(
 
 @functools.cache
 def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> SimpleNamespace:
-    """Return `prepare`, `subtract_gradient`, `support` and `contact`.
+    """Return the kernels `prepare`, `subtract_gradient`, `support` and `contact`.
 
     Args:
         cut: whether faces have open fractions.
         moving: whether solids have velocities.
         ghost: whether the free surface lies between cells.
-        bounded: whether a wall lets go; else there is no lower bound.
+        bounded: whether a wall is separating; else there is no lower bound.
     """
     module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost + "_equations" * (not bounded)
     flags = {"CUT": cut, "MOVING": moving, "GHOST": ghost, "BOUNDED": bounded, "THETA_MIN": THETA_MIN, "TINY_WEIGHT": TINY_WEIGHT}
@@ -70,10 +70,10 @@ RELEASE_FACTOR = 10.0  # a wall cell lets go if its outflow exceeds this multipl
 
 @dataclass(frozen=True)
 class Projection:
-    """What a projection found.
+    """Result of a pressure projection.
 
     Attributes:
-        result: of the solve; `result.x` is kick_dt p / (rho dx) [m/s]. None: no cell holds liquid, there was nothing to solve.
+        result: of the solve; `result.x` is kick_dt p / (rho dx) [m/s]. None: no cell holds liquid.
         unknowns: FLUID cells.
         found: returns `released` and `max_outflow`, and waits for the device.
     """
@@ -88,17 +88,20 @@ class Projection:
 
     @property
     def released(self) -> int:
-        """Wall cells that let go."""
+        """Number of wall cells where the liquid separates."""
         return int(self._found[0])
 
     @property
     def max_outflow(self) -> float:
-        """Largest |y| of the other FLUID cells, recomputed from the projected velocities [m/s]."""
+        """Largest |y| of the other FLUID cells after the projection [m/s].
+
+        Recomputed from the projected velocities.
+        """
         return self._found[1]
 
 
 class PressureProjection:
-    """Solve for the pressure of the liquid's cells and project the velocity.
+    """Pressure solve and projection of the velocity.
 
     With x = kick_dt p / (rho dx) [m/s] on FLUID cells, s_f = +-1 outward, a_f the open fraction of a face, u_s the solid's velocity and
     theta_f the distance to the free surface in cells where air is beyond the face, else 1 [Batty, Bertails & Bridson 2007],
@@ -107,9 +110,9 @@ class PressureProjection:
 
     is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is not open on a separating wall have
     0 <= x complementary to y >= 0, the others y = 0. Liquid that wets the wall has -kick_dt `adhesion` in the place of 0, and its `jump`
-    beside a surface that pulls by more: no air gets between liquid and wall against it. Whole cells have a = 0 or 1, a surface on the
+    beside a surface with a stronger pull: air then cannot enter between liquid and wall. Whole cells have a = 0 or 1, a surface on the
     cells' faces theta = 1: without solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the
-    diagonal. Beyond an open side of the domain lies AIR that the operator does not have: its faces add a_f / theta_f.
+    diagonal. Beyond an open side of the domain lies AIR outside of the operator: its faces add a_f / theta_f.
 
     Material in AIR cells has no pressure; where the velocity is continued into air, it takes that of liquid beside it. With `weights`, for
     short steps, it rests on the surface instead: a face there that particles gave weight takes the mean change of the projected faces
@@ -124,20 +127,20 @@ class PressureProjection:
         tolerance: relative residual at which a solve is done; "auto": see `fluids.tolerance`.
         max_iterations: of the method a solve may take.
         phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID cells; None: it lies on the cells' faces.
-        coupling: with bodies that the pressure moves, whose term A then has too; None: there are none.
-        lets_go: whether a wall separates; else y = 0 on all cells, and no bounds are stored.
-        weights: of the particles on each component's faces; None: nothing rests on the surface.
-        gravity: its size [m/s^2], the most that the surface supports.
+        coupling: coupling with rigid bodies, whose term is added to A; None: there are none.
+        lets_go: whether a wall is separating; else y = 0 on all cells, and no bounds are stored.
+        weights: of the particles on the faces of each component; None: no support of spray by the surface.
+        gravity: magnitude of gravity [m/s^2], the limit of that support.
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID, which the caller marks.
         cells: `kind` of the last projection, which pressure and contact belong to; as first marked before it.
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
-        known: int8, one field a component: which faces the last projection made valid, see `warp_lcp.grid.extrapolate`.
-        jump: of the pressure across the surface [m/s] in cells beside it, float32, which whoever pushes u* by it sets; None: there is none.
-        adhesion: what air has to overcome between wall and liquid, as the pressure that a cell bears below the air's, over rho dx [m/s^2].
-        automatic: what sets the tolerance from step to step, if something does.
+        known: int8, one field per component: faces that the last projection made valid, see `warp_lcp.grid.extrapolate`.
+        jump: of the pressure across the surface [m/s] in cells beside it, float32, set by the surface tension; None: there is none.
+        adhesion: pressure below that of the air at which liquid detaches from a wall, over rho dx [m/s^2].
+        automatic: automatic tolerance, or None.
     """
 
     def __init__(
@@ -162,18 +165,25 @@ class PressureProjection:
         self._least: Any = -np.inf if self._lower is None else self._lower
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._count, self._contacts = WindowTally(COUNT, grid), WindowTally(self._passes.contact, grid)
-        self._trail, self._solved, self._rhs, self._guess = Trail(grid.domain), grid.domain, self._b, self._start  # what is solved for
+        self._trail, self._solved, self._rhs, self._guess = (
+            DirtyRegion(grid.domain),
+            grid.domain,
+            self._b,
+            self._start,
+        )  # what is solved for
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
 
     def show(self) -> None:
-        """Show `kind` in frames though nothing has been projected yet."""
+        """Set the cell kinds shown in frames before the first projection."""
         wp.copy(self.cells, self.kind)
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> bool:
-        """Set up the problem of the marked cells; return whether there is one. The first guess is the last pressure.
+        """Set up the problem of the marked cells; return whether there is one.
 
-        It may have no unknowns: `counted` tells, and waits for the device.
+        The first guess is the last pressure.
+
+        It may have no unknowns: `counted` returns their number and waits for the device.
 
         Args:
             velocity: u* of each component [m/s].
@@ -200,7 +210,7 @@ class PressureProjection:
         self._solved = self._trail.through(window)
 
     def leave(self) -> Projection:
-        """Take a step without liquid cells: all is spray."""
+        """Record a step without liquid cells: all liquid is spray."""
         for field in (self.pressure, self.contact, *self.known):
             field.zero_()
         self.show()
@@ -255,7 +265,7 @@ class PressureProjection:
         return result, criteria
 
     def push_bodies(self, result: wl.SolveResult) -> None:
-        """Give the bodies the impulses of a result's pressure, if there are bodies."""
+        """Apply the impulses of a pressure solution to the bodies, if there are any."""
         if self.coupling is not None:
             self.coupling.push(result.x)
 
@@ -272,7 +282,9 @@ class PressureProjection:
         return MeanCriteria(**tolerances, max_iterations=self.max_iterations, count=self.counted, counted=self._count.on_device())
 
     def recorded(self, speed: float) -> dict[str, np.ndarray]:
-        """Return the prepared problem as `warp_lcp.gallery.recorded` describes it, without what the simulation knows: step, time, dt.
+        """Return the prepared problem in the format of `warp_lcp.gallery.recorded`.
+
+        Step, time and dt are added by the simulation.
 
         Args:
             speed: scale of u* [m/s].
@@ -283,11 +295,11 @@ class PressureProjection:
         return recorded.arrays(self._problem, self._start) | {name: np.array(value) for name, value in numbers.items()}
 
     def fields(self) -> list[wp.array]:
-        """Return the fields of the problem: its cells, right-hand side, lower bound and first guess."""
+        """Return the problem's fields: cells, right-hand side, lower bound, first guess."""
         return [self.kind, self._b, *([] if self._lower is None else [self._lower]), self._start]
 
     def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
-        """Take a result: subtract the gradient, mark valid faces, find the released cells.
+        """Apply a solution: subtract the gradient, mark valid faces and released cells.
 
         Args:
             velocity: u* of each component [m/s] (updated on open faces that touch FLUID, and on those with weight beside them).
@@ -314,16 +326,22 @@ class PressureProjection:
         return int(self._count.read()[0])
 
     def not_finite(self) -> np.ndarray:
-        """Return the cells (x, y, z), counted from 0, whose right-hand side is not finite, shape (n, 3)."""
+        """Return the cells whose right-hand side is not finite, shape (n, 3).
+
+        Indices (x, y, z) from 0.
+        """
         bad = ~np.isfinite(self.grid.interior(self._b.numpy()))
         return np.argwhere(bad)[:, ::-1]
 
     def fluid_cells(self) -> np.ndarray:
-        """Return where FLUID was in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""
+        """Return the FLUID cells of the last projection, shape (n, 3).
+
+        Indices (k, j, i) in the stored shape.
+        """
         return np.argwhere(self.cells.numpy() == FLUID)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what the next projection starts from, and what a frame shows of the last."""
+        """Return the state: first guess of the next solve and frame data."""
         return {
             "pressure": self.pressure.numpy().copy(),
             "pressure_dt": np.array(self._last),
@@ -333,7 +351,7 @@ class PressureProjection:
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from `state`, whose arrays have been checked."""
+        """Restore `state`, whose arrays have been checked."""
         self.pressure.assign(state["pressure"])
         self.cells.assign(state["cells"])
         self.contact.assign(state["contact"])
@@ -343,7 +361,10 @@ class PressureProjection:
             self.automatic.restore(state["time_error"])
 
     def pressures(self, density: float) -> np.ndarray:
-        """Return the pressure p = rho dx x / kick_dt [Pa] in the stored shape; zeros before the first step."""
+        """Return the pressure p = rho dx x / kick_dt [Pa] in the stored shape.
+
+        Zero before the first step.
+        """
         scale = density * self.grid.spacing / self._last if self._last > 0.0 else 0.0
         return self.pressure.numpy() * scale
 
@@ -370,5 +391,5 @@ class PressureProjection:
 
 
 def three(fields: Sequence[wp.array]) -> list[wp.array | None]:
-    """Return three fields, None where there are fewer."""
+    """Return three fields, padded with None."""
     return [*fields, None, None, None][:3]

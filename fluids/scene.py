@@ -1,4 +1,4 @@
-"""Scenes of liquid: the tables `pressure` and `liquid`."""
+"""Scene tables of liquids."""
 
 from __future__ import annotations
 
@@ -62,7 +62,10 @@ class SurfaceTensionSettings(Table):
 
 
 class LiquidScene(ParticleScene):
-    """A scene of liquid: the tables of all materials, `pressure`, `viscosity`, `surface_tension` and `liquid`."""
+    """Scene of liquid.
+
+    The tables of all materials, and `pressure`, `viscosity`, `surface_tension` and `liquid`.
+    """
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True
@@ -76,39 +79,37 @@ class LiquidScene(ParticleScene):
     wall_drag: WallDragSettings | None = None
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
-        """Return `liquid` and its shapes."""
+        """Return the key `liquid` and its shapes."""
         return "liquid", self.liquid
 
     def complaints(self) -> list[Complaint]:
-        """Return what is wrong across keys."""
+        """Return errors that involve several keys."""
         found = super().complaints()
         if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
-            message = (
-                f"does not take the rigid bodies' part of the matrix, which has products only; with bodies: {', '.join(COUPLED_METHODS)}"
-            )
+            message = f"cannot be combined with rigid bodies (their part of the matrix has only products); use {', '.join(COUPLED_METHODS)}"
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
             found.append(
                 Complaint(
-                    ("pressure", "surface"), "voxel", 'has no meaning for pressure.model = "unilateral", whose pressure needs no surface'
+                    ("pressure", "surface"), "voxel", 'cannot be combined with pressure.model = "unilateral", which has no free surface'
                 )
             )
         if self.pressure.model == "unilateral" and self.particles.narrow_band is not None:
-            message = 'has no meaning for pressure.model = "unilateral", whose liquid may come apart anywhere inside'
+            message = 'cannot be combined with pressure.model = "unilateral", whose liquid may separate anywhere inside'
             found.append(Complaint(("particles", "narrow_band"), None, message))
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
-            message = 'needs pressure.surface = "ghost-fluid", which tells how full cells are'
+            message = 'needs pressure.surface = "ghost-fluid", which computes how full cells are'
             found.append(Complaint(("particles", "narrow_band"), None, message))
         if self.surface_tension is not None and self.pressure.surface == "voxel":
-            message = 'needs pressure.surface = "ghost-fluid", which has a curvature'
+            message = 'needs pressure.surface = "ghost-fluid", whose surface has a curvature'
             found.append(Complaint(("surface_tension",), None, message))
         if self.surface_tension is not None and self.pressure.model == "unilateral":
-            message = 'needs pressure.model = "incompressible": a pressure that never pulls keeps no surface together'
+            message = 'needs pressure.model = "incompressible": surface tension needs a pressure that may be negative'
             found.append(Complaint(("surface_tension",), None, message))
         return [*found, *self._viscosity_complaints(), *probe_complaints(self.probe, self.domain.size, self.physics.gravity)]
 
     def notes(self) -> list[str]:
-        """Return settings that look like mistakes."""
+        """Return suspicious settings."""
         found, tension = [*super().notes(), *LIQUID_DENSITY.notes("physics.density", self.physics.density)], self.surface_tension
         given = [("viscosity.value", self.viscosity.value if self.viscosity else None)]
         given += [(f"{place}.viscosity", getattr(shape, "viscosity", None)) for place, shape in self.shapes()]
@@ -132,7 +133,7 @@ class LiquidScene(ParticleScene):
     def _viscosity_complaints(self) -> list[Complaint]:
         """Return what needs viscosity, and what viscosity does not go with."""
         if self.viscosity is not None and self.endless:
-            return [Complaint(("viscosity",), None, "not on a domain with periodic axes")]
+            return [Complaint(("viscosity",), None, "cannot be combined with periodic axes")]
         own = [
             (key, n, shape.viscosity)
             for key, shapes in (("liquid", self.liquid), ("source", self.source))
@@ -140,9 +141,9 @@ class LiquidScene(ParticleScene):
         ]
         own = [given for given in own if given[-1] is not None]
         if self.viscosity is not None:
-            message = "has no meaning for liquids that differ in viscosity: the grid carries one inside"
+            message = "cannot be combined with liquids of different viscosities"
             return [Complaint(("particles", "narrow_band"), None, message)] if own and self.particles.narrow_band is not None else []
-        message = 'needs the table [viscosity]: without it nothing sticks, use "free-slip"'
+        message = 'needs the table [viscosity]; without viscosity use "free-slip"'
         walls = [(("domain", "wall"), self.domain.wall), *((("solid", n, "wall"), solid.wall) for n, solid in enumerate(self.solid))]
         found = [Complaint(place, wall, message) for place, wall in walls if wall == "sticky"]
         slips = [(n, solid.slip_length) for n, solid in enumerate(self.solid) if solid.slip_length is not None]
@@ -150,22 +151,22 @@ class LiquidScene(ParticleScene):
         return found + [Complaint(("solid", n, "slip_length"), slip, "needs the table [viscosity]") for n, slip in slips]
 
     def kept(self, materials: Sequence[MaterialProperties | SourceProperties]) -> list[float] | None:
-        """Return viscosities in units of `viscosity.value`; None: all liquid has the same."""
+        """Return viscosities relative to `viscosity.value`; None: one viscosity."""
         if self.viscosity is None or all(shape.viscosity is None for shape in (*self.liquid, *self.source)):
             return None
         return [(getattr(shape, "viscosity", None) or self.viscosity.value) / self.viscosity.value for shape in materials]
 
     @property
     def slip_lengths(self) -> list[float]:
-        """Return those of the domain's wall and of each solid [m]."""
+        """Return the slip lengths of the domain's wall and of each solid [m]."""
         assert self.viscosity is not None
         own = [(self.domain.wall, None), *((solid.wall or self.domain.wall, solid.slip_length) for solid in self.solid)]
         return [math.inf if wall == "free-slip" else (self.viscosity.slip_length if slip is None else slip) for wall, slip in own]
 
     def models(self) -> list[Model]:
-        """Return the models that the scene turns on, and those that it asks for but cannot need."""
+        """Return the models that the scene turns on, and those that have no effect."""
         full, ghost = self.stays_full, self.pressure.surface == "ghost-fluid"
-        closed = "liquid fills a closed box for ever: there is no surface"
+        closed = "liquid fills a closed box: there is no free surface"
         found = []
         if self.pressure.model == "unilateral":
             found.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
@@ -195,7 +196,10 @@ class LiquidScene(ParticleScene):
 
     @property
     def drags(self) -> list[float] | None:
-        """Return c_f of the domain's walls and of each solid, see `fluids.wall_drag`; None: no wall drags."""
+        """Return c_f of the domain's walls and of each solid; None: no wall drag.
+
+        See `fluids.wall_drag`.
+        """
         table = self.wall_drag or WallDragSettings()
         walls = [table.domain, *(solid.drag for solid in self.solid)]
         found = [table.coefficient if given is None else given for given in walls]
@@ -203,22 +207,32 @@ class LiquidScene(ParticleScene):
 
     @property
     def keeps_volume(self) -> bool:
-        """Return whether voids inside are closed: the unilateral model lets liquid come apart, a band knows its interior to a tenth."""
+        """Return whether voids inside the liquid are closed.
+
+        Not with the unilateral model, where liquid may separate, nor with a narrow band, whose
+        interior is known to a tenth.
+        """
         return self.pressure.model == "incompressible" and self.particles.narrow_band is None
 
     @property
     def settles(self) -> bool:
-        """Return whether full cells settle to the density at rest, which the unilateral model has gravity do, see `fluids.unilateral`."""
+        """Return whether overfull cells settle to the density at rest.
+
+        The unilateral model settles them with gravity, see `fluids.unilateral`.
+        """
         return self.pressure.model == "unilateral" and any(self.physics.gravity)
 
     @property
     def speeds_up(self) -> bool:
-        """Return whether full cells settle, or a surface pulls."""
+        """Return whether settling or surface tension can accelerate liquid."""
         return self.settles or self.surface_tension is not None
 
     @property
     def stays_full(self) -> bool:
-        """Return whether liquid fills the domain but for solids that stand still, so that there never is a surface."""
+        """Return whether liquid fills the domain, so that there is no free surface.
+
+        True if only solids at rest take space besides the liquid.
+        """
         openings = self.domain.open or self.source or self.drain or any(solid.moves for solid in self.solid)
         return not openings and self.particles.narrow_band is None and self.pressure.model == "incompressible" and self._filled()
 
@@ -232,22 +246,25 @@ class LiquidScene(ParticleScene):
 
     @property
     def lets_go(self) -> bool:
-        """Return whether a wall that is there separates."""
+        """Return whether a wall of the scene is separating."""
         walls = self.domain.wall == "separating" and len(self.domain.open) < 2 * self.dimension
         return walls or any((solid.wall or self.domain.wall) == "separating" for solid in self.solid)
 
     @property
     def coheres(self) -> bool:
-        """Return whether a pressure below that of the air keeps together what turns in flight."""
+        """Return whether pressure below that of air can hold rotating liquid together."""
         return self.pressure.model == "incompressible"
 
     @property
     def short_steps(self) -> bool:
-        """Return whether steps are so short that spray must not take the velocity of liquid beside it in each of them."""
+        """Return whether steps are short enough to need support of spray.
+
+        Spray must then not take the velocity of the liquid beside it in each step.
+        """
         return self.time.cfl < SHORT_STEPS and self.pressure.model == "incompressible"
 
     def own_memory_parts(self) -> dict[str, int]:
-        """Return what pressure and surface take at most on the device [bytes]."""
+        """Return the most memory of pressure and surface on the device [bytes]."""
         cells, level_set = self.counted_cells, self.pressure.surface == "ghost-fluid"
         bounded = self.lets_go or self.pressure.model == "unilateral"
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)

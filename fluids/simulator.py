@@ -1,4 +1,4 @@
-"""Liquid on a staggered grid, carried by particles: the plug-in `fluids`."""
+"""Simulator plug-in `fluids`: liquids by particles on a staggered grid."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ MOST_PARTS = 8  # of the viscous solve in a step that is much shorter than the l
 
 
 class LiquidSimulation(ParticleSimulation):
-    """A liquid in progress; implements `warp_lcp.simulation.Simulation`.
+    """Simulation of a liquid; implements `warp_lcp.simulation.Simulation`.
 
     Args:
-        scene: what to simulate.
+        scene: the scene.
         grid: the one that it starts on.
-        parts: what of it belongs to that grid.
+        parts: the fields and models on that grid.
         particles: the liquid at the start.
-        solids: of the scene, where something asks for the forces on them.
+        solids: of the scene, if the output needs the forces on them.
         more: as of `ParticleSimulation`.
 
     Attributes:
         surface: the free surface.
-        forces: what the step has done to each solid; None: nobody asks.
-        tension: of the surface; None: it has none.
+        forces: force output of each solid; None: off.
+        tension: surface tension; None: off.
         projection: the pressure's fields.
         record: takes the problem of each step before it is solved, if it is set.
     """
@@ -92,14 +92,12 @@ class LiquidSimulation(ParticleSimulation):
             longest = self.tension.longest_step()
             self._notes.append(f"surface tension: steps of at most {longest:.3g} s")
             if scene.time.dt_min > longest:
-                self._notes.append(
-                    f"time.dt_min = {scene.time.dt_min:g} s is longer than that, and steps would not be stable: take {0.1 * longest:.1g}"
-                )
+                self._notes.append(f"time.dt_min = {scene.time.dt_min:g} s is longer, and steps would be unstable: use {0.1 * longest:.1g}")
         self.mark()
 
-    def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
-        """Allocate what belongs to a grid."""
-        super().lay(grid, parts)
+    def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
+        """Allocate the fields of a grid."""
+        super().allocate(grid, parts)
         self.surface = self._surface()
         self.tension = self._tension()
         self.projection = self._pressure()
@@ -127,27 +125,27 @@ class LiquidSimulation(ParticleSimulation):
     def _probes(self) -> Probes | None:
         return Probes(self.scene.probe, self.gravity, self.grid.dimension) if self.scene.probe else None
 
-    def bring_to_faces(self, window: Window) -> None:
-        """Bring the particles' velocities to the faces, let gravity act on them, and bring along what the particles have of viscosities."""
-        super().bring_to_faces(window)
+    def particles_to_grid(self, window: Window) -> None:
+        """Transfer velocity (and viscosity) of particles to the faces; apply gravity."""
+        super().particles_to_grid(window)
         if self.viscosity is not None and self.viscosity.relative:
             p, fields = self.particles, (self.viscosity.relative, self.weights)  # which stay what they are
             particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets, runs=p.runs)
 
     def stable_dt(self) -> float:
-        """Return the longest step that advection and surface tension allow [s]."""
+        """Return the longest stable time step for advection and surface tension [s]."""
         dt = super().stable_dt()
         return dt if self.tension is None else min(dt, self.tension.longest_step())
 
     def mark(self) -> None:
-        """Find the liquid's cells, and show them."""
+        """Mark the liquid cells."""
         self.surface.mark(self.particles, self.grid.everywhere, self.projection.kind)
         self.projection.show()
 
     def step(self, dt: float) -> Row:
         """Advance by dt [s].
 
-        The pressure is solved before any particle moves, so that a failed solve leaves the state as it was, but for the particles' order.
+        The pressure is solved before any particle moves, so that a failed solve changes at most the particles' order.
 
         Raises:
             StepFailed: a solve missed its criteria; a smaller dt may be tried.
@@ -158,7 +156,7 @@ class LiquidSimulation(ParticleSimulation):
         if self.forces is not None:
             self.forces.begin(self.time)
         window = self.window(before)
-        self.bring_to_faces(window)
+        self.particles_to_grid(window)
         speed = self.top_speed(before)
         self._find_surface(window)
         viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
@@ -170,12 +168,12 @@ class LiquidSimulation(ParticleSimulation):
                     self.tension.measure(window, self.projection.kind)
         walls = self._meet_walls(window, dt)
         self.solve_contacts()
-        self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
+        self.extrapolate_velocity(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self._measure()
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
-        self.bring_to_particles(window, self.projection.kind, dt)
+        self.grid_to_particles(window, self.projection.kind, dt)
         if self.tension is not None:
             self.tension.calm(self.particles, dt)
         row = self.move(dt, window) | self.solve_row(projected.result) | viscous | walls
@@ -189,7 +187,9 @@ class LiquidSimulation(ParticleSimulation):
         return self.logged(row | {"active": projected.released})
 
     def tables(self) -> dict[str, tuple[str, ...]]:
-        """Return the columns of the tables beside the log; `measured` has the last step's row of each.
+        """Return the columns of the tables besides the log.
+
+        `measured` has the last row of each.
 
         `time` is that of pressures, levels and forces: the step's beginning; velocities are those of its middle.
         """
@@ -234,15 +234,15 @@ class LiquidSimulation(ParticleSimulation):
         return impulses
 
     def known_density(self) -> wp.array | None:
-        """Return the density that the surface lies in, if it is made of one."""
+        """Return the density from which the surface was computed, or None."""
         return self.surface.density
 
     def known_contact(self) -> wp.array | None:
-        """Return where walls held the liquid and where they let go."""
+        """Return where the liquid was held at walls and where it separated."""
         return self.projection.contact
 
     def own_columns(self) -> tuple[str, ...]:
-        """Return the names of the pressure's columns and the volume's.
+        """Return the log columns of pressure and volume.
 
         active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the projection; volume [m^3; m^2 in 2-D]:
         counts FLUID cells, or lies inside the surface where that is finer than cells. With an automatic tolerance: tolerance, the relative
@@ -258,7 +258,9 @@ class LiquidSimulation(ParticleSimulation):
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
     def frame(self) -> list[Part]:
-        """Return the particles and the liquid's cells of the last solve, and its surface and volume if the scene wants them.
+        """Return the parts of a frame: particles, liquid cells, surface and volume.
+
+        Cells are those of the last solve; surface and volume are optional.
 
         Particles have velocity, speed and, where it differs, viscosity [Pa s]; cells pressure [Pa], wall and released flags.
         """
@@ -282,11 +284,11 @@ class LiquidSimulation(ParticleSimulation):
         ]
 
     def own_state(self) -> dict[str, np.ndarray]:
-        """Return what the next pressure starts from, and what a frame shows of the last."""
+        """Return the state of the pressure: first guess of the next solve and frame data."""
         return self.projection.state()
 
     def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from the arrays of `own_state`."""
+        """Restore the arrays of `own_state`."""
         self.projection.restore(dict(state))
 
     def _find_surface(self, window: Window) -> None:
@@ -311,7 +313,7 @@ class LiquidSimulation(ParticleSimulation):
         momenta = [] if self.bodies is None else [body.momenta() for body in self.bodies.bodies]
         if self._project(window, dt, speed).result is None:
             return {}
-        self.extend(window, projection.known, projection.kind, projection.contact)
+        self.extrapolate_velocity(window, projection.known, projection.kind, projection.contact)
         # A step much shorter than the last one, as a retry is, still has half of that to make up for: equations no stiffer than its own
         # length asks for are solved several times.
         parts, total = min(max(1, int(self.kick_dt / dt)), MOST_PARTS), None
@@ -399,29 +401,29 @@ class LiquidSimulation(ParticleSimulation):
             )
         if result.status is wl.SolveStatus.INFEASIBLE and (self.boundary.velocity or self.sources):  # no dt helps
             raise SimulationFailed(
-                f"step {self.step_count}: liquid fills a closed space, and walls move or sources run so that its volume would have "
-                'to change; leave air in it, or give the wall that moves away from it wall = "separating"'
+                f"step {self.step_count}: liquid fills a closed space whose volume changes, by moving walls or sources; "
+                'leave air in it, or set wall = "separating" for a wall that moves away'
             )
         residual = f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance})"
         raise missed_by_far("pressure", result.status, result.iterations, residual, result.status.value)
 
 
 class FluidsSimulator:
-    """The plug-in for liquids that let go of their walls."""
+    """Simulator plug-in for liquids that separate from walls."""
 
     name = "fluids"
-    summary = "liquids that let go of their walls"
+    summary = "liquids that separate from walls"
     scene_model = LiquidScene
 
     def create(self, scene: Scene, *, device: str, folder: Path, wall_velocity: np.ndarray | None = None) -> LiquidSimulation:
-        """Build a simulation of `scene`.
+        """Build the simulation of a scene.
 
         Args:
             scene: a LiquidScene.
             device: a Warp device's name.
-            folder: where the files are that the scene names.
+            folder: folder of the files that the scene names.
             wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the solids' cells stay
-                where they are. None: all stand still.
+                fixed. None: all are at rest.
 
         Raises:
             ValueError: the scene cannot be simulated; the message names the key and what is allowed.
@@ -435,9 +437,11 @@ class FluidsSimulator:
         self, scene: LiquidScene, solids: Sequence[PlacedSolid], bodies: RigidBodies | None, *, device: str, folder: Path,
         wall_velocity: np.ndarray | None = None,
     ) -> LiquidSimulation:  # fmt: skip
-        """Build a simulation of `scene` among `solids`, of which liquid moves `bodies`; the rest as of `create`.
+        """Build the simulation of a scene from placed solids and bodies.
 
-        `scene.solid` says in their order what liquid does at their walls.
+        `bodies` are those that the liquid moves; other arguments as in `create`.
+
+        `scene.solid`, in the same order, has the boundary condition of each solid.
         """
         warnings: list[str] = []
 
@@ -456,7 +460,7 @@ class FluidsSimulator:
         )  # fmt: skip
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
-        """Build a rank's part of a simulation of `scene`, see `fluids.distributed.create`."""
+        """Build this rank's part of a simulation; see `fluids.distributed.create`."""
         from warp_lcp.fluids.distributed import create  # what it needs is an extra
 
         return create(scene, ranks, device=device, folder=folder)

@@ -1,4 +1,4 @@
-"""The free surface: which cells hold liquid, and where between cells it ends."""
+"""Free surface: liquid cells, and the surface between cell centers."""
 
 import typing
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ SAMPLES = 8  # points along the edge of a cut cell, of a volume that is found on
 
 
 class FreeSurface(Protocol):
-    """Where the liquid ends.
+    """Free surface of a liquid.
 
     Attributes:
         phi: float32 distance to the surface at cell centers [cells], < 0 in liquid; None: the surface lies on the cells' faces.
@@ -58,7 +58,7 @@ class FreeSurface(Protocol):
     density: wp.array | None
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds.
+        """Mark the kind of each cell.
 
         Args:
             particles: the liquid; `key` holds its cells.
@@ -67,17 +67,23 @@ class FreeSurface(Protocol):
         """
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Give u* to faces of FLUID cells that no particle gave weight; `known` is scratch memory."""
+        """Set u* on faces of FLUID cells without particle weight.
+
+        `known` is scratch memory.
+        """
 
     def measure(self) -> None:
-        """Find the liquid's volume, for `volume` to tell."""
+        """Compute the liquid's volume, which `volume` returns."""
 
     def volume(self, cells: int) -> float:
-        """Return the liquid's volume [m^3; m^2 in 2-D] when it was last marked or measured, given the number of FLUID cells."""
+        """Return the liquid's volume when last marked or measured [m^3; m^2 in 2-D].
+
+        Takes the number of FLUID cells.
+        """
 
 
 class WholeCellSurface:
-    """Cells that hold a particle are liquid.
+    """Free surface on cell faces: cells that hold a particle are liquid.
 
     In cells that a solid cuts down to a sliver there may be no particle though the liquid fills them; a level set decides there.
     """
@@ -91,7 +97,7 @@ class WholeCellSurface:
         self.density = self._level_set.density if self._level_set is not None else None
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds: FLUID where a particle is."""
+        """Mark cells that hold a particle as FLUID."""
         wp.copy(kind, self.boundary.base)
         wp.launch(mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device)
         if self._level_set is not None:
@@ -99,12 +105,12 @@ class WholeCellSurface:
             window.launch(mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind])
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Give u* to faces of slivers that hold no particle."""
+        """Set u* on faces of sliver cells that hold no particle."""
         if self._level_set is not None:
             complete(window, velocity, weights, known)
 
     def measure(self) -> None:
-        """Do nothing: cells are counted."""
+        """Do nothing: the volume is the number of cells."""
 
     def volume(self, cells: int) -> float:
         """Return the volume of the FLUID cells."""
@@ -112,7 +118,7 @@ class WholeCellSurface:
 
 
 class NoSurface:
-    """Every open cell is liquid, and stays so: a closed box full of it has no surface, whatever was asked for."""
+    """No free surface: all open cells are liquid, as in a filled closed box."""
 
     phi = density = None
 
@@ -127,30 +133,32 @@ class NoSurface:
         self._volume = float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds: FLUID in all open ones."""
+        """Mark all open cells as FLUID."""
         wp.copy(kind, self._kind)
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Give u* to faces between particles."""
+        """Set u* on faces between particles."""
         complete(window, velocity, weights, known)
 
     def measure(self) -> None:
-        """Do nothing: it stays."""
+        """Do nothing: the volume is constant."""
 
     def volume(self, cells: int) -> float:
-        """Return the volume that solids leave."""
+        """Return the volume outside of solids."""
         return self._volume
 
 
 class GhostFluidSurface:
-    """The zero of a level set that the particles' density gives: air begins between the cells' centers [Gibou et al. 2002].
+    """Ghost-fluid surface: zero of a level set of the particles' density.
+
+    The air begins between cell centers [Gibou et al. 2002].
 
     Args:
         grid: the grid.
         boundary: solids and walls.
         particles_a_cell: of liquid at rest.
         smoothing: binomial passes over the density: quieter, and less accurate in thin sheets.
-        fill: adds to the density what no particle stands for.
+        fill: adds the density of liquid without particles.
         counted: cells whose volume is asked for; None: all.
     """
 
@@ -165,18 +173,18 @@ class GhostFluidSurface:
         self._window, self._counted, self._measured = grid.everywhere, counted or grid.domain, False
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds: FLUID below the surface."""
+        """Mark cells below the surface as FLUID."""
         self._window, self._measured = window, False
         self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
         wp.copy(kind, self.boundary.base)
         window.launch(mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Give u* to FLUID faces between particles."""
+        """Set u* on FLUID faces between particles."""
         complete(window, velocity, weights, known)
 
     def measure(self) -> None:
-        """Find the volume inside the surface."""
+        """Compute the volume inside the surface."""
         self.level_set.measure(self.boundary.distance, self._window.common(self._counted))
         self._measured = True
 

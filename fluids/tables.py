@@ -22,7 +22,7 @@ class WallDragSettings(Table):
 def _column_name(text: str) -> str:
     """Return a name that columns may begin with."""
     if not (text.isascii() and text.isidentifier()):
-        raise PydanticCustomError("name", 'must be a name of letters, digits and "_" that begins with no digit')
+        raise PydanticCustomError("name", 'must consist of letters, digits and "_", and not begin with a digit')
     return text
 
 
@@ -49,9 +49,9 @@ def probe_complaints(probes: Sequence[Probe], size: Sequence[float], gravity: Se
         if len(probe.position) != len(size):
             found.append(Complaint(place, probe.position, f"must have {len(size)} entries, as domain.size has"))
         elif not all(0.0 <= x <= side for x, side in zip(probe.position, size, strict=True)):
-            found.append(Complaint(place, probe.position, f"lies outside the domain, which reaches from the origin to {list(size)} m"))
+            found.append(Complaint(place, probe.position, f"lies outside the domain, which extends from the origin to {list(size)} m"))
         if any((probe.name, probe.quantity) == (other.name, other.quantity) for other in probes[:index]):
-            message = f"is the name of another probe of the {probe.quantity}: their columns would be the same"
+            message = f"is also the name of another probe of the {probe.quantity}: log columns must differ"
             found.append(Complaint(("probe", index, "name"), probe.name, message))
         if probe.quantity == "level" and not any(gravity):
             found.append(Complaint(("probe", index, "quantity"), "level", "needs gravity, along which it is measured"))

@@ -1,4 +1,4 @@
-"""How exact a step's pressure has to be: a stated part of the error that the time step makes anyway."""
+"""Pressure tolerance from the time discretization error."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ MOST = 0.1  # relative residual that is always asked for: what follows a collisi
 
 
 class TimeErrorTolerance:
-    """Stop a solve when the velocity error that it leaves is FRACTION of the step's own error in time.
+    """Automatic tolerance: a fraction of the time discretization error.
 
-    A step takes the acceleration by the pressure as constant. To first order its error in the velocity is half of what this acceleration
-    changes by from one step to the next. The first guess of a solve is just the last step's pressure, x0 = x_last kick_dt / kick_dt_last:
+    A step assumes a constant acceleration by the pressure. To first order its velocity error is half of the change of this acceleration
+    from one step to the next. The first guess of a solve is just the last step's pressure, x0 = x_last kick_dt / kick_dt_last:
 
         time error = 1/2 ||G (x - x0)||,   ||G e||^2 = e'A e,
 
@@ -41,7 +41,7 @@ class TimeErrorTolerance:
     Args:
         size: elements of a stored field.
         device: where they live.
-        across: who has other parts of the fields; None: nobody.
+        across: communicator; None if serial.
 
     Attributes:
         used: relative residual that the last solve was held to.
@@ -57,7 +57,7 @@ class TimeErrorTolerance:
         self._reduction = Reduction(size, device, self._sum.array, across=across)
 
     def criteria(self, ratio: float, atol: float) -> dict[str, float]:
-        """Return when a solve is done: `rtol`, and `atol` of the root mean square over the unknowns [m/s].
+        """Return `rtol` and `atol` of a solve; `atol` is a root mean square [m/s].
 
         Args:
             ratio: kick_dt / kick_dt_last; 0 without a last step.
@@ -71,7 +71,7 @@ class TimeErrorTolerance:
         return {"rtol": LEAST, "atol": max(atol, allowed)}
 
     def measure(self, A: Any, result: wl.SolveResult, criteria: wl.StoppingCriteria, fields: list[wp.array], unknowns: int) -> None:
-        """Find the step's error in time from a result.
+        """Estimate the time discretization error from a solution.
 
         Args:
             A: the operator.
@@ -99,15 +99,18 @@ class TimeErrorTolerance:
 
     @property
     def time_error(self) -> float | None:
-        """Of the last step, root mean square over the cells [m/s]; None: no step came before it."""
+        """Error of the last step, root mean square over the cells [m/s].
+
+        None before the first step.
+        """
         if self._change:
             self._change, self._error = False, 0.5 * float(np.sqrt(max(float(self._sum.numpy()[0]), 0.0) / self._unknowns))
         return self._error
 
     def state(self) -> np.ndarray:
-        """Return what the next tolerance is made from, shape (2,); -1: there is no error yet."""
+        """Return the state, shape (2,); -1: no error estimate yet."""
         return np.array([-1.0 if self.time_error is None else self.time_error, self._reference])
 
     def restore(self, state: np.ndarray) -> None:
-        """Continue from what `state` returned."""
+        """Restore the result of `state`."""
         self._error, self._reference, self._change = float(state[0]) if state[0] >= 0.0 else None, float(state[1]), False

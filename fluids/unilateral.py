@@ -1,4 +1,4 @@
-"""Pressure that only keeps cells from over-filling: liquid may separate anywhere, and spray flies freely."""
+"""Unilateral pressure: it only prevents over-filled cells, without suction."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ from warp_lcp.operators.grid_poisson import FLUID
 
 
 class UnilateralPressure(PressureProjection):
-    """Solve 0 <= p complementary to what is left of a cell >= 0, in every cell that is not SOLID.
+    """Unilateral pressure: 0 <= p complementary to the free volume of a cell >= 0.
 
-    The idea is that of Narain et al. (2010) and Gerszewski and Bargteil (2013), as [Book] 1.3 reports it; the discrete law is derived here.
+    The problem has all cells that are not SOLID.
+
+    After Narain et al. (2010) and Gerszewski and Bargteil (2013), as reported in [Book] 1.3; the discrete law is derived here.
 
     rho_i is the density of the particles in units of that at rest, capacity_i what fits beside walls, a_f the open fraction of a face,
     s_f = +-1 outward. A cell is filled to f_i = min(rho_i / (FULL capacity_i), 1), f_f is that of a face. The pressure accelerates it:
@@ -81,7 +83,10 @@ class UnilateralPressure(PressureProjection):
         self._setting = setting
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> bool:
-        """Set up the problem of all cells that are not SOLID; return whether there are any; arguments as of the base class."""
+        """Set up the problem of all cells that are not SOLID; return if there are any.
+
+        Arguments as in the base class.
+        """
         self._begin(kick_dt)
         self._setting.rate = wp.float64(self.grid.spacing / dt)
         self._setting.settling = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
@@ -97,7 +102,10 @@ class UnilateralPressure(PressureProjection):
         return unknowns > 0
 
     def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
-        """Take a result: let the pressure act, mark valid faces, find the walls that liquid presses on; arguments as of the base class."""
+        """Apply a solution: update velocities, mark valid faces and wall contact.
+
+        Arguments as in the base class.
+        """
         self._accept(result.x)
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
@@ -113,7 +121,10 @@ class UnilateralPressure(PressureProjection):
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
     def fluid_cells(self) -> np.ndarray:
-        """Return where there was liquid or pressure in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""
+        """Return the cells with liquid or pressure in the last projection, shape (n, 3).
+
+        Indices (k, j, i) in the stored shape.
+        """
         return np.argwhere((self.cells.numpy() == FLUID) | (self.pressure.numpy() > 0.0))
 
     def _at(self, velocity: Sequence[wp.array]) -> Any:

@@ -37,7 +37,7 @@ from warp_lcp.fluids.viscosity_bodies import BodyDrag, WallPull
 from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
-from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
+from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
@@ -148,7 +148,7 @@ class Viscosity:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
             self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes, self._inner, across)
         self._solver = self._krylov()
-        self._trail, self._sums = Trail(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
+        self._trail, self._sums = DirtyRegion(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
 
     def solve(
         self, velocity: Sequence[wp.array], window: Window, kind: wp.array, contact: wp.array, dt: float, speed: float, *, last: bool = True

@@ -1,4 +1,4 @@
-"""Rigid bodies that sand moves: their velocity follows from the stresses within the coupled solve."""
+"""Rigid bodies in sand, coupled implicitly with the stresses."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FIRST = {2: 2, 3: 4}  # layer of the first copy of a shear
 
 
 class SandBodies:
-    """Rigid bodies as the stresses meet them.
+    """Rigid bodies in the stress solve.
 
     With F = - sum of rows times stresses, see `granular.body_faces`, a body leaves the solve with V = V* + rho dx^d M^-1 F. That adds
     R M^-1 R' to the matrix of the stresses: a light body's part of it is far larger than sand's own. So a step of the stresses takes it
@@ -78,7 +78,7 @@ class SandBodies:
         self._faces, self._cells, self._edges = Places(), Places(), Places()
 
     def place(self, index: np.ndarray, centers: np.ndarray, walls: Walls) -> None:
-        """Find where the bodies meet sand.
+        """Find the faces, cells and edges where bodies meet sand.
 
         Args:
             index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
@@ -149,12 +149,12 @@ class SandBodies:
         self._active.assign(active)
 
     def forget(self, stress: Mapping[str, wp.array]) -> None:
-        """Take stresses from where only the edge of a body is near."""
+        """Remove stresses where only the edge of a body is near."""
         if len(self._unowned):
             wp.launch(forget_kernel, len(self._unowned), [self._unowned, *(s.flatten() for s in stress.values())], device=self.grid.device)
 
     def prepare(self, packing: Packing, numbers: wp.array, *, pressure_step: float, shear_step: float) -> None:
-        """Find how much of a mismatch of the velocity a trial step corrects.
+        """Compute the correction of a trial step per velocity mismatch.
 
         Args:
             packing: where sand is.
@@ -187,7 +187,9 @@ class SandBodies:
         self._correction.assign(np.linalg.inv(identity + self._host_response @ steepest))
 
     def impulses(self) -> np.ndarray:
-        """Return what the sand has done to each body since V*, shape (bodies, k) [kg m/s, kg m^2/s; 2-D: per m].
+        """Return the impulse of the sand on each body since V*, shape (bodies, k).
+
+        [kg m/s, kg m^2/s; 2-D: per m].
 
         That is of the stresses of the last `Stress.residual`, and of the layer of sand that moves with the body.
         """
@@ -195,13 +197,13 @@ class SandBodies:
         return np.asarray((self._force.numpy() + layer) * self._scale)
 
     def move(self, velocity: Velocity, launch: Launch) -> None:
-        """Give the bodies' faces their velocity."""
+        """Set the velocity of the bodies' faces."""
         kernel = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate).move
         if len(self._faces.at):
             launch(kernel, len(self._faces.at), [self._faces, self.velocity, flat_vector(velocity.u)], device=self.grid.device)
 
     def respond(self, packing: Packing, stress: wp.array, launch: Launch, *, implicit: bool) -> None:
-        """Find what stresses do to the bodies and the velocity that they leave, or a step towards it."""
+        """Compute the bodies' velocity under the stresses, or a step towards it."""
         device = self.grid.device
         inputs = [self._shape, self._spans, stress.flatten(), self._cells, self._edges, flat_vector(packing.share), self._partial]
         if self._spans.shape[0]:
@@ -212,7 +214,9 @@ class SandBodies:
     def search(
         self, packing: Packing, velocity: Velocity, stress: Mapping[str, typing.Any], given: Mapping[str, typing.Any], launch: Launch
     ) -> None:
-        """Find the velocity with which a step of the stresses is implicit; faces and edges beside the bodies get it.
+        """Find the bodies' velocity for which a step of the stresses is implicit.
+
+        Faces and edges beside the bodies are set to it.
 
         Args:
             packing: where sand is.

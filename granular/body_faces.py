@@ -1,4 +1,4 @@
-"""Where rigid bodies meet sand on the grid: their faces, and how their motion strains the cells and edges around them.
+"""Faces between bodies and sand, and the strain rates that bodies cause.
 
 A body of k degrees of freedom V (2-D: vx, vy, wz; 3-D: vx, vy, vz, wx, wy, wz; about its center of mass) has the velocity J_f V on face f,
 J_f the velocity of unit motions at the face's center along its axis. It changes the differences of velocity across an open cell, and the
@@ -21,7 +21,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 @dataclass(frozen=True)
 class Incidence:
-    """Places beside bodies: faces, cells or edges, each with a body, ordered by body.
+    """Places beside bodies (faces, cells or edges) with their body, sorted by body.
 
     Attributes:
         at: flat index of the place, shape (n,).
@@ -39,13 +39,13 @@ class Incidence:
     share: np.ndarray
 
     def where(self, wanted: np.ndarray) -> Incidence:
-        """Return the places that are wanted, bool, shape (n,)."""
+        """Return the selected places; mask of type bool, shape (n,)."""
         return Incidence(*(getattr(self, name)[wanted] for name in self.__dataclass_fields__))
 
 
 @dataclass(frozen=True)
 class BodyFaces:
-    """The bodies' faces near open cells, and the open cells and the edges that they touch."""
+    """Faces of bodies near open cells, and the adjacent cells and edges."""
 
     face: Incidence
     cell: Incidence
@@ -55,7 +55,7 @@ class BodyFaces:
 def find_body_faces(
     grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[int], centers: np.ndarray, counted: Window | None = None
 ) -> BodyFaces:
-    """Return where bodies meet open cells.
+    """Return the faces between bodies and open cells.
 
     A face between two solids belongs to that of the higher number.
 
@@ -79,7 +79,9 @@ def find_body_faces(
 
 
 def entries_near(grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which wall faces have an edge beside a body, and all cells whose stresses a body's velocity reaches.
+    """Return wall faces and cells that a body's velocity reaches.
+
+    Wall faces with an edge beside a body, and all cells whose stresses it changes.
 
     Args:
         grid: the grid.
@@ -100,7 +102,9 @@ def entries_near(grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides
 
 
 def unowned_copies(grid: StaggeredGrid, index: np.ndarray, faces: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
-    """Return the copies of shears on edges beside bodies that belong to no wall face: (shear, 4) as one number, and the cell.
+    """Return shear copies on edges beside bodies that belong to no wall face.
+
+    As (shear, 4) in one number, and the cell.
 
     A cell that touches a solid with its edge alone may have left a stress there before a body came that near. Nothing bounds it now.
     """
@@ -119,14 +123,20 @@ def unowned_copies(grid: StaggeredGrid, index: np.ndarray, faces: BodyFaces) -> 
 
 
 def own_copies(grid: StaggeredGrid, edge: Incidence, counted: Window | None) -> np.ndarray:
-    """Return which of an edge's four copies are of counted cells, a bit each, uint8, shape (n,); `counted`: None: all."""
+    """Return which of an edge's four copies are in counted cells.
+
+    One bit each, uint8, shape (n,); `counted` None: all.
+    """
     strides, axes = np.array(_strides(grid)), np.array(SHEARS[grid.dimension])[edge.axis]
     cells = [edge.at - (q & 1) * strides[axes[:, 0]] - (q >> 1) * strides[axes[:, 1]] for q in range(4)]
     return np.packbits([within(grid, at, counted) for at in cells], axis=0, bitorder="little")[0]
 
 
 def within(grid: StaggeredGrid, flat: np.ndarray, window: Window | None, *, below: int = 0, above: int = 0) -> np.ndarray:
-    """Return which places, flat indices, are in a window, or so many layers below and above it; None: all are."""
+    """Return which flat indices lie in a window grown by some layers.
+
+    None: all.
+    """
     if window is None:
         return np.ones(len(flat), dtype=bool)
     at = np.stack(np.unravel_index(flat, grid.shape), axis=-1)

@@ -1,4 +1,4 @@
-"""Methods for the coupled pressure and friction of sand: accelerated projection of both at once, and interleaved Gauss-Seidel sweeps."""
+"""Coupled pressure and friction of sand: accelerated projection, sweeps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_kernels import PERIOD
 from warp_lcp.granular.yield_set import F32, I32, U8, WALLS, sand_pass, xyz
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.settings import Count, CountOrZero, NonNegative, Positive, Relaxation, Settings, ShareOrZero
+from warp_lcp.settings import Count, CountOrZero, NonNegative, Positive, Relaxation, Settings, ShareOrZero, renamed_names
 
 BETTER = 0.95  # of the best estimate: progress
 NEAR_BEST = 1.2
@@ -28,10 +28,10 @@ APART = 3  # cells along an axis, so that two threads change no velocity in comm
 
 
 class StressWorkspace:
-    """The stresses under a method, and their natural residual [m/s]: the iterate is the problem's own field, in place.
+    """Workspace of a stress solve; the iterate is the problem's field, in place.
 
-    The last stresses are the result, also of a solve that fails: `AcceleratedProjection.least` says why the residual is no judge of them.
-    What steps keep beside them (earlier ones, the momentum) is memory of the problem, whose `begin` uses it between solves.
+    The last stresses are the result, even if the solve fails; `HeavyBallProjectedGradient.least` explains why.
+    Earlier stresses and the momentum are memory of the problem, whose `begin` uses it between solves.
     """
 
     precision = wl.Precision.SINGLE
@@ -41,23 +41,26 @@ class StressWorkspace:
         self.norm, self.current = math.inf, False
 
     def evaluate(self, x: wp.array) -> float:
-        """Return the norm of pressure's and friction's natural residual; `stress.checked` is then the velocity that the stresses leave."""
+        """Return the norm of the natural residual of pressure and friction [m/s].
+
+        `stress.checked` is then the velocity under the stresses.
+        """
         self.norm, self.current = math.hypot(*self.problem.residual()), True
         return self.norm
 
     def rounding_floor(self, x: wp.array, epsilon: float) -> float:
-        """Return 0: what rounding leaves of sand's residual is not known."""
+        """Return 0: the rounding floor of the residual of sand is unknown."""
         return 0.0
 
     def keep(self) -> None:
-        """Let the stresses be the result, as the last ones always are."""
+        """Keep the last stresses as the result."""
 
     restore = keep
 
 
 @dataclass(frozen=True, kw_only=True)
-class AcceleratedProjection(Settings):
-    """Projected gradient steps on pressure and friction together, with momentum (Polyak's heavy ball).
+class HeavyBallProjectedGradient(Settings):
+    """Heavy-ball projected gradient method for pressure and friction together.
 
     Each step moves all stresses against their gradient, scaled by the problem's diagonal, and projects: x onto x >= 0, the friction onto
     the yield set of the new x. Pressure and friction have momenta of their own, which grow where steps go on in one direction and fall
@@ -75,14 +78,14 @@ class AcceleratedProjection(Settings):
         lookahead: the gradient is taken at x + lookahead beta (x - x_before), steps start from x + beta (x - x_before).
         momentum: beta at the start of a solve.
         check_every: periods of steps between two looks at the estimate of the residual.
-        patience: steps without a better estimate after which the next that is nearly as good as the best is taken.
+        patience: steps without a better estimate, after which the next estimate near the best is accepted.
         wait: steps without a better estimate after which the momentum is limited, unless the estimate is within the tolerance.
         calm: limits of the momentum, one after the other: beyond .87 deep sand that yields flutters, which doubles its residual; waves
             of pressure as long as the sand is deep want .95 and more, so that solves start without a limit.
         least: steps that a solve takes, whatever its residual, unless that is next to nothing. Smooth errors hardly show in the residual
             and add up from one time step to the next: without these steps, packed sand at rest creeps two to four times as far.
         cold: the same of a solve that starts from much less than its forces make, unless the residual is next to nothing before. What it
-            leaves is how far sand put down at rest falls, and walls keep the marks of the rebound: in a silo 126 cells deep it is 2e-4 of
+            leaves is the distance that sand initially at rest falls, with a rebound at walls: in a silo 126 cells deep it is 2e-4 of
             the height, and friction points down in the uppermost rows.
     """
 
@@ -100,11 +103,11 @@ class AcceleratedProjection(Settings):
     cold: CountOrZero = 600
 
     def init(self, problem: Stress) -> MomentumWorkspace:
-        """Return what solves of these stresses keep beside them."""
+        """Return the workspace."""
         return MomentumWorkspace(problem, self)
 
     def step(self, problem: Stress, work: MomentumWorkspace, x: wp.array) -> wl.Step:
-        """Take `check_every` periods of steps; the residual is due where their estimate of it says so."""
+        """Take `check_every` periods of steps; evaluate the residual if it is due."""
         estimate, taken = problem.advance(self.check_every), self.check_every * PERIOD
         due, stagnates = work.judge(estimate, taken)
         failure = wl.SolveStatus.STAGNATED if stagnates else None
@@ -112,19 +115,22 @@ class AcceleratedProjection(Settings):
 
 
 class MomentumWorkspace(StressWorkspace):
-    """What a solve with momentum has come to.
+    """Workspace of a solve with momentum.
 
     Args:
         stress: the problem.
         method: the method.
     """
 
-    def __init__(self, stress: Stress, method: AcceleratedProjection) -> None:
+    def __init__(self, stress: Stress, method: HeavyBallProjectedGradient) -> None:
         super().__init__(stress)
         self.method = method
 
     def start(self, *, warm: bool, tolerance: float) -> bool:
-        """Begin a sequence of steps; return whether a least number of them is wanted whatever the residual."""
+        """Begin a sequence of steps; return whether a minimum number is required.
+
+        The minimum holds for any residual.
+        """
         stress, method = self.problem, self.method
         flat = stress.packing.grid.dimension == 2
         stress.restart(
@@ -136,20 +142,23 @@ class MomentumWorkspace(StressWorkspace):
         self._least, self._still = method.least, 0.0
         if stress.cold:
             self._least, self._still = method.cold, STILL * tolerance
-            stress.calm(1.0 - SWING / max(stress.packing.grid.domain_counts))
+            stress.limit_momentum(1.0 - SWING / max(stress.packing.grid.domain_counts))
         if self.norm <= NOTHING * tolerance:
             self._least = 0
         return self._least > 0
 
     def judge(self, estimate: float, taken: int) -> tuple[bool, bool]:
-        """Return whether the residual is due, and whether no better one is in sight; limit the momentum in between."""
+        """Return whether to evaluate the residual, and whether progress has ended.
+
+        Also limits the momentum.
+        """
         method, stagnates = self.method, False
         self._done += taken
         if not estimate < BETTER * self._best:
             late = self._done - self._best_at >= method.patience and estimate < NEAR_BEST * self._best
             stagnates = not math.isfinite(estimate) or late
             if self._limits and self._done - self._moved >= method.wait and estimate > self._aim:
-                self.problem.calm(self._limits.pop(0))
+                self.problem.limit_momentum(self._limits.pop(0))
                 self._moved = self._done
         else:
             self._best, self._best_at, self._moved = estimate, self._done, self._done
@@ -161,7 +170,9 @@ class MomentumWorkspace(StressWorkspace):
 
 @dataclass(frozen=True, kw_only=True)
 class InterleavedSweeps(Settings):
-    """One Gauss-Seidel sweep over the pressure and one over the friction in turn ([Book] 2.2.4, staggering with one sweep a block).
+    """Alternating Gauss-Seidel sweeps over pressure and friction.
+
+    [Book] 2.2.4: staggering with one sweep per block.
 
     Solving either to the end before the other converges far slower: both carry the same load, and each sweep must be able to hand it over.
 
@@ -178,11 +189,11 @@ class InterleavedSweeps(Settings):
     check_every: Count = 4
 
     def init(self, problem: Stress) -> StressSweepWorkspace:
-        """Return what solves of these stresses keep beside them."""
+        """Return the workspace."""
         return StressSweepWorkspace(problem)
 
     def step(self, problem: Stress, work: StressSweepWorkspace, x: wp.array) -> wl.Step:
-        """Sweep `check_every` times over either."""
+        """Sweep `check_every` times over pressure and friction."""
         for _ in range(self.check_every):
             self._round(problem)
         return wl.Step("round", self.check_every, interim=True, iterations=self.check_every, final=True)
@@ -201,10 +212,10 @@ class InterleavedSweeps(Settings):
 
 
 class StressSweepWorkspace(StressWorkspace):
-    """The stresses under sweeps, which keep the velocity up to date."""
+    """Workspace of sweeps, which keep the velocity up to date."""
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Find the velocity that sweeps then keep up to date."""
+        """Compute the velocity that the sweeps then keep up to date."""
         self.problem.velocity.find(self.problem.now)
 
 
@@ -220,7 +231,7 @@ def _sweep(stress: Stress, passed: RowPass, **given: Any) -> None:
 
 @functools.cache
 def interleaved_passes(dimension: int, box: bool = False, rate: bool = False, listed: bool = False) -> SimpleNamespace:
-    """Return the passes of sweeps in 2 or 3 dimensions; `listed`: over `cells` with a list of them."""
+    """Return the sweep kernels in 2-D or 3-D; `listed`: over a list of cells."""
     module = f"interleaved_{dimension}d{'_box' * box}{'_rate' * rate}{'_listed' * listed}"
     made = functools.partial(sand_pass, module, dimension=dimension, real=F32, numbers={"omega": F32}, BOX=box, RATE=rate)
     cells, moved = {"flags": U8, "now": F32}, xyz("inverse", "u")
@@ -234,13 +245,19 @@ def interleaved_passes(dimension: int, box: bool = False, rate: bool = False, li
 
 @functools.lru_cache(maxsize=2)
 def colors(shape: tuple[int, int, int], low: tuple[int, int, int], high: tuple[int, int, int], device: str) -> list[wp.array]:
-    """Return the flat indices of a box's cells low <= (k, j, i) < high in fields of a shape, a list a color: `APART` along each axis."""
+    """Return the flat indices of a box's cells by color.
+
+    Cells low <= (k, j, i) < high; cells of a color are `APART` along each axis.
+    """
     cells = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)[tuple(map(slice, low, high))]
     starts = np.ndindex(*(min(APART, n) for n in cells.shape))
     return [wp.array(cells[k::APART, j::APART, i::APART].ravel(), dtype=wp.int32, device=device) for k, j, i in starts]
 
 
-METHODS: dict[str, type[AcceleratedProjection | InterleavedSweeps]] = {
-    "accelerated-projection": AcceleratedProjection,
+METHODS: dict[str, type[HeavyBallProjectedGradient | InterleavedSweeps]] = {
+    "accelerated-projection": HeavyBallProjectedGradient,
     "interleaved-sweeps": InterleavedSweeps,
 }
+
+
+__getattr__ = renamed_names(__name__, AcceleratedProjection="HeavyBallProjectedGradient")

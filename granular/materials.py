@@ -1,4 +1,4 @@
-"""Granular materials: what a scene may call by name, and where the numbers come from.
+"""Named granular materials, with the sources of their parameters.
 
 The angles are between loose and dense packing as soil mechanics measures them, near the loose one, which is that of a heap: uniform sand
 of round grains 27.5 to 34 degrees, sandy gravel 35 to 50 [Terzaghi & Peck 1967, table 17.1]; the densities are between both too, dry
@@ -18,7 +18,7 @@ FrictionAngleTest = Literal["repose", "plane-strain", "triaxial-compression"]
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """A granular material.
+    """Granular material.
 
     Attributes:
         friction_angle: at which it stops on a slope of itself [degrees].
@@ -41,7 +41,9 @@ MATERIALS = {
 
 
 def slope(angle: float, test: FrictionAngleTest, dimension: int) -> float:
-    """Return k of the yield set |s|_F / sqrt(2) <= k p of an angle [degrees] by the test that it is of.
+    """Return k of the yield set |s|_F / sqrt(2) <= k p for a friction angle.
+
+    The angle [degrees] is that of the given test.
 
     Repose: layers stop at it, k = tan. What slides along a slope shears alone, under equal normal stresses: its shear stress over its
     pressure is the slope's tangent. Sand that rests and has pushed against itself along the slope holds up to asin(k), 35.3 degrees where

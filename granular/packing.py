@@ -1,4 +1,4 @@
-"""How densely sand lies on the grid: fractions of cells, masses of faces, and where stresses live."""
+"""Packing of sand on the grid: cell fractions, face masses, stressed cells."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHEARS = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # the axes of each shear
 
 
 class Packing:
-    """Where sand is in a step, and what of it the stresses move.
+    """Packing of sand in a step, and where stresses act.
 
     phi is the share of a cell that grains fill, in units of the densest packing. Sand may be denser than 1 by what the particles'
     sampling makes of it, which the stresses leave as it is; from FULL on a cell is full. A face has the mean of its cells as mass; those
@@ -75,7 +75,7 @@ class Packing:
             self.spans.assign(np.full((*grid.shape[:2], 2), (low[2], high[2] + 1), dtype=np.int32))
 
     def update(self, density: wp.array, velocity: Sequence[wp.array], dt: float, solid: Sequence[wp.array] = ()) -> None:
-        """Take sand as it is now.
+        """Update the packing from the particles' density and velocity.
 
         Args:
             density: of the particles, in units of the densest packing, float32.
@@ -118,12 +118,12 @@ class Packing:
         return window.common(self.nodes) or self.nodes
 
     def join(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:
-        """Bring a field of stresses to where counted cells and nodes around them look for what is counted elsewhere."""
+        """Make a field of stresses consistent with neighboring parts of the grid."""
         if self.sides is not None:
             self.sides.wrap(stress, launch=launch)
 
     @property
     def cells(self) -> dict[str, Any]:
-        """What a step of the stresses takes, by name."""
+        """Arguments of a stress step, by name."""
         fields = {"flags": self.flags, "drive": self.drive, "stiff": self.stiff}
         return fields | xyz(share=self.share, mass=self.mass, inverse=self.inverse)

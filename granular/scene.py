@@ -1,4 +1,4 @@
-"""Scenes of sand: the tables `material`, `friction`, `gauge` and `sand`, and what sand has of its own in the others."""
+"""Scene tables of sand."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ Angle = Annotated[float, Field(gt=0, lt=60)]
 
 
 class SandTime(Time):
-    """[time]: shorter steps, since sand that moves further than a cell per step packs unevenly."""
+    """[time]: shorter default steps.
+
+    Sand that moves further than a cell per step packs unevenly.
+    """
 
     cfl: float = Field(default=0.8, ge=1e-3, description="Courant number, usually 0.5 to 1")
     dt_max: Positive = Field(default=5e-3, description="longest step [s]")
@@ -70,7 +73,7 @@ class MaterialTable(Table):
     """[material]: properties of the grains."""
 
     renamed: ClassVar = {"angle_of": "friction_angle_test"}
-    name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="material of the defaults")
+    name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="material that gives the defaults")
     friction_angle: Angle | None = Field(
         default=None, description="slope at which running sand stops [degrees], see friction_angle_test; default: by name"
     )
@@ -86,7 +89,7 @@ class MaterialTable(Table):
     tensile_strength: NonNegative = Field(default=0.0, description="tensile strength at dense packing [Pa]")
     friction_angle_test: FrictionAngleTest = Field(
         default="repose",
-        description="test of friction_angle: repose, the slope where layers stop, or plane-strain or triaxial-compression of soils",
+        description="test that measured friction_angle: repose (slope where layers stop), plane-strain or triaxial-compression (soils)",
     )
 
 
@@ -117,7 +120,7 @@ class Gauge(Table):
 def _not_automatic(value: Any) -> Any:
     """Refuse "auto", which liquids have."""
     if value == "auto":
-        message = "is for liquids only: sand's tolerance is in units of rho g dx already, what a cell of sand weighs; 1e-3 unless given"
+        message = "is for liquids only: the tolerance of sand is relative to rho g dx, the weight of a cell; default: 1e-3"
         raise PydanticCustomError("cross_check", "{message}", {"message": message})
     return value
 
@@ -137,56 +140,56 @@ class SandSolver(Table):
 
 
 class SandProperties(MaterialProperties):
-    """What a body of sand has besides its shape."""
+    """Properties of a body of sand besides its shape."""
 
     friction_angle: Angle | None = Field(default=None, description="friction angle [degrees]; default: material.friction_angle")
     cohesion: NonNegative | None = Field(default=None, description="cohesion [Pa]; default: material.cohesion")
 
 
 class SandBox(SandProperties, BoxTable):
-    """A box of sand."""
+    """Box of sand."""
 
 
 class SandSphere(SandProperties, SphereTable):
-    """A ball of sand."""
+    """Ball of sand."""
 
 
 class SandCapsule(SandProperties, CapsuleTable):
-    """A capsule of sand."""
+    """Capsule of sand."""
 
 
 class SandPlane(SandProperties, PlaneTable):
-    """A half space of sand."""
+    """Half space of sand."""
 
 
 class SandMesh(SandProperties, MeshTable):
-    """Sand inside a surface of triangles."""
+    """Sand inside a triangle mesh."""
 
 
 class RoughSolid(Table):
-    """What a solid among sand has of its own."""
+    """Friction of a solid in sand."""
 
     rubs: ClassVar[bool] = True
 
 
 class RoughBox(RoughSolid, SolidBox):
-    """A solid box."""
+    """Solid box with friction."""
 
 
 class RoughSphere(RoughSolid, SolidSphere):
-    """A solid ball."""
+    """Solid ball with friction."""
 
 
 class RoughCapsule(RoughSolid, SolidCapsule):
-    """A solid capsule."""
+    """Solid capsule with friction."""
 
 
 class RoughPlane(RoughSolid, SolidPlane):
-    """A solid half space."""
+    """Solid half space with friction."""
 
 
 class RoughMesh(RoughSolid, SolidMesh):
-    """A solid inside a surface of triangles."""
+    """Solid inside a triangle mesh, with friction."""
 
 
 Sand = Annotated[SandBox | SandSphere | SandCapsule | SandPlane | SandMesh, Field(discriminator="shape")]
@@ -199,7 +202,7 @@ def _found(rules: Iterable[tuple[object, str, object, str]]) -> list[Complaint]:
 
 
 class SandScene(ParticleScene):
-    """A scene of sand."""
+    """Scene of sand."""
 
     elsewhere: ClassVar = {"liquid": "fluids", "pressure": "fluids"}
     palette: ClassVar = "sand"
@@ -231,17 +234,17 @@ class SandScene(ParticleScene):
         return data if density is None else {**data, "physics": {"density": density, **physics}}
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
-        """Return `sand` and its shapes."""
+        """Return the key `sand` and its shapes."""
         return "sand", self.sand
 
     @property
     def endless(self) -> tuple[int, ...]:
-        """Return the axes without an end."""
+        """Return the periodic axes."""
         return tuple(axis for axis, endless in enumerate(self.domain.periodic or ()) if endless)
 
     @property
     def preset(self) -> Material:
-        """Return what the named material is like."""
+        """Return the named material."""
         return MATERIALS[self.material.name]
 
     @property
@@ -252,7 +255,7 @@ class SandScene(ParticleScene):
 
     @property
     def cohesion(self) -> float:
-        """Return the cohesion of all sand, its own or the material's [Pa]."""
+        """Return the cohesion of the sand, its own or the material's [Pa]."""
         own = next((sand.cohesion for sand in self.sand if sand.cohesion is not None), None)
         return self.material.cohesion if own is None else own
 
@@ -266,11 +269,11 @@ class SandScene(ParticleScene):
 
     @property
     def intercept(self) -> float:
-        """Return what |s|_F / sqrt(2) may be without pressure [Pa]."""
+        """Return the largest |s|_F / sqrt(2) without pressure [Pa]."""
         return self.slope * self.cohesion / math.tan(math.radians(self.friction_angle))
 
     def growth(self, spacing: float, kick_dt: float) -> dict[str, float]:
-        """Return `gain` and `halfway` of the yield set in a step, empty if friction does not grow with the rate of shear.
+        """Return `gain` and `halfway` of the yield set; empty without mu(I).
 
         I = |rate of shear| d sqrt(rho_s / p) [Jop, Forterre & Pouliquen 2006], rho_s = rho / max_fraction that of a grain.
 
@@ -286,22 +289,22 @@ class SandScene(ParticleScene):
 
     @property
     def max_fraction(self) -> float:
-        """Return the share of space that grains fill at the densest."""
+        """Return the volume fraction of grains at the densest packing."""
         return self.material.max_fraction or self.preset.max_fraction
 
     def wall_frictions(self) -> list[float]:
-        """Return Coulomb's coefficient of the domain's walls and of each solid."""
+        """Return the friction coefficient of the domain's walls and of each solid."""
         general = self.preset.wall_friction if self.material.wall_friction is None else self.material.wall_friction
         domain = general if self.domain.friction is None else self.domain.friction
         given = [domain, *(domain if s.friction is None else s.friction for s in self.solid)]
         return [STICKS if friction == "stick" else float(friction) for friction in given]
 
     def body_frictions(self) -> list[float]:
-        """Return Coulomb's coefficient of each solid's surface."""
+        """Return the friction coefficient of each solid's surface."""
         return self.wall_frictions()[1:]
 
     def complaints(self) -> list[Complaint]:
-        """Return what is wrong across keys."""
+        """Return errors that involve several keys."""
         found = super().complaints()
         for key, first in (("friction_angle", self.friction_angle), ("cohesion", self.cohesion)):
             for number, sand in enumerate(self.sand):
@@ -312,7 +315,7 @@ class SandScene(ParticleScene):
         return found + self._strength_complaints() + self._rate_complaints() + self._domain_complaints()
 
     def notes(self) -> list[str]:
-        """Return settings that look like mistakes."""
+        """Return suspicious settings."""
         found = [
             *super().notes(),
             *GRAIN_DENSITY.notes("physics.density", self.physics.density),
@@ -329,7 +332,7 @@ class SandScene(ParticleScene):
         grains = self.friction.grain_size
         if grains is not None and grains > self.spacing:
             found.append(
-                f"friction.grain_size = {grains:g} is in m: more than a cell of {self.spacing:.4g} m; of mm it is {1e-3 * grains:g}"
+                f"friction.grain_size = {grains:g} m is larger than a cell, {self.spacing:.4g} m; if mm were meant, it is {1e-3 * grains:g}"
             )
         return found
 
@@ -363,7 +366,7 @@ class SandScene(ParticleScene):
         table, dynamic = self.friction, self.friction.dynamic_angle
         if dynamic is None:
             given = {"grain_size": table.grain_size, "inertial_number": table.inertial_number}
-            message = "goes with friction.dynamic_angle, which is missing"
+            message = "needs friction.dynamic_angle, which is missing"
             return _found((value is not None, f"friction.{key}", value, message) for key, value in given.items())
         above = f"must be above the friction angle, {self.friction_angle:g} degrees: friction grows with the rate of shear"
         small, steep = dynamic <= self.friction_angle, self._slope_of(dynamic) > STEEPEST[self.dimension]
@@ -384,23 +387,23 @@ class SandScene(ParticleScene):
         ends = closed and (self.density_correction or self.particles.reseed or self.source or self.drain)
         sweeps, bodies = method == "interleaved-sweeps", any(solid.is_body for solid in self.solid)
         holds = domain.wall != "separating" or any(solid.wall == "free-slip" for solid in self.solid)
-        pulls = 'must be "separating", of solids too: walls do not pull at sand; friction = 0 lets it slip'
+        pulls = 'must be "separating", for solids too: walls cannot pull sand; for free slip set friction = 0'
         height, top = None if self.gauge is None else self.gauge.height, domain.size[1]
         return _found(
             [
                 (1 in closed, "domain.periodic", periodic, "may be true along x and z only: sand falls along y"),
                 (opened, "domain.open", domain.open, "names a side of a periodic axis"),
-                (ends, "domain.periodic", periodic, "goes without density_correction, reseed, source and drain"),
-                (closed and sweeps, "solver.method", method, "knows no axis without an end: take accelerated-projection"),
-                (bodies and sweeps, "solver.method", method, "moves no rigid bodies: take accelerated-projection"),
-                (bodies and closed, "domain.periodic", domain.periodic, "goes without rigid bodies"),
+                (ends, "domain.periodic", periodic, "cannot be combined with density_correction, reseed, source or drain"),
+                (closed and sweeps, "solver.method", method, "cannot be combined with periodic axes: choose accelerated-projection"),
+                (bodies and sweeps, "solver.method", method, "cannot be combined with rigid bodies: choose accelerated-projection"),
+                (bodies and closed, "domain.periodic", domain.periodic, "cannot be combined with rigid bodies"),
                 (holds, "domain.wall", domain.wall, pulls),
                 (height is not None and not 0.0 < height < top, "gauge.height", height, f"must lie in the domain, between 0 and {top:g} m"),
             ]
         )
 
     def plan(self) -> list[tuple[str, str]]:
-        """Return what a run would do."""
+        """Return a summary of the run."""
         frictions = ", ".join("stick" if f == STICKS else f"{f:g}" for f in self.wall_frictions())
         cohesion = f", cohesion {self.cohesion:g} Pa" if self.cohesion else ""
         dynamic, grain = self.friction.dynamic_angle, self.friction.grain_size
@@ -409,6 +412,6 @@ class SandScene(ParticleScene):
         return [*super().plan(), ("material", material), ("friction", f"{self.friction.model}{growing}, on walls {frictions}")]
 
     def own_memory_parts(self) -> dict[str, int]:
-        """Return what the stresses take at most on the device [bytes]."""
+        """Return the most memory of the stresses on the device [bytes]."""
         cut = CUT_STRESS_BYTES[self.dimension] if self.cuts_cells else 0
         return {"stresses": self.counted_cells * (STRESS_BYTES[self.dimension] + cut)}

@@ -1,4 +1,4 @@
-"""Sand on a staggered grid, carried by particles: the plug-in `granular`."""
+"""Simulator plug-in `granular`: sand by particles on a staggered grid."""
 
 from __future__ import annotations
 
@@ -46,29 +46,29 @@ if TYPE_CHECKING:
 
 FRONT = 99.0  # percentile of the particles that runout and height are of
 FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step
-JAMMED = "solids or a source may leave sand no way out: let them move less or slower; deep sand may need more solver.max_iterations"
+JAMMED = "solids or a source may enclose sand: move them less or slower; deep sand may need more solver.max_iterations"
 STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
 DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # columns that nothing else needs
 COLUMNS = ("coupled_residual", "staggering_iterations", *DIAGNOSTICS, "max_fraction", "runout", "height")
 
 
 class SandSimulation(ParticleSimulation):
-    """Sand in progress; implements `warp_lcp.simulation.Simulation`.
+    """Simulation of sand; implements `warp_lcp.simulation.Simulation`.
 
-    A step brings the particles' mass and velocity to the grid, solves for pressure and friction together, brings the velocity that they
-    leave back to the particles and moves them.
+    A step transfers mass and velocity of the particles to the grid, solves for pressure and friction together, transfers the resulting
+    velocity back to the particles and moves them.
 
     Args:
-        scene: what to simulate.
+        scene: the scene.
         grid: the one that it starts on.
-        parts: what of it belongs to that grid; `solids`: what the sand presses and rubs against.
+        parts: the fields and models on that grid; `solids`: walls with contact and friction.
         particles: the sand at the start.
         more: as of `ParticleSimulation`.
 
     Attributes:
-        packing: how densely the sand lies.
-        stress: what it bears.
-        carried: the bodies as the stresses meet them; None: there are none.
+        packing: density of the sand.
+        stress: stresses of the sand.
+        carried: rigid bodies in the stress solve; None: there are none.
         outcome: of the last solve.
     """
 
@@ -82,9 +82,9 @@ class SandSimulation(ParticleSimulation):
         self._start = self._front()[0]
         self.mark()
 
-    def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
-        """Allocate what belongs to a grid."""
-        super().lay(grid, parts)
+    def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
+        """Allocate the fields of a grid."""
+        super().allocate(grid, parts)
         scene, self.solids, self.sides = self.scene, parts.solids, parts.boundary.sides
         self._base, self.density = grid.field(wp.int8), grid.field()
         self.packing = self._packing()
@@ -104,27 +104,27 @@ class SandSimulation(ParticleSimulation):
         stress = Stress(self.packing, self.solids.walls, **settings)
         return stress, SandReport(stress)
 
-    def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
-        """Go on on another grid of the same domain, see the base class."""
-        super().cover(grid, state)
+    def regrid(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
+        """Continue on another grid window of the domain; see the base class."""
+        super().regrid(grid, state)
         self._place_solids()
         wp.copy(self._base, self.solids.base)
 
     def mark(self) -> None:
-        """Find the sand's cells, as frames show them before the first step."""
+        """Mark the cells that hold sand, for frames before the first step."""
         self._place_solids()
         wp.copy(self._base, self.solids.base)
         self._find_density(self.grid.everywhere)
         self.packing.update(self.density, self.velocity, 1.0)
 
     def window(self, totals: ParticleTotals) -> Window:
-        """Return the cells that the particles can touch in a step."""
+        """Return the window of cells that particles can reach in a step."""
         window = super().window(totals)
         return window if self.sides is None else self.sides.widen(window)
 
-    def bring_to_faces(self, window: Window) -> None:
-        """Bring the particles' velocities to the faces, and let gravity act on them."""
-        super().bring_to_faces(window)
+    def particles_to_grid(self, window: Window) -> None:
+        """Transfer the particles' velocity to the faces and apply gravity."""
+        super().particles_to_grid(window)
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
         complete(window, self.velocity, self.weights, self.outcome.known, self._layer_filled())  # faces have mass farther out than weight
@@ -138,24 +138,24 @@ class SandSimulation(ParticleSimulation):
     def step(self, dt: float) -> Row:
         """Advance by dt [s].
 
-        Stresses that miss their tolerance are taken as they are, and the log's coupled_residual says how good they are, unless their
-        residual is beyond `FAR` and they make sand faster: it would gain energy. They are solved for before any particle moves, so that a
-        failed solve leaves the state as it was, but for the particles' order.
+        Stresses that miss their tolerance are accepted (the log's coupled_residual has their residual), unless the
+        residual exceeds `FAR` and they would add energy to the sand. They are solved for before any particle moves, so that a
+        failed solve leaves the state unchanged, except for the particles' order.
 
         Raises:
-            StepFailed: the stresses are far from what balances the sand; a smaller dt may be tried.
+            StepFailed: the stresses are far from balance; a smaller dt may be tried.
             SimulationFailed: something is not finite, or a particle has left the domain.
             ValueError: dt is not positive.
         """
         before = self.begin_step(dt)
         window = self.window(before)
-        self.bring_to_faces(window)
+        self.particles_to_grid(window)
         solved = self._solve(window, dt)
         measured = self._measured()
-        self.extend(window, self.outcome.known, self.packing.kind, self.outcome.contact)
+        self.extrapolate_velocity(window, self.outcome.known, self.packing.kind, self.outcome.contact)
         if self.sources is not None:
             self.sources.hold(self.velocity, [], self.packing.kind)
-        self.bring_to_particles(window, self.packing.kind, dt)
+        self.grid_to_particles(window, self.packing.kind, dt)
         below, most = self._mass_below(), self._most()
         row = self.move(dt, window)
         self._place_solids()
@@ -173,25 +173,26 @@ class SandSimulation(ParticleSimulation):
             return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
 
     def known_density(self) -> wp.array | None:
-        """Return the density that the packing is made of."""
+        """Return the density from which the packing was computed."""
         return self.density
 
     def own_columns(self) -> tuple[str, ...]:
-        """Return the names of the columns of the stresses and of the sand's shape.
+        """Return the log columns of stresses and shape of the sand.
 
         coupled_residual: natural residual of pressure and friction together, root mean square over the cells with sand, in units of
         rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded,
         dissipation, predicted_excess: see `SandReport.report`; max_fraction: of a cell at the start of the step, in units of
         the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s;
-        kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
+        kg/(s m) in 2-D]: mass below the gauge, or without a gauge the mass that left through drains and open sides.
         """
         columns = tuple(name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS)
         return (*columns, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else columns
 
     def frame(self) -> list[Part]:
-        """Return the particles and the cells that hold sand, with fraction of grains, pressure [Pa] and yield ratio of the last solve.
+        """Return the parts of a frame: particles and cells, surface and volume.
 
-        And the sand's surface and volume, if the scene wants them.
+        Cells have the fraction of grains, pressure [Pa] and yield ratio of the last solve. Surface
+        and volume are written if the scene asks for them.
         """
         grid, points = self.grid, self.points()
         fields = {
@@ -218,12 +219,15 @@ class SandSimulation(ParticleSimulation):
         return np.argwhere(self.grid.interior(self.packing.kind.numpy()) == FLUID) + 1
 
     def pressures(self) -> np.ndarray:
-        """Return the pressure p = rho dx x / dt [Pa] of the last solve, in the stored shape; zeros before the first."""
+        """Return the pressure p = rho dx x / dt [Pa] of the last solve.
+
+        Stored shape; zero before the first step.
+        """
         scale = self.scene.physics.density * self.grid.spacing / self.stress.kick_dt if self.stress.kick_dt > 0.0 else 0.0
         return np.asarray(self.stress.now.numpy()[0] * scale)
 
     def own_state(self) -> dict[str, np.ndarray]:
-        """Return the stresses, and what a frame shows of the last solve."""
+        """Return the stresses and the frame data of the last solve."""
         packing = self.packing
         return {
             "stress": self.stress.now.numpy().copy(),
@@ -235,7 +239,7 @@ class SandSimulation(ParticleSimulation):
         }
 
     def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from the arrays of `own_state`."""
+        """Restore the arrays of `own_state`."""
         self.stress.now.assign(state["stress"])
         self.stress.kick_dt = float(state["stress_dt"])
         self.packing.kind.assign(state["cells"])
@@ -244,7 +248,7 @@ class SandSimulation(ParticleSimulation):
         self._start = float(state["front_at_start"])
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from `state`.
+        """Restore `state`.
 
         Raises:
             ValueError: the arrays do not belong to this scene.
@@ -257,7 +261,7 @@ class SandSimulation(ParticleSimulation):
         if self.solids.moves:
             self.solids.place(self.time)
             if self.solids.walls is not self.stress.walls:
-                self.stress.face(self.solids.walls)
+                self.stress.set_walls(self.solids.walls)
             if self.carried is not None and self.bodies is not None:
                 centers = np.array([body.position for body in self.bodies.bodies])
                 self.carried.place(self.solids.index.numpy(), centers, self.solids.walls)
@@ -280,7 +284,10 @@ class SandSimulation(ParticleSimulation):
         return fastest > math.hypot(*before) + scale + others + bodies
 
     def solve_stress(self, scale: float) -> wl.SolveResult:
-        """Solve for the stresses, to the scene's tolerance in units of `scale` [m/s]: g dt is a pressure of rho g dx."""
+        """Solve for the stresses to the tolerance of the scene.
+
+        In units of `scale` [m/s]: g dt is a pressure of rho g dx.
+        """
         solver = self.scene.solver
         stopping = wl.StoppingCriteria(rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations)
         return wl.solve(self.stress, self.method, stopping=stopping)
@@ -311,8 +318,8 @@ class SandSimulation(ParticleSimulation):
             raise SimulationFailed(f"step {self.step_count}: the stresses are not finite after {solved.iterations} iterations")
         if solved.status is not wl.SolveStatus.CONVERGED and residual > FAR and self._gains(scale):
             self.restore_bodies()
-            stress.take_back()
-            left = f"residual of {residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and would make the sand faster"
+            stress.roll_back()
+            left = f"residual of {residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and would add energy to the sand"
             raise missed_by_far("stress", solved.status, solved.iterations, left, JAMMED)
         with self.watch.stage("projection", *self.velocity):
             self.outcome.take(self.velocity)
@@ -320,7 +327,7 @@ class SandSimulation(ParticleSimulation):
         try:
             self.solve_contacts()
         except StepFailed:
-            stress.take_back()
+            stress.roll_back()
             raise
         return {
             "solver": scene.solver.method,
@@ -419,24 +426,24 @@ class SandSimulation(ParticleSimulation):
 
 
 def percentile_place(count: int) -> int:
-    """Return which of so many sorted numbers, from 0, is the percentile that runout and height are of."""
+    """Return the index of the percentile of runout and height in sorted numbers."""
     return min(int(count * FRONT / 100.0), count - 1)
 
 
 class GranularSimulator:
-    """The plug-in for sand that flows and comes to rest."""
+    """Simulator plug-in for sand that flows and comes to rest."""
 
     name = "granular"
     summary = "sand that flows, piles up and comes to rest"
     scene_model = SandScene
 
     def create(self, scene: Scene, *, device: str, folder: Path) -> SandSimulation:
-        """Build a simulation of `scene`.
+        """Build the simulation of a scene.
 
         Args:
             scene: a SandScene.
             device: a Warp device's name.
-            folder: where the files are that the scene names.
+            folder: folder of the files that the scene names.
 
         Raises:
             ValueError: the scene cannot be simulated; the message names the key and what is allowed.
@@ -463,7 +470,7 @@ class GranularSimulator:
         )  # fmt: skip
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSand:
-        """Build a rank's part of a simulation of `scene`, see `granular.distributed.create`."""
+        """Build this rank's part of a simulation; see `granular.distributed.create`."""
         from warp_lcp.granular.distributed import create  # what it needs is an extra
 
         return create(scene, ranks, device=device, folder=folder)

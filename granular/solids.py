@@ -145,17 +145,17 @@ class SandSolids:
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid that stands still and that no stress feels."""
         return tuple(
-            f"{solid.name} holds no center of a cell of {self.grid.spacing:.4g} m: it bears no sand, and particles may pass"
+            f"{solid.name} contains no center of a cell of {self.grid.spacing:.4g} m: it supports no sand, and particles may pass through"
             for solid, cells in zip(self._placed, self._covers(), strict=True)
             if self.cut is None and not cells and solid.motion is None
         )
 
     def _whole_note(self, cuts: bool) -> str:
         """Return why solids that cut cells do not do so for the stresses."""
-        reason = "some move" if self.moves else "an axis is periodic" if cuts else 'solver.method is "interleaved-sweeps"'
+        reason = "some solids move" if self.moves else "an axis is periodic" if cuts else 'solver.method is "interleaved-sweeps"'
         return (
-            f'to the stresses of the sand solids are whole cells, as with domain.solids = "voxel", since {reason}: they bear it up to half '
-            "a cell off their surfaces, which the particles meet"
+            f'the stress solve uses whole cells for solids, as with domain.solids = "voxel", because {reason}: sand may rest up to half '
+            "a cell off their surfaces; particles collide with the surfaces"
         )
 
     def begin_step(self, time: float, dt: float) -> None:

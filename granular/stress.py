@@ -1,4 +1,4 @@
-"""The stress of sand: pressure and friction that are solved together, and what they leave of the velocity."""
+"""Stress of sand: pressure and friction, solved together."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_ST
 from warp_lcp.rows import Rows
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import Reduction
+from warp_lcp.settings import renamed_method
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
 MOST_MOMENTUM = 0.985  # unless a method wants less
@@ -27,7 +28,9 @@ SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds th
 
 @dataclass(frozen=True)
 class YieldSet:
-    """The stresses that sand can bear, as impulses over rho dx [m/s]: |s|_F / sqrt(2) <= k x + cohesion, x >= -tension.
+    """Yield set of sand: |s|_F / sqrt(2) <= k x + cohesion, x >= -tension.
+
+    Stresses are impulses over rho dx [m/s].
 
     With `gain` friction grows with the rate of shear: k becomes k + gain e / (e + halfway sqrt(x)), e = |rate of shear| dx [m/s], which is
     mu(I) [Jop, Forterre & Pouliquen 2006].
@@ -48,7 +51,7 @@ class YieldSet:
 
 
 class Velocity:
-    """The velocity that a stress leaves, in one precision, and the rates of strain.
+    """Velocity under a stress, in one precision, and the rates of strain.
 
     Attributes:
         u: of each component [m/s].
@@ -65,11 +68,11 @@ class Velocity:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Return `u` and `edge` by the names that passes have for them."""
+        """Return `u` and `edge` by the argument names of the kernels."""
         return xyz(u=self.u, edge=self.edge)
 
     def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
-        """Find velocity and rates of strain under a field of stresses.
+        """Compute velocity and rates of strain under a field of stresses.
 
         Args:
             stress: the stresses.
@@ -92,7 +95,7 @@ class Velocity:
 
 
 class Stress(wl.VariationalInequality):
-    """Pressure and friction of sand under a packing.
+    """Variational inequality of pressure and friction of sand for a given packing.
 
     With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
 
@@ -146,10 +149,10 @@ class Stress(wl.VariationalInequality):
         self.last_residual = 0.0, 0.0
         self.kick_dt, self.cold = 0.0, True
         self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # as before `begin`
-        self.face(walls)
+        self.set_walls(walls)
 
-    def face(self, walls: Walls) -> None:
-        """Take other walls: solids have moved."""
+    def set_walls(self, walls: Walls) -> None:
+        """Set other walls, after solids have moved."""
         device = self.packing.grid.device
         self.walls, self._program, self._check = walls, None, None
         self._sums.zero_()
@@ -159,13 +162,13 @@ class Stress(wl.VariationalInequality):
         self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
 
     def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float) -> None:
-        """Start from the last stresses, as far as they have a place in the packing now.
+        """Start from the last stresses, where they exist in the new packing.
 
         Args:
-            bound: what sand can bear.
+            bound: yield set of the sand.
             gravity: [m/s^2], three entries.
             dt: time step [s].
-            kick_dt: how long forces act in it [s]; stresses are impulses, and it is the last step's pressure that goes on.
+            kick_dt: time for which forces act in it [s]; stresses are impulses and are rescaled from the last step's pressure.
         """
         wp.copy(self._last, self.now)
         self._last_kick = self.kick_dt
@@ -192,13 +195,13 @@ class Stress(wl.VariationalInequality):
         """Return how many cells hold sand, given the flags of the counted ones."""
         return int(np.count_nonzero(flags))
 
-    def take_back(self) -> None:
-        """Put the stresses back to what they were before `begin`, as the step is not taken."""
+    def roll_back(self) -> None:
+        """Restore the stresses before `begin`; the step is not taken."""
         wp.copy(self.now, self._last)
         self.kick_dt = self._last_kick
 
     def restart(self, *, pressure_step: float, shear_step: float, lookahead: float, momentum: float) -> None:
-        """Start a sequence of steps with momentum.
+        """Restart the steps with momentum.
 
         Args:
             pressure_step: of the projected gradient, relative to the diagonal.
@@ -218,15 +221,22 @@ class Stress(wl.VariationalInequality):
         if self.bodies is not None:
             self.bodies.prepare(self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step)
 
-    def calm(self, momentum: float) -> None:
-        """Let momenta from now on be at most `momentum`."""
+    def limit_momentum(self, momentum: float) -> None:
+        """Limit all later momenta to `momentum`."""
         state = self._momentum.numpy().copy()
         state[BETA_X : NEXT_X + 2] = np.minimum(state[BETA_X : NEXT_X + 2], momentum)
         state[REST] = 1.0 - momentum
         self._momentum.assign(state)
 
+    face = renamed_method("face", set_walls)
+    take_back = renamed_method("take_back", roll_back)
+    calm = renamed_method("calm", limit_momentum)
+
     def advance(self, periods: int) -> float:
-        """Take some periods of steps with momentum, see `PERIOD`; return an estimate of the natural residual [m/s]."""
+        """Take several periods of steps; return an estimate of the residual [m/s].
+
+        See `PERIOD`; the steps have momentum.
+        """
         if self._program is None:
             self._program = Program(self.packing.grid.device)
             for step in range(PERIOD):
@@ -253,7 +263,10 @@ class Stress(wl.VariationalInequality):
         launch(momentum_kernel, 1, [sums, self._momentum], device=self.packing.grid.device)
 
     def residual(self) -> tuple[float, float]:
-        """Return the natural residual of pressure and friction [m/s], root mean squares over the cells that hold sand, in float64."""
+        """Return the natural residual of pressure and friction [m/s], in float64.
+
+        Root mean squares over the cells that hold sand.
+        """
         if self._check is None:
             self._check = Program(self.packing.grid.device)
             self.checked.find(self.now, launch=self._check.launch, bodies=self.bodies, respond=True)

@@ -1,4 +1,4 @@
-"""What sand can bear: the shape of a field of stresses, numbers of the yield set, and the passes over both, whose headers have the rest.
+"""Yield set of sand: layout of the stress fields, parameters, kernels.
 
 All stresses are impulses over rho dx [m/s]: x = kick_dt p / (rho dx) and the like, so that spacing and time step appear nowhere. A field of
 stresses has layers of the grid's shape: x, the normal parts of the deviator (2-D: a = s_xx = -s_yy; 3-D: s_xx, s_yy, s_zz), and for each
@@ -44,7 +44,10 @@ WALLS = {"cells": I32, "sides": U8, "walls": I32, "friction": F32, "fraction": F
 
 
 def xyz(*names: str, **fields: Any) -> dict[str, Any]:
-    """Return entries `name_x`, `name_y`, `name_z` of vectors: of `names` F32, of `fields` their components, None where there are fewer."""
+    """Return entries `name_x`, `name_y`, `name_z` of vectors.
+
+    F32 for `names`, the components for `fields`, None for missing ones.
+    """
     given = {name: [F32] * 3 for name in names} | fields
     return {f"{name}_{axis}": field for name, three in given.items() for axis, field in zip("xyz", [*three, None, None], strict=False)}
 
@@ -63,7 +66,7 @@ def sand_pass(
     listed: str = "",
     **words: Any,
 ) -> RowPass:
-    """Return a pass over stresses.
+    """Return the declaration of a kernel over stresses.
 
     Args:
         module: Warp module, after the package.

@@ -181,7 +181,7 @@ def test_callbacks_see_each_iterate():
 
     found = sweeps(maxiter=6, callback=see)
     assert found.status == 1
-    assert found.message.startswith("MAX_ITERATIONS: the iteration limit came first: raise maxiter")
+    assert found.message.startswith("MAX_ITERATIONS: the iteration limit was reached: raise maxiter")
     assert [one.nit for one in seen] == [1, 2, 3, 4, 5, 6] == list(range(1, found.nit + 1))
     assert [one.residual for one in seen] == [record.residual for record in found.result.history[1:]]
     norms = [np.linalg.norm(one.x - seen[-1].x) for one in seen]
@@ -200,7 +200,7 @@ def test_a_callback_stops(at):
 
     found = sweeps(callback=stop)
     assert (found.status, found.success, found.nit) == (99, False, at)
-    assert found.message == "STOPPED: the callback raised StopIteration: go on from this x"
+    assert found.message == "STOPPED: the callback raised StopIteration: continue from this x"
     np.testing.assert_array_equal(found.x, min(seen, key=lambda one: one.residual).x)
     assert found.result.status is wl.SolveStatus.STOPPED
     assert sweeps(x0=found.x).success
@@ -263,7 +263,7 @@ A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
         ((A, B), {"method": "projected-multigrid"}, "ProjectedMultigrid needs an operator with a stencil"),
         ((A, B), {"callback": 3}, "callback is a int: expected a function of one argument"),
         ((A, B), {"preconditioner": np.eye(3)}, r"preconditioner has shape \(3, 3\)"),
-        ((A, B), {"preconditioner": np.eye(2), "method": "lemke"}, "preconditioner: Lemke makes no use of it"),
+        ((A, B), {"preconditioner": np.eye(2), "method": "lemke"}, "preconditioner: Lemke does not use one"),
     ],
 )
 def test_what_is_refused(arguments, options, message):

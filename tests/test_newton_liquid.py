@@ -184,14 +184,14 @@ def test_a_frame_shows_liquid_and_bodies():
 def test_graphs_are_not_for_it():
     model = world(((0.0, 0.0, 0.5), 500.0, "sphere", {"radius": 0.1}))
     liquid, state = SolverLiquid(model, pool(), origin=MIDDLE), model.state()
-    with wp.ScopedDevice("cpu"), pytest.raises(RuntimeError, match="outside of captured graphs"), wp.ScopedCapture():
+    with wp.ScopedDevice("cpu"), pytest.raises(RuntimeError, match="inside a captured graph"), wp.ScopedCapture():
         liquid.step(state, state, None, None, 0.01)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"solid": [{"shape": "sphere", "center": [0.5] * 3, "radius": 0.1, "mass": 1.0}]}, "rigid bodies are the model's"),
+        ({"solid": [{"shape": "sphere", "center": [0.5] * 3, "radius": 0.1, "mass": 1.0}]}, "rigid bodies come from the model"),
         ({"solver": {"method": "psor"}}, "solver.method"),
         (
             {"domain": {"size": [1.0, 1.0], "resolution": 16}, "liquid": [{"shape": "box", "min": [0, 0], "max": [1, 0.5]}]},
@@ -217,7 +217,7 @@ def test_worlds_that_it_cannot_hold_are_refused():
         SolverLiquid(many.finalize(device="cpu"), pool())
     walls = newton.ModelBuilder()
     walls.add_shape_plane(width=1.0, length=1.0)
-    with pytest.raises(ValueError, match="PLANE has no inside"):
+    with pytest.raises(ValueError, match="PLANE encloses no volume"):
         SolverLiquid(walls.finalize(device="cpu"), pool())
 
 

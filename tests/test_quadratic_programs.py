@@ -122,7 +122,7 @@ def test_infinity_as_a_number(infinity):
     assert none.extras["result"].message == "INFEASIBLE: h[0] is -infinity, which no x meets"
     falls = qp.solve_problem(qpsolvers.Problem(0 * eye, one, lb=-infinity * one))
     assert falls.found is False
-    assert falls.extras["result"].message == "INFEASIBLE: costs fall without end: the program is unbounded below"
+    assert falls.extras["result"].message == "INFEASIBLE: the objective is unbounded below"
 
 
 def test_what_is_just_below_infinity_is_a_number():

@@ -20,8 +20,10 @@ from warp_lcp.distributed.petsc_active_set import PetscActiveSet
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics
 from warp_lcp.gallery.planted import Plant
 from warp_lcp.granular.coupled import METHODS as SAND
+from warp_lcp.grid import staggered
+from warp_lcp.material import density_correction
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
-from warp_lcp.settings import OrInfinite, SettingError, Settings, checked, ranges, rule
+from warp_lcp.settings import OrInfinite, SettingError, Settings, checked, ranges, renamed_method, rule
 
 KINDS = [
     *wl.METHODS.values(),
@@ -169,5 +171,27 @@ def test_old_names_are_taken_with_a_warning_that_gives_the_new_one():
     ):
         with pytest.warns(DeprecationWarning, match=rf"{kind.__name__}\({old}=\.\.\.\) is now {kind.__name__}\({new}=\.\.\.\)"):
             assert kind(**{old: value}) == kind(**{new: value})
-        with pytest.raises(TypeError, match=f"{old} or {new}, its new name, and not both"):
+        with pytest.raises(TypeError, match=f"got both {old} and {new}"):
             kind(**{old: value, new: value})
+
+
+def test_old_names_of_modules_and_methods_warn_and_give_the_new_ones():
+    with pytest.warns(DeprecationWarning, match=r"staggered\.Trail is now warp_lcp\.grid\.staggered\.DirtyRegion"):
+        assert staggered.Trail is staggered.DirtyRegion
+    with pytest.warns(DeprecationWarning, match="DensityMonitor"):
+        assert density_correction.Crowding is density_correction.DensityMonitor
+    with pytest.raises(AttributeError, match="no attribute 'Trace'"):
+        staggered.Trace  # noqa: B018
+
+    class Doubled:
+        def twice(self, number: int) -> int:
+            return 2 * number
+
+        double = renamed_method("double", twice)
+
+    class Own(Doubled):
+        def twice(self, number: int) -> int:
+            return 2 * number + 1
+
+    with pytest.warns(DeprecationWarning, match=r"Own\.double is now Own\.twice"):
+        assert Own().double(2) == 5

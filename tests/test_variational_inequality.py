@@ -143,7 +143,7 @@ def test_methods_and_problems_that_do_not_go_together() -> None:
     problem = Contacts(2, 5)
     with pytest.raises(ValueError, match="ProjectedSOR takes problems of the class LCP: this is a Contacts"):
         wl.solve(problem, wl.ProjectedSOR())
-    with pytest.raises(ValueError, match="a Contacts is solved by methods of its own"):
+    with pytest.raises(ValueError, match="a Contacts needs one of its own methods"):
         wl.solve(problem)
     with pytest.raises(ValueError, match="ProjectedGradient takes problems of the class Contacts: this is a LCP"):
         wl.solve(wl.LCP(np.eye(3), np.ones(3)), ProjectedGradient())

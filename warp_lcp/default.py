@@ -48,7 +48,7 @@ Run = Callable[[LCP, Solver, StoppingCriteria | MeanCriteria, Array | None, Call
 
 
 def default_method(problem: LCP) -> Solver:
-    """Return the method that `wl.recommend` names, which `wl.solve` takes first."""
+    """Return the method that `wl.solve` tries first, as named by `wl.recommend`."""
     return recommend(problem).method
 
 
@@ -60,18 +60,18 @@ def solve(
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
-        solver: the method, say `wl.MinimumMapNewton()`, or its name in `wl.METHODS` for its default
-            settings, say "psor". None: what `wl.recommend` names, and where that fails, its
-            alternatives, each from the same start. Their steps add up, no more than `stopping`
-            allows in all; the history has all of them, and the result's `method` names the one that
+        solver: the method, such as `wl.MinimumMapNewton()`, or its name in `wl.METHODS` for its default
+            settings, such as "psor". None: the method of `wl.recommend`, and if that fails, its
+            alternatives, each from the same start. `stopping` limits the sum of their steps;
+            the history has all of them, and the result's `method` names the one that
             found x. Sparse matrices that are a compact stencil on a box of cells in its natural
-            order, x first, are then solved as such, which the result's `grid` says.
+            order, x first, are then solved as a grid problem; the result's `grid` has its shape.
         stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that `wl.recommend` gives if there is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
-        workspace: what `solver.init(problem)` returned, to use its memory again.
-        callback: called with each Record as it is made, say `wl.print_progress`; where it raises StopIteration,
+        workspace: result of `solver.init(problem)`, to reuse its memory.
+        callback: called with each Record, such as `wl.print_progress`; if it raises StopIteration,
             the solve ends with STOPPED.
-        misplaced: nothing; other options are refused.
+        misplaced: other options are refused, with a hint where they belong.
 
     Returns:
         The best iterate, its status and recomputed residual, the history. The result's x is the caller's to keep, unless the problem
@@ -84,12 +84,12 @@ def solve(
     """
     for name in misplaced:
         if name in StoppingCriteria.__dataclass_fields__:
-            raise TypeError(f"solve takes no {name}: it is a criterion, pass stopping=wl.StoppingCriteria({name}=...)")
-        raise TypeError(f"solve takes no {name}: settings are the method's own, say wl.ProjectedSOR(omega=1.5)")
+            raise TypeError(f"solve takes no {name}: it is a stopping criterion, pass stopping=wl.StoppingCriteria({name}=...)")
+        raise TypeError(f"solve takes no {name}: it is a setting of a method, pass for example wl.ProjectedSOR(omega=1.5)")
     if solver is None and workspace is not None:
-        raise ValueError("workspace: name the solver that made it")
+        raise ValueError("workspace: pass the solver that made it, too")
     if solver is None and isinstance(problem, VariationalInequality):
-        raise ValueError(f"solver: a {type(problem).__name__} is solved by methods of its own, name one")
+        raise ValueError(f"solver: a {type(problem).__name__} needs one of its own methods, pass one")
     check_criteria(stopping)
     method: Any = method_of(solver, "solver")
     if method is None and isinstance(problem, LCP):

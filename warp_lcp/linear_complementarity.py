@@ -44,13 +44,13 @@ def linear_complementarity(
     A: Any, b: Array, *, bounds: Any = None, x0: Array | None = None, tol: float = 1e-6, atol: float = 0.0,
     method: str | Solver | None = None, maxiter: int = 1000, preconditioner: Any = None, callback: Callable[..., Any] | None = None,
 ) -> OptimizeResult:  # fmt: skip
-    """Solve a complementarity problem in the manner of scipy.optimize.
+    """Solve a complementarity problem with SciPy's conventions.
 
     Find x with lo <= x <= hi and y = A x + b: y_i >= 0 where x_i = lo_i, y_i <= 0 where x_i = hi_i,
     and y_i = 0 in between.
 
     For bounds 0 and inf that is the linear complementarity problem, 0 <= x, y >= 0, x'y = 0 ([Book] 1.2); if A is symmetric positive
-    semi-definite, x minimizes x'Ax / 2 + b'x within its bounds. This is `wl.solve` in SciPy's manner, for arrays on the host: problems
+    semi-definite, x minimizes x'Ax / 2 + b'x within its bounds. This is `wl.solve` with SciPy's conventions, for host arrays. Problems
     that are solved again and again, or live on a device, are better made once as a `wl.LCP`.
 
     Args:
@@ -59,22 +59,22 @@ def linear_complementarity(
         bounds: a tuple (lo, hi) or a scipy.optimize.Bounds, of numbers or arrays like b, or None
             where there is none; or SciPy's list of pairs (lo, hi), one for each unknown, of numbers
             or None; None: (0, inf). For two unknowns a list of two tuples is pairs, a tuple of two
-            lists or arrays is (lo, hi), and what could be both is refused. Magnitudes of 1e20 and
+            lists or arrays is (lo, hi), and ambiguous forms are refused. Magnitudes of 1e20 and
             more are infinite.
         x0: a guess, of b's shape.
         tol: relative tolerance, in [0, 1): of the natural residual's norm, relative to that at the projection of 0 onto the bounds.
         atol: absolute tolerance of that norm, >= 0, in the units of b.
-        method: a method with its settings, say `wl.InteriorPoint()`, or a name in `wl.METHODS`, which stands for the method with its
+        method: a method with its settings, such as `wl.InteriorPoint()`, or a name in `wl.METHODS`, for the method with its
             default settings; None: `wl.default_method`, and its alternatives where it fails.
-        maxiter: the most iterations of the method, >= 0.
+        maxiter: maximum number of iterations of the method, >= 0.
         preconditioner: of `wl.LCP`.
         callback: called after each iteration, of alternatives too: `callback(intermediate_result)`, an
-            OptimizeResult with x, nit and residual, if that is what its parameter is called, else
-            `callback(x)`. Where it raises StopIteration the best x so far is returned, with status 99.
+            OptimizeResult with x, nit and residual, if its parameter has this name, else
+            `callback(x)`. If it raises StopIteration, the best x so far is returned, with status 99.
 
     Returns:
         `x`, a float64 array of b's shape; `success`, whether the residual, recomputed in float64, meets a tolerance; `status`, 0 for
-        success, 1 where maxiter came first, 2 where there is no solution, others as `STATUSES` of this module has them; `message`,
+        success, 1 where maxiter was reached, 2 where there is no solution, others as `STATUSES` of this module has them; `message`,
         which says what to try next; `nit`; `residual`, the norm of the natural residual, and `relative_residual`; `slack`, y;
         `active_mask`, as scipy.optimize.lsq_linear has it, -1 where x is held at lo, 1 at hi, 0 where y = 0 is asked for; `result`,
         what `wl.solve` returned.
@@ -221,7 +221,7 @@ def _method(method: Any) -> Solver:
     method = method_of(method)
     if isinstance(method, type) or not isinstance(method, Solver):
         kind = f"the class {method.__name__}" if isinstance(method, type) else f"a {type(method).__name__}"
-        raise ValueError(f"method is {kind}: expected a name in wl.METHODS, a method with its settings, say wl.MinimumMapNewton(), or None")
+        raise ValueError(f"method is {kind}: expected a name in wl.METHODS, a method like wl.MinimumMapNewton(), or None")
     return method
 
 

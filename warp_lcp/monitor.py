@@ -28,7 +28,7 @@ def print_progress(record: Record) -> None:
     seconds and the kind of the last step. It is like the output of PETSc's `-snes_monitor`.
 
     Args:
-        record: what `wl.solve` passes to its callback.
+        record: argument that `wl.solve` passes to its callback.
     """
     print(f"{record.iteration:5d}  residual {record.residual:.6e}  {record.seconds:9.3f} s  {record.step}", flush=True)
 

@@ -35,11 +35,13 @@ if TYPE_CHECKING:
 NAME = "warp_lcp"
 LOOSER = 10.0  # times tol: residuals row by row, where a method has met tol in the norm of all rows
 LEAST = 1e-12  # the least tolerance of rows, which rounding leaves
-WORDS = {"infeasible": "no x meets the constraints", "unbounded": "costs fall without end: the program is unbounded below"}
+WORDS = {"infeasible": "no x meets the constraints", "unbounded": "the objective is unbounded below"}
 
 
 def register() -> None:
-    """Make `qpsolvers.solve_qp(..., solver="warp_lcp")` call `solve_problem`, for dense and for sparse matrices.
+    """Register the solver "warp_lcp" with `qpsolvers.solve_qp`.
+
+    It then calls `solve_problem`, for dense and for sparse matrices.
 
     Raises:
         ImportError: qpsolvers is not installed.
@@ -57,7 +59,9 @@ def register() -> None:
 def solve_problem(
     problem: Problem, initvals: Any = None, verbose: bool = False, *, method: Any = None, tol: float = 1e-9, maxiter: int = 500
 ) -> Solution:
-    """Minimize x'Px / 2 + q'x subject to G x <= h, A x = b, lb <= x <= ub, P symmetric positive semi-definite.
+    """Minimize x'Px / 2 + q'x subject to G x <= h, A x = b, lb <= x <= ub.
+
+    P must be symmetric positive semi-definite.
 
     A program with nothing but a box is the boxed LCP of P and q ([Book] eq. 1.58); others are
     equilibrated and solved by the boxed LCP of their first-order conditions, in x and the
@@ -65,20 +69,20 @@ def solve_problem(
     infinite.
 
     Args:
-        problem: of qpsolvers; P's symmetric part is what counts.
+        problem: of qpsolvers; only the symmetric part of P is used.
         initvals: a guess of x, shape (n,).
         verbose: print how the solve ended.
-        method: of `linear_complementarity`. None: what that takes for a box; with other
-            constraints, or where that fails, InteriorPoint, then Lemke.
+        method: of `linear_complementarity`. None: its default for a box; with other
+            constraints, or if that fails, InteriorPoint, then Lemke.
         tol: relative tolerance, in [0, 1), of the natural residual; what is found has primal and
             dual residuals below 10 tol in every row, relative to the terms of that row, and such a
             duality gap, relative to its terms.
-        maxiter: the most iterations of a method.
+        maxiter: maximum number of iterations of a method.
 
     Returns:
         x with the multipliers y, z and z_box in qpsolvers' signs, and `found` where residuals and
         gap, recomputed in float64 in all rows, meet the tolerance; else `found` is False and they
-        are None. `extras["result"]` is what `linear_complementarity` returned last, with success,
+        are None. `extras["result"]` is the last result of `linear_complementarity`, with success,
         status and message of the program; "primal_residual", "dual_residual" and "duality_gap" are
         those relative figures.
 
@@ -179,7 +183,10 @@ class _Solve:
             self.end(SolveStatus.CONVERGED, f"{SolveStatus.CONVERGED.value}")
         elif self.result.success:
             worst = ", ".join(f"{name} {value:.1e}" for name, value in zip(("primal", "dual", "gap"), self.figures, strict=True))
-            self.end(SolveStatus.FLOOR, f"the conditions are solved, but a row is not to 10 tol: relative residuals {worst}")
+            self.end(
+                SolveStatus.FLOOR,
+                f"the conditions are solved, but a constraint is violated by more than 10 tol: relative residuals {worst}",
+            )
 
 
 def _write(solution: Solution, program: QuadraticProgramData, point: ProgramPoint, bounding: np.ndarray) -> None:

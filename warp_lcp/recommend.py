@@ -39,7 +39,7 @@ class Budget(Settings):
         bytes: memory besides the problem's own, an integer >= 1.
 
     Raises:
-        ValueError: nothing is given, or something outside its range.
+        ValueError: no limit is given, or one is out of range.
 
     Example:
         >>> Budget(iterations=0)
@@ -65,11 +65,11 @@ class Recommendation:
     Args:
         name: of the method in METHODS.
         method: the method with its settings.
-        stopping: criteria for the accuracy asked for, with a limit of steps that the method can be expected to need.
-        reasons: why, a sentence each.
-        expected: what the solve is expected to take, None where that is not known.
-        alternatives: names of the methods to try if this one fails or is too slow, the likeliest first.
-        traits: what the decision rests on.
+        stopping: criteria for the requested accuracy, with a suitable limit of steps.
+        reasons: one sentence for each reason.
+        expected: expected cost of the solve, None if unknown.
+        alternatives: names of methods to try if this one fails or is too slow, best first.
+        traits: properties of the problem that decided.
     """
 
     name: str
@@ -142,18 +142,18 @@ RULES: tuple[Rule, ...] = (
 
 
 def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget | None = None) -> Recommendation:
-    """Return a method for a problem, with reasons.
+    """Return the recommended method for a problem, with reasons.
 
-    The rules decide by what A and the bounds look like; `wl.solve` without a method decides by them
-    too. Sweeps are tried only on unsymmetric sparse matrices and where there is a budget; only
-    symmetric matrices are factored, at most 2,048 rows of them. They were made from times of all
-    methods on one core of an AMD EPYC, and hold for the CPU; docs "Choosing a method" gives the
-    decision list and how often it is right.
+    The rules depend on A and the bounds; `wl.solve` without a method uses them
+    too. Sweeps are tried only on unsymmetric sparse matrices and if there is a budget; only
+    symmetric matrices are factored, at most 2,048 rows of them. The rules come from timings of all
+    methods on one core of an AMD EPYC and hold for CPUs; docs "Choosing a method" gives the
+    decision list and its success rate.
 
     Args:
         problem: the LCP; it is not changed.
         accuracy: relative residual wanted, in (0, 1), or "rough" (1e-2), "usual" (1e-6) or "exact" (1e-10).
-        budget: what the solve may cost; None: whatever it takes.
+        budget: limits of the solve; None: no limits.
 
     Raises:
         ValueError: an argument is of another kind or outside its range.
@@ -261,7 +261,7 @@ def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendat
     if not found.traits.takes("psor") or not _takes("psor", problem, steps=TRIAL):
         return _said(found, f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no sweep is possible here.")
     many = max(1, int(seconds / ((time.perf_counter() - begun) / TRIAL)))
-    why = f"{found.name} took {took:.2g} s for its first step, more than the {seconds:g} s allowed: {many} sweeps fit, each is of use."
+    why = f"{found.name} took {took:.2g} s for its first step, more than the {seconds:g} s allowed: {many} sweeps fit, and each helps."
     cheaper = _instead(found, "psor", why)
     return replace(cheaper, stopping=replace(cheaper.stopping, max_iterations=min(many, cheaper.stopping.max_iterations)))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
@@ -101,7 +102,7 @@ def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
             for old, new in names.items():
                 if old in settings:
                     if new in settings:
-                        raise TypeError(f"{kind.__name__} takes {old} or {new}, its new name, and not both")
+                        raise TypeError(f"{kind.__name__} got both {old} and {new}: {old} is the old name of {new}, leave it out")
                     warnings.warn(f"{kind.__name__}({old}=...) is now {kind.__name__}({new}=...)", DeprecationWarning, stacklevel=2)
                     settings[new] = settings.pop(old)
             init(self, *args, **settings)
@@ -110,6 +111,40 @@ def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
         return kind
 
     return wrap
+
+
+def renamed_names(module: str, **names: str) -> Callable[[str], Any]:
+    """Return a module's `__getattr__` that finds old names, with a DeprecationWarning.
+
+    Args:
+        module: `__name__` of the module.
+        names: old="new", names of the module.
+    """
+
+    def find(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        warnings.warn(f"{module}.{name} is now {module}.{names[name]}", DeprecationWarning, stacklevel=2)
+        return getattr(sys.modules[module], names[name])
+
+    return find
+
+
+def renamed_method(old: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a method that calls one by its new name, with a DeprecationWarning.
+
+    Args:
+        old: old name.
+        method: the method by its new name; subclasses may override it.
+    """
+    new = method.__name__
+
+    @wraps(method)
+    def call(self: Any, *args: Any, **given: Any) -> Any:
+        warnings.warn(f"{type(self).__name__}.{old} is now {type(self).__name__}.{new}", DeprecationWarning, stacklevel=2)
+        return getattr(self, new)(*args, **given)
+
+    return call
 
 
 def checked(name: str, given: object, annotation: Any) -> Any:

@@ -35,9 +35,9 @@ LOW_RANK, LOW_RANK_ITERATIVE = 0.1, 0.3
 
 
 class Traits:
-    """What is known of a problem; each property is computed when it is first read.
+    """Properties of a problem, each computed when first read.
 
-    That costs a product or less unless it says more.
+    Each costs a product with A or less unless stated otherwise.
 
     Args:
         problem: the LCP; it is not changed.
@@ -67,12 +67,12 @@ class Traits:
 
     @cached_property
     def unknowns(self) -> int:
-        """Return n."""
+        """Return the number of unknowns n."""
         return int(np.count_nonzero(self._known))
 
     @cached_property
     def entries(self) -> int:
-        """Return how many entries of A a product reads."""
+        """Return the number of entries of A that a product reads."""
         if self.kind == "sparse":
             A = self._problem.A
             return A.nnz if isinstance(A, SparseOperator) else int(self._matrix.nnz)
@@ -85,13 +85,16 @@ class Traits:
 
     @cached_property
     def diagonal(self) -> str:
-        """Return the sign of the smallest diagonal entry: "positive", "zero" or "negative"."""
+        """Return the sign of the least diagonal entry: "positive", "zero" or "negative"."""
         least = self._entries_on_diagonal.min()
         return "positive" if least > 0 else "zero" if least == 0 else "negative"
 
     @cached_property
     def curved(self) -> bool:
-        """Return whether a matrix's diagonal entries are negative where a bound is infinite, none is positive there."""
+        """Return whether a matrix with infinite bounds has negative diagonal entries.
+
+        Negative entries where a bound is infinite, and no positive entries there.
+        """
         return self.kind in ("dense", "sparse") and self.diagonal == "negative" and has_negative_curvature(self._problem)
 
     @cached_property
@@ -102,7 +105,9 @@ class Traits:
 
     @cached_property
     def definiteness(self) -> str:
-        """Return whether A's symmetric part is "definite", "semidefinite", "indefinite" or "unknown".
+        """Return the definiteness of the symmetric part of A.
+
+        "definite", "semidefinite", "indefinite" or "unknown".
 
         By dominance, or of at most MOST_FACTORED unknowns by a Cholesky factorization or two.
         """
@@ -114,7 +119,7 @@ class Traits:
 
     @cached_property
     def low_rank(self) -> bool:
-        """Return whether A is dense, symmetric, and few of its eigenvalues carry the trace.
+        """Return whether A is dense, symmetric and close to low rank.
 
         By whether most pivots of a Cholesky factorization are small beside the diagonal entries;
         beyond MOST_FACTORED unknowns those of every second row and column.
@@ -138,7 +143,7 @@ class Traits:
 
     @cached_property
     def bounds(self) -> str:
-        """Return "affine", "none", "one-sided" or "box": which bounds are finite anywhere."""
+        """Return the kind of bounds: "affine", "none", "one-sided" or "box"."""
         problem = self._problem
         if self.affine:
             return "affine"
@@ -147,7 +152,7 @@ class Traits:
 
     @cached_property
     def sweeps(self) -> float:
-        """Return how many sweeps of `ProjectedSOR` the accuracy would take.
+        """Return the expected number of `ProjectedSOR` sweeps for the accuracy.
 
         On grids by the rate omega - 1 of the advised omega, else extrapolated from the rate of TRIAL
         sweeps, which are made.
@@ -169,11 +174,14 @@ class Traits:
 
     @cached_property
     def able(self) -> tuple[str, ...]:
-        """Return the names of the methods that take the problem."""
+        """Return the names of the methods that can solve the problem."""
         return tuple(name for name in METHODS if self.takes(name))
 
     def takes(self, name: str) -> bool:
-        """Return whether a method takes the operator, its size, the bounds and the rest."""
+        """Return whether a method can solve the problem.
+
+        It must accept the operator, its size and the bounds.
+        """
         method, problem = METHODS[name], self._problem
         if name == "quadratic-program" and not (self.symmetric and has_piqp()):
             return False
@@ -184,7 +192,9 @@ class Traits:
 
     @property
     def pivotable(self) -> bool:
-        """Return whether A is no Hessian of a convex function and has an entry <= 0 on its diagonal.
+        """Return whether pivoting is suitable: A is not a convex Hessian.
+
+        And has an entry <= 0 on its diagonal.
 
         That is unsymmetric, as with friction cones, or with a zero and indefinite, as in games.
         """

@@ -43,8 +43,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.hostile", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--count", type=int, default=78, help="cases of each kind; 78 make 1,014 solves")
-    parser.add_argument("--kinds", nargs="+", default=[], help="all unless given")
-    parser.add_argument("--index", type=int, help="solve this case alone, in this process")
+    parser.add_argument("--kinds", nargs="+", default=[], help="default: all")
+    parser.add_argument("--index", type=int, help="solve only this case, in this process")
     parser.add_argument("--out", type=Path, help="folder for hostile.json and hostile.md")
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)  # index of the first case
     given = parser.parse_args()

@@ -166,16 +166,18 @@ def report(results: list[dict[str, object]], out: Path, seed: int) -> None:
 def options() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.mutants", description=__doc__)
-    parser.add_argument("--count", type=int, help="how many mutants: 50, spread over all modules, or all formulas, unless given")
-    parser.add_argument("--seed", type=int, default=7, help="of which ones")
+    parser.add_argument("--count", type=int, help="number of mutants; default: 50 over all modules, or all formulas")
+    parser.add_argument("--seed", type=int, default=7, help="seed of the random choice")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--out", type=Path, default=ROOT / "out/mutants", help="folder of the report; of a run that was stopped: go on")
+    parser.add_argument("--formulas", action="store_true", help="use the changes and tests of formulas.py instead of random ones")
+    parser.add_argument("--again", type=Path, help="try the survivors of a mutants.json instead of new mutants")
     parser.add_argument(
-        "--formulas", action="store_true", help="the changes of formulas.py, with the tests named there, instead of drawn ones"
+        "--files", type=int, nargs=2, default=FILES, help="numbers of test files: first try, and again if a mutant survives"
     )
-    parser.add_argument("--again", type=Path, help="a mutants.json whose survivors are tried, instead of new ones")
-    parser.add_argument("--files", type=int, nargs=2, default=FILES, help="so many test files, then so many where a mutant survives")
-    parser.add_argument("--seconds", type=float, default=5.0, help="of a file's tests on a processor: those that start later are left out")
+    parser.add_argument(
+        "--seconds", type=float, default=5.0, help="processor time per test file [s]; tests that would start later are skipped"
+    )
     return parser.parse_args()
 
 

@@ -114,7 +114,7 @@ def exchange(dimension: int, ratio: float, *, together: bool = True) -> tuple[fl
         coupling._share = 0.0
     begun = simulation.begin_step(0.01)
     window: Window = simulation.window(begun)
-    simulation.bring_to_faces(window)
+    simulation.particles_to_grid(window)
     simulation.surface.mark(simulation.particles, window, simulation.projection.kind)
     simulation.surface.complete(window, simulation.velocity, simulation.weights, simulation.projection.known)
     before = [field.numpy().astype(np.float64) for field in simulation.velocity]

@@ -83,13 +83,13 @@ def drop(resolution: int, numerics: Numerics, ceiling: str = "flat", *, wall: st
 
 def _hold(simulation: LiquidSimulation) -> None:
     """Let the extension of velocity take no cell for released, as if nobody had thought of it."""
-    extend, contact = simulation.boundary.extend, simulation.projection.contact
+    extend, contact = simulation.boundary.extrapolate_velocity, simulation.projection.contact
     nothing = wp.zeros_like(contact)
 
     def forgetful(*given: Any) -> None:
         extend(*(nothing if a is contact else a for a in given))
 
-    simulation.boundary.extend = forgetful  # type: ignore[assignment, method-assign]
+    simulation.boundary.extrapolate_velocity = forgetful  # type: ignore[assignment, method-assign]
 
 
 CEILING = Check(

@@ -15,7 +15,7 @@ SHAPES = ("box", "sphere", "capsule", "plane", "mesh")
 SHARED = ("scene", "time", "domain", "physics", "output", "camera")
 SAMPLED = ("particles", "particles.reseed", "particles.narrow_band", "density_correction")
 SELF_EVIDENT = ("scene", "time", "physics", "output", "particles", "solver", "pressure", "material", "friction")  # by their headings
-ELSEWHERE = "not for bodies alone"  # begins the description of a key that bodies alone inherit
+ELSEWHERE = "unused with bodies alone"  # begins the description of a key that bodies alone inherit
 LONG_LISTS = {  # by a key's default
     "vtu": "[formats](frames-and-films.md#other-formats)",
     "projected-multigrid": "others: those with * in [methods](methods.md)",
@@ -60,7 +60,7 @@ warp-lcp schema                                # JSON, for editors
 - Units are SI, angles are in degrees, y is up. Vectors have an entry per axis.
 - Keys are optional unless marked *required*. Unknown keys are refused; the message names the nearest key.
 
-The [tutorial](tutorial.md) builds scenes step by step. [Liquids](liquids.md), [sand](sand.md) and [rigid bodies](bodies.md)
+[Get started](tutorial.md) builds scenes step by step. [Liquids](liquids.md), [sand](sand.md) and [rigid bodies](bodies.md)
 explain the models.
 """
 

@@ -77,9 +77,9 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
         with self.attempt(dt):
             return super().step(dt)
 
-    def bring_to_faces(self, window: Window) -> None:
+    def particles_to_grid(self, window: Window) -> None:
         """Bring the particles' velocities to the faces, and viscosities, which ghosts' own ghosts would have a share in."""
-        super().bring_to_faces(window)
+        super().particles_to_grid(window)
         if self.viscosity is not None and self.viscosity.relative:
             self.part.fill(*self.viscosity.relative, *self.weights)
 

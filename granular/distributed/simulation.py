@@ -57,7 +57,7 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
             try:
                 return super().step(dt)
             except StepFailed:
-                self.stress.take_back()  # also where it is the velocity that ranks cannot follow
+                self.stress.roll_back()  # also where it is the velocity that ranks cannot follow
                 raise
 
     def frame(self) -> list[Part]:

@@ -105,7 +105,7 @@ def test_run(tmp_path):
         (["kernals"], "did you mean 'kernels'?"),
         (["kernels", "--device", "cuda:77"], "--device cuda:77: there is no such device"),
         (["kernels", "--size", "4"], "size = 4: must be >= 8"),
-        (["validation", "--size", "16"], "size = 16: the suite validation has its own resolutions"),
+        (["validation", "--size", "16"], "size = 16: cannot be given for the suite validation"),
         (["kernels", "--repeat", "0"], "--repeat"),
         (["kernels", "--compare", "a.json"], "--compare"),
         (["kernels", "--compare", "a.json", "b.json"], "a.json: no results of a benchmark"),

@@ -106,7 +106,7 @@ def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> No
 def test_a_scene_is_for_suites_that_run_some() -> None:
     result = CliRunner().invoke(cli.app, ["bench", "kernels", "dam-break"])
     assert result.exit_code == 2
-    assert "dam-break: the suite kernels has scenes of its own" in result.stderr
+    assert "dam-break: the suite kernels has its own scenes" in result.stderr
     result = CliRunner().invoke(cli.app, ["bench", "tradeoff", "dam-brake"])
     assert result.exit_code == 2
     assert "did you mean 'dam-break'?" in result.stderr

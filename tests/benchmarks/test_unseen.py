@@ -250,7 +250,7 @@ def test_fresh_seeds_are_neither_reserved_nor_those_of_tests():
 
 
 def test_seeds_are_refused_where_nothing_is_drawn(tmp_path):
-    with pytest.raises(ValueError, match="--seed 3: the suite solvers draws no problems; use extremes"):
+    with pytest.raises(ValueError, match="--seed 3: the suite solvers has no random problems; use extremes"):
         SOLVERS.run(device="cpu", out=tmp_path, seed=3)
     with pytest.raises(ValueError, match="--seed -1: must be >= 0"):
         EXTREMES.run(device="cpu", out=tmp_path, seed=-1)

@@ -68,9 +68,9 @@ def test_the_folder_is_named_after_the_scene(scene_file, tmp_path, monkeypatch):
         (["run", "{scene}", "--set", "time.cfl=0"], "time.cfl = 0: must be at least 0.001"),
         (["run", "{scene}", "--device", "cuda:77"], "--device cuda:77: there is no such device; choose from"),
         (["run", "{scene}", "--resume"], "there is no run to resume"),
-        (["run", "{scene}", "--resume", "--force"], "choose one"),
+        (["run", "{scene}", "--resume", "--force"], "exclude each other"),
         (["run", "{scene}", "--frames", "-1"], "--frames"),
-        (["run", "{scene}", "--device", "cpu", "--record-problems", "problems"], "the simulator dots has no problems to show"),
+        (["run", "{scene}", "--device", "cpu", "--record-problems", "problems"], "the simulator dots has no problems to record"),
         (["run"], "SCENE"),
         (["run", "{scene}", "--fast"], "--fast"),
         (["check", "{scene}", "--set", "domain.wal=x"], "did you mean 'wall'?"),
@@ -91,7 +91,7 @@ def test_existing_output_is_kept_without_force(scene_file, out):
     assert call(*run, "--frames", 1).exit_code == 0
     refused = call(*run)
     assert refused.exit_code == 2
-    assert "--force deletes it" in refused.stderr
+    assert "--force to delete it" in refused.stderr
     assert call(*run, "--resume", "--frames", 2).exit_code == 0
     assert call(*run, "--force", "--frames", 0).exit_code == 0
     assert [path.name for path in out.glob("frames/particles*")] == ["particles_000000.vtu"]
@@ -101,7 +101,7 @@ def test_a_finished_run_that_is_resumed_says_so(scene_file, out):
     assert call("run", scene_file, "--out", out, "--device", "cpu").stdout.startswith("finished: frame ")
     again = call("run", "--resume", "--out", out, "--device", "cpu")
     assert again.exit_code == 0
-    assert again.stdout.startswith("finished before, nothing was left to do: frame 10 of 10 reached; ")
+    assert again.stdout.startswith("finished earlier, nothing to do: frame 10 of 10 reached; ")
     more = call("run", "--resume", "--out", out, "--device", "cpu", "--set", "time.duration=0.6")
     assert more.stdout.startswith("finished: frame 12 of 12 reached")
 

@@ -55,7 +55,7 @@ def every_command(scene: object, tmp_path: Path, *overrides: str) -> None:
     recorded = ["--record-problems", problems] if alone else []
     assert "finished: frame 1 " in done("run", scene, "--device", "cpu", "--out", out, "--frames", 1, *recorded, *sets)
     assert "finished: frame 2 " in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
-    assert "finished before" in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
+    assert "finished earlier" in done("run", "--resume", "--out", out, "--device", "cpu", "--frames", 2)
     assert told in done("check", out / "scene.toml", "--device", "cpu"), "the scene as it ran is one"
     assert "image" in done("render", out, "--slice", "--size", "320x240")
     assert "frame_000002.png" in done("render", out, "--frame", 2, "--size", "320x240")

@@ -60,15 +60,15 @@ def test_packed_files(tmp_path, suffix, pack):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "does not begin with %%MatrixMarket"),
-        (b"%%MatrixMarket vector array real general\n3\n", "does not begin with %%MatrixMarket"),
-        (REAL + b"\n" * 100_000, "does not begin with %%MatrixMarket"),
-        (REAL + b"2 2\n1 1\n", "its size is not that of its form"),
-        (REAL + b"1" + b"0" * 30 + b" 4 1\n1 1 1\n", "does not begin"),
-        (REAL + b"2 2 1\n1 1 1.9[[[[[", "something that is no number"),  # these end SciPy 1.17 with a segmentation fault
-        (REAL + b"2 2 2\n1 1 1.5\n2 2 1\x00.5\n", "something that is no number"),
+        (b"", "must begin with %%MatrixMarket"),
+        (b"%%MatrixMarket vector array real general\n3\n", "must begin with %%MatrixMarket"),
+        (REAL + b"\n" * 100_000, "must begin with %%MatrixMarket"),
+        (REAL + b"2 2\n1 1\n", "the line with its size does not fit its form"),
+        (REAL + b"1" + b"0" * 30 + b" 4 1\n1 1 1\n", "must begin"),
+        (REAL + b"2 2 1\n1 1 1.9[[[[[", "an entry that is not a number"),  # these end SciPy 1.17 with a segmentation fault
+        (REAL + b"2 2 2\n1 1 1.5\n2 2 1\x00.5\n", "an entry that is not a number"),
         (REAL + b"2 2 2\n1 1 1.5\n2 ", "these take 11 bytes, and the file has 10"),
-        (REAL + b"2 2 2\n1 1 1.5\n222222 ", "it holds 4 numbers, 2 x 2 with 2 entries are 6"),
+        (REAL + b"2 2 2\n1 1 1.5\n222222 ", "it holds 4 numbers, expected 6 for 2 x 2 with 2 entries"),
         (REAL + b"2 2 1\n1 3 1.5\n", "rows 1 to 2 and columns 1 to 2"),
         (REAL + b"2 2 1\n0 1 1.5\n", "rows 1 to 2 and columns 1 to 2"),
         (REAL + b"2 2 1\n1.5 1 1\n", "rows 1 to 2 and columns 1 to 2"),
@@ -101,10 +101,7 @@ def test_the_shape_is_read_alone(tmp_path):
     assert read_shape(path, lambda rows, columns: True, "") == (700, 900)
     (tmp_path / "a.mtx.gz").write_bytes(gzip.compress(REAL + b"3 4 1\nno numbers"))
     assert read_shape(tmp_path / "a.mtx.gz", lambda rows, columns: True, "") == (3, 4)
-    for data, message in (
-        (REAL + b"2 2 9\n1 1 1\n", "2 x 2 with 9 entries: these take 53 bytes, and the file has 6"),
-        (b"", "does not begin"),
-    ):
+    for data, message in ((REAL + b"2 2 9\n1 1 1\n", "2 x 2 with 9 entries: these take 53 bytes, and the file has 6"), (b"", "must begin")):
         path.write_bytes(data)
         with pytest.raises(ValueError, match=message):
             read_shape(path, lambda rows, columns: True, "")
@@ -112,5 +109,5 @@ def test_the_shape_is_read_alone(tmp_path):
 
 def test_a_device_is_no_file(tmp_path):
     (tmp_path / "zero.mtx").symlink_to("/dev/zero")
-    with pytest.raises(ClaimError, match="it is no file"):
+    with pytest.raises(ClaimError, match="it is not a file"):
         read_market(tmp_path / "zero.mtx", lambda rows, columns: True, "")

@@ -113,7 +113,7 @@ def test_a_solve_that_fails_exits_with_1(problem, tmp_path):
 def test_a_solve_ends_in_time(problem, tmp_path):
     result = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--max-seconds", 1e-9)
     assert result.exit_code == 1
-    assert result.stderr.startswith("TIME_LIMIT: `max_seconds` came first")
+    assert result.stderr.startswith("TIME_LIMIT: `max_seconds` was reached")
     assert call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--max-seconds", 600).exit_code == 0
 
 
@@ -136,11 +136,8 @@ def test_a_long_history_is_shortened(problem, tmp_path):
         (["A.mtx", "A.mtx"], "A.mtx: has shape 36 x 36: expected 36 x 1"),
         (["claims.mtx", "b.mtx"], "b.mtx: has shape 36 x 1: expected 2000000000 x 1, a number for each row of A"),
         (["A.mtx", "b.mtx", "--upper", "long.mtx"], "long.mtx: has shape 2000000000 x 1: expected 36 x 1"),
-        (
-            ["A.mtx", "b.mtx", "--lower", "1e25"],
-            "--lower 1e25: inf, or a magnitude of 1e20 and more, which is infinite: no x could meet it",
-        ),
-        (["A.mtx", "b.mtx", "--upper=-inf"], "--upper -inf: -inf, or a magnitude of 1e20 and more"),
+        (["A.mtx", "b.mtx", "--lower", "1e25"], "--lower 1e25: is inf (1e20 and more count as infinite): no x could meet it"),
+        (["A.mtx", "b.mtx", "--upper=-inf"], "--upper -inf: is -inf (1e20 and more count as infinite)"),
         (["A.mtx", "bnan.mtx"], "bnan.mtx: holds 2 values that are not finite"),
         (["A.mtx", "binf.mtx"], "binf.mtx: holds 1 values that are not finite"),
         (["A.mtx", "b.mtx", "--upper", "bnan.mtx"], "bnan.mtx: holds 2 values that are NaN"),
@@ -149,12 +146,12 @@ def test_a_long_history_is_shortened(problem, tmp_path):
         (["A.mtx", "b.mtx", "--lower", "2", "--upper", "1"], "lower > upper in 36"),
         (["A.mtx", "b.mtx", "--lower", "nan"], "lower holds 36 NaN"),
         (["A.mtx", "b.mtx", "--method", "lemk"], "--method lemk: no such method; did you mean 'lemke'?"),
-        (["A.mtx", "b.mtx", "--method", "projected-multigrid"], "does not take sparse matrices; choose from"),
+        (["A.mtx", "b.mtx", "--method", "projected-multigrid"], "does not accept sparse matrices; choose from"),
         (["A.mtx", "b.mtx", "--tolerance", "2"], "--tolerance 2.0: must be in [0, 1)"),
         (["A.mtx", "b.mtx", "--max-iterations", "-1"], "--max-iterations -1: must be an integer >= 0"),
         (["A.mtx", "b.mtx", "--max-seconds", "0"], "--max-seconds 0.0: must be > 0"),
         (["A.mtx", "b.mtx", "--max-seconds", "nan"], "--max-seconds nan: must be > 0"),
-        (["A.mtx", "b.mtx", "--out", "no/where/x.mtx"], "--out no/where/x.mtx: there is no folder no/where"),
+        (["A.mtx", "b.mtx", "--out", "no/where/x.mtx"], "--out no/where/x.mtx: no such folder: no/where"),
         (["A.mtx"], "b.mtx"),
     ],
 )
@@ -229,7 +226,7 @@ def test_a_recorded_problem(recorded_problem, tmp_path):
     [
         (["b.mtx"], "b.mtx: problem_000007.npz has a right-hand side of its own"),
         (["--lower", "0"], "--lower 0: problem_000007.npz has bounds of its own"),
-        (["--out", "x.mtx"], "--out x.mtx: x of a grid becomes a NumPy array: name a .npy file"),
+        (["--out", "x.mtx"], "--out x.mtx: x of a grid is written as a NumPy array: the name must end in .npy"),
         (["--method", "psorr"], "--method psorr: no such method; did you mean 'psor'?"),
         (["--tolerance", "2"], "--tolerance 2.0: must be in [0, 1)"),
     ],
@@ -246,7 +243,7 @@ def test_a_damaged_recorded_problem(recorded_problem, tmp_path):
     file.write_bytes(file.read_bytes()[:-900])
     result = call(file)
     assert result.exit_code == 2
-    assert f"{file}: no recorded problem: " in result.stderr
+    assert f"{file}: is not a recorded problem: " in result.stderr
 
 
 def test_a_pattern_is_a_matrix_of_ones(tmp_path):

@@ -202,7 +202,7 @@ def test_the_commands(tmp_path: Path) -> None:
     [
         ({"solid": []}, "has no rigid body: give one a density or a mass"),
         ({"solver": {"method": "nncgg"}}, "solver.method"),
-        ({"solver": {"directions": 6}}, "solver.directions = 6: is of the methods lemke"),
+        ({"solver": {"directions": 6}}, "solver.directions = 6: is only for the methods lemke"),
         ({"solver": {"method": "lemke", "directions": 5}}, "solver.directions = 5"),
         ({"solver": {"precision": "mixed"}}, "solver.precision"),
         ({"solver": {"preset": "final"}}, "solver.preset"),

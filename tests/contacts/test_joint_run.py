@@ -131,12 +131,12 @@ def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
         ({"joint": [hinge(1, 7, at=0.5)]}, "joint[0].solids = [1, 7]: must be numbers of [[solid]]s, from 0 to 2"),
         ({"joint": [hinge(0, 1, at=0.5)]}, "the first must be a rigid body"),
         ({"joint": [hinge(1, 1, at=0.5)]}, "must differ"),
-        ({"joint": [{"kind": "hinge", "solids": [1], "anchor": [0.5, 1.5, 1.0]}]}, "joint[0].axis: of a hinge in 3-D must be given"),
-        ({"joint": [hinge(1, at=0.5, motor_speed=1.0)]}, "joint[0].motor_torque: needs motor_speed"),
+        ({"joint": [{"kind": "hinge", "solids": [1], "anchor": [0.5, 1.5, 1.0]}]}, "joint[0].axis: must be given for a hinge in 3-D"),
+        ({"joint": [hinge(1, at=0.5, motor_speed=1.0)]}, "joint[0].motor_torque: must be given together with motor_speed"),
         ({"joint": [hinge(1, at=0.5, limits=[10.0, -10.0])]}, "joint[0].limits = [10.0, -10.0]: must be in order"),
         (
             {"joint": [{"kind": "ball", "solids": [1], "anchor": [0.5, 1.5, 1.0], "limits": [-1.0, 1.0]}]},
-            "is of hinges: this joint is ball",
+            "is only for hinges: this joint is ball",
         ),
         ({"joint": [{"kind": "rope", "solids": [1], "anchor": [0.5, 1.5, 1.0]}]}, "joint[0].kind"),
         ({"solver": {"method": "sweeps-and-newton"}}, "cannot solve joints, which are equations; choose from nncg"),
@@ -144,9 +144,9 @@ def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
         ({"domain": {"size": [3.0, 3.0, 2.0], "open": ["left"]}}, "domain.open"),
         ({"target": [{**REACH, "solid": 0}]}, "target[0].solid = 0: must be the number of a rigid body"),
         ({"target": [{**REACH, "times": [0.0]}]}, "target[0].places"),
-        ({"target": [REACH], "joint": JOINTS[:1]}, "target: each body needs one hinge in which it comes first"),
-        ({"target": [REACH], "joint": [hinge(1, 2, at=1.02), hinge(2, 1, at=1.02)]}, "some form a ring"),
-        ({"target": [REACH], "solver": {"method": "staggering"}}, "is not for inverse kinematics"),
+        ({"target": [REACH], "joint": JOINTS[:1]}, "target: every body must be the first body of exactly one hinge"),
+        ({"target": [REACH], "joint": [hinge(1, 2, at=1.02), hinge(2, 1, at=1.02)]}, "some form a loop"),
+        ({"target": [REACH], "solver": {"method": "staggering"}}, "cannot be used for inverse kinematics"),
     ],
 )
 def test_what_is_wrong_is_refused(change: dict[str, Any], message: str) -> None:

@@ -73,7 +73,7 @@ def busiest(load, cut):
 def test_boxes_are_cut_anew_only_if_the_whole_step_gets_a_quarter_shorter(least, pays, monkeypatch):
     """What a step takes besides, as much as all work of the busiest rank, gets no shorter: 2000 is 1.28 times 1560 and 1.12 times 1780."""
     cuts = [[3, 5], [8], [8]]
-    now = SimpleNamespace(counts=(8, 8, 8), parts=[[4, 4], [8], [8]], cut_anew=lambda cut: cut)
+    now = SimpleNamespace(counts=(8, 8, 8), parts=[[4, 4], [8], [8]], repartition=lambda cut: cut)
     ranks = SimpleNamespace(size=2, rank=0, collect=lambda mine: [mine, None])
     part = SimpleNamespace(decomposition=now, layers=3, ranks=ranks)
     monkeypatch.setattr(balance, "seen_by", lambda counts, parts, layers: np.zeros((2, 1, 1)))

@@ -97,7 +97,7 @@ def test_blocks_end_alike(mpi):
 
 def test_a_rank_that_nobody_meets_ends_all(mpi):
     done = mpi(3, ALONE, exit_code=1)
-    assert "rank 1 of 3: left alone\nall ranks end" in done.stderr
+    assert "rank 1 of 3: left alone\nall ranks are aborted" in done.stderr
     assert "done" not in done.stdout
 
 

@@ -211,7 +211,7 @@ def test_a_source_keeps_its_cells_in_other_boxes_wherever_bodies_are():
     simulation = alone(scene(**(HEAP | {"solid": [falling], "source": [source]})))
     advance(simulation, 10)
     cells, bodies = simulation.sources._cells, simulation.bodies.state()["bodies"]
-    simulation._work_on(simulation.part.cut_anew(simulation.part.decomposition))
+    simulation._work_on(simulation.part.repartition(simulation.part.decomposition))
     np.testing.assert_array_equal(simulation.sources._cells, cells)
     np.testing.assert_array_equal(simulation.bodies.state()["bodies"], bodies)
 

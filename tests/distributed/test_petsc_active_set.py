@@ -124,7 +124,7 @@ def test_wrong_settings_and_problems_are_refused():
     with pytest.raises(ValueError, match=r"eta = 2"):
         PetscActiveSet(eta=2)
     with pytest.raises(
-        ValueError, match=r"PetscActiveSet needs an operator with a stencil .*; DenseOperator has none: take MinimumMapNewton"
+        ValueError, match=r"PetscActiveSet needs an operator with a stencil .*; DenseOperator has none: use MinimumMapNewton"
     ):
         wl.solve(wl.LCP(wl.DenseOperator(np.eye(2), device="cpu"), -np.ones(2)), PetscActiveSet())
 

@@ -41,7 +41,7 @@ def test_one_ends_all(mpi, what):
 
 def test_different_things_are_refused_once(mpi):
     done = mpi(3, FAIL, "differ", exit_code=2)
-    assert done.stderr.count("the scene on rank 1 is not what it is on rank 0: start all ranks with the same command and files") == 1
+    assert done.stderr.count("the scene on rank 1 differs from rank 0: start all ranks with the same command and files") == 1
     assert "done" not in done.stdout
 
 

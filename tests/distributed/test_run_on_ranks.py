@@ -131,7 +131,7 @@ TROUBLES = {  # with how the run ends, and what it says
     "40 -1 failed": ("failed", "failed: step 40: velocity is not finite"),
     "40 -1 missed": ("failed", "retries 6: the solve missed its criteria"),
     "40 1 interrupted": ("stopped", "stopped: interrupted"),
-    "40 1 disk": ("failed", "failed: the disk is full: rank 1: [Errno 28] No space left on device; what was written before is intact"),
+    "40 1 disk": ("failed", "failed: the disk is full: rank 1: [Errno 28] No space left on device; files written before are intact"),
 }
 
 
@@ -154,7 +154,7 @@ def test_troubles_end_the_run_with_a_message(run, tmp_path):
 def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expected):
     """They wait for it inside MPI: it says what happened, writes that into run.json and ends them."""
     done = run(2, f"DOTS_TROUBLE='{trouble}' run dots.toml --out out", exit_code=1)
-    assert f"{expected}\nall ranks end" in done.stderr
+    assert f"{expected}\nall ranks are aborted" in done.stderr
     found = record(tmp_path / "out")
     assert found["status"] == "failed"
     assert found["reason"].startswith(f"rank {trouble.split()[1]}")
@@ -163,10 +163,10 @@ def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expecte
 
 WRONG = {  # commands, with what is said of each
     "run dots.toml --out out": "holds a run already",
-    "run dots.toml --out out --resume --force": "choose one",
+    "run dots.toml --out out --resume --force": "exclude each other",
     "run dots.toml --out out --set time.cfl=0": "time.cfl = 0: must be at least 0.001",
     "run dots.toml --out out --force --set output.surface_ply=true": "output.surface_ply = true: ",
-    "run dots.toml --out out --force --record-problems problems": "--record-problems: not with --engine petsc",
+    "run dots.toml --out out --force --record-problems problems": "--record-problems cannot be combined with --engine petsc",
     "DOTS_REFUSE=liquid[0] run dots.toml --out out --force": "dots: liquid[0]",
     "DOTS_REFUSE=liquid[1{rank}] run dots.toml --out out --force": "rank 0: dots: liquid[10]; rank 1: dots: liquid[11]",
 }
@@ -227,7 +227,7 @@ def test_ranks_of_another_mpi_are_refused(mpi, tmp_path):
     environment = launch.environment() | {"SLURM_STEP_NUM_TASKS": "3"}
     done = subprocess.run(words, env=environment, cwd=tmp_path, text=True, capture_output=True, check=False)
     assert done.returncode == 2
-    assert "3 processes were started, but mpi4py knows only one" in done.stderr
+    assert "3 processes were started, but mpi4py sees only one" in done.stderr
 
 
 SMALL = "--set domain.resolution=24 --set time.duration=0.3 --set output.checkpoint_every=4 --set output.grid_format=vti"

@@ -216,7 +216,8 @@ def test_boxes_thinner_than_the_ghost_layers_are_refused():
         part_of(seat, (16, 3, 1))
 
     with pytest.raises(
-        ValueError, match=r"4 ranks along x have boxes of 4 cells.*takes 5: start fewer ranks \(along that axis 3 at most\)"
+        ValueError,
+        match=r"4 ranks along x have boxes of 4 cells.*needs 5 layers around a box: start fewer ranks \(at most 3 along that axis\)",
     ):
         on_ranks(4, work)
 

@@ -59,11 +59,11 @@ def test_two_dimensions_and_boxes(mpi, tmp_path):
 
 
 WRONG = {  # commands, with what is said of each
-    "none.npz": "none.npz: no recorded problem",
-    "A.mtx b.mtx": "A.mtx: --engine petsc solves problems of grids",
+    "none.npz": "none.npz: is not a recorded problem",
+    "A.mtx b.mtx": "A.mtx: --engine petsc solves only grid problems",
     "problem_000004.npz --method psor": "--method psor: does not work on several ranks; choose from minimum-map-newton",
     "problem_000004.npz --device cuda": "--device cuda: there is no such device",
-    "problem_000004.npz --out x.mtx": "--out x.mtx: x of a grid becomes a NumPy array: name a .npy file",
+    "problem_000004.npz --out x.mtx": "--out x.mtx: x of a grid is written as a NumPy array: the name must end in .npy",
 }
 
 

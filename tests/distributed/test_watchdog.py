@@ -11,7 +11,10 @@ from warp_lcp.distributed.waiting import Waiting, finish
 from warp_lcp.distributed.watchdog import Board, Post, place_of, verdict
 
 INSIDE, OUTSIDE = Post(9, 31, "a sum", 12.0, "solver:7"), Post(8, 30, "", 13.0, "build:3 from step:5")
-LATE, SILENT = "has been at build:3 from step:5 for 13 s", "told nothing: stopped, out of reach, or in a library that does not return"
+LATE, SILENT = (
+    "has been at build:3 from step:5 for 13 s",
+    "sends no heartbeat: stopped, unreachable, or inside a library call that does not return",
+)
 VERDICTS = [
     ([OUTSIDE, OUTSIDE], ""),
     ([INSIDE, OUTSIDE, INSIDE], f"rank 1 of 3 keeps the others waiting: rank 1 {LATE}; ranks 0, 2 in a sum (solver:7) for 12 s"),
@@ -20,7 +23,7 @@ VERDICTS = [
     ([None, OUTSIDE], f"rank 1 {LATE}; rank 0 {SILENT}"),
     (
         [INSIDE, Post(9, 29, "a broadcast", 14.0, "solver:8")],
-        "all ranks wait for each other, and not in the same operation: rank 0 in a sum (solver:7); rank 1 in a broadcast (solver:8)",
+        "all ranks wait for each other in different operations: rank 0 in a sum (solver:7); rank 1 in a broadcast (solver:8)",
     ),
 ]
 ROOT = Path(__file__).parents[2]
@@ -101,7 +104,7 @@ def test_operations_are_counted_in_order():
 
 ENDS = {
     "late": r"rank 2 of 3 keeps the others waiting: rank 2 has been at __main__:\d+ for \d+ s; ranks 0, 1 in a gather \(__main__:\d+\)",
-    "other": r"all ranks wait for each other, and not in the same operation: ranks 0, 2 in a gather \(__main__:\d+\); rank 1 in a gather",
+    "other": r"all ranks wait for each other in different operations: ranks 0, 2 in a gather \(__main__:\d+\); rank 1 in a gather",
 }
 
 
@@ -112,7 +115,7 @@ def test_waiting_ends(mpi, what):
     assert done.returncode != 0
     assert "done" not in done.stdout
     assert re.search(ENDS[what], done.stderr), done.stderr
-    assert "all ranks end: --rank-timeout 2" in done.stderr
+    assert "all ranks are aborted: --rank-timeout 2" in done.stderr
 
 
 def test_no_operation_goes_unwatched():

@@ -70,7 +70,7 @@ def projected(simulation, dt):
     """Project once; return velocities before and after, and the bodies' velocities (6 each) before and after."""
     before, taken = simulation.begin_step(dt), {}
     window = simulation.window(before)
-    simulation.bring_to_faces(window)
+    simulation.particles_to_grid(window)
     prepare = simulation.projection.prepare
 
     def watched(velocity, *steps):
@@ -228,7 +228,7 @@ def test_a_run_goes_on_bit_for_bit_from_a_state():
 
 def test_methods_that_sweep_are_refused_with_bodies():
     body = box([0.3, 0.3], [0.5, 0.5], density=500.0)
-    with pytest.raises(ValidationError, match="with bodies: projected-multigrid"):
+    with pytest.raises(ValidationError, match=r"cannot be combined with rigid bodies.*use projected-multigrid"):
         scene(size=[1.0, 1.0], resolution=16, liquid=[box([0.0, 0.0], [1.0, 0.4])], solid=[body], solver={"method": "psor"})
 
 

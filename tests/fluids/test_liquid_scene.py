@@ -60,11 +60,14 @@ def test_the_plan_counts_particles() -> None:
 
 def test_the_plan_says_what_moves_particles_apart() -> None:
     assert not {"density", "reseeding"} & dict(small(density_correction={"every": 0}).plan()).keys()
-    assert dict(small().plan())["density"] == "at most 1.05 of that at rest, corrected every step if more than 0.1 % is beyond it"
+    assert (
+        dict(small().plan())["density"]
+        == "at most 1.05 times the density at rest, corrected every step if more than 0.1 % of the material exceeds it"
+    )
     rare = dict(small(particles={"per_axis": 4}, solver={"preset": "preview"}).plan())["density"]
-    assert rare == "at most 1.025 of that at rest, corrected every 2 steps if more than 0.05 % is beyond it"
+    assert rare == "at most 1.025 times the density at rest, corrected every 2 steps if more than 0.05 % of the material exceeds it"
     plan = dict(small(density_correction={"every": 2}, particles={"per_axis": 3, "reseed": {"every": 1}}).plan())
-    assert plan["density"] == "at most 1.033 of that at rest, corrected every 2 steps"
+    assert plan["density"] == "at most 1.033 times the density at rest, corrected every 2 steps"
     assert plan["reseeding"] == "4 to 18 particles a cell, every step"
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from small_liquids import box, create, scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
+from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 
 TABLES: dict[str, dict[str, Any]] = {
@@ -38,7 +38,7 @@ def states(tables: dict[str, Any]) -> list[dict[str, bytes]]:
 @pytest.mark.parametrize("tables", TABLES.values(), ids=TABLES)
 def test_windows_leave_what_passes_over_all_do(tables, monkeypatch):
     found = states(tables)
-    monkeypatch.setattr(Trail, "through", lambda self, window: self.all)
+    monkeypatch.setattr(DirtyRegion, "through", lambda self, window: self.all)
     for step, (state, expected) in enumerate(zip(found, states(tables), strict=True)):
         assert [name for name in expected if state[name] != expected[name]] == [], step
 
@@ -75,7 +75,7 @@ def test_pressure_and_flight_cost_what_the_liquid_does(monkeypatch):
 
 def test_a_trail_leads_through_the_last_window():
     grid = StaggeredGrid((20, 10, 1), 1.0, 2)
-    trail = Trail(grid.domain)
+    trail = DirtyRegion(grid.domain)
     boxes = [grid.window((2, 2, 1), (4, 4, 1)), grid.window((5, 3, 1), (7, 8, 1)), grid.window((5, 3, 1), (6, 5, 1))]
     through = [trail.through(window) for window in boxes]
     assert (through[0].low, through[0].high) == (grid.domain.low, grid.domain.high)  # nobody knows what was there

@@ -300,7 +300,7 @@ def test_refusals():
     with pytest.raises(ValidationError, match=r"greater than or equal to 3"):
         tank(particles={"narrow_band": {"width": 2.99}})
     assert without(tank(particles={"narrow_band": {"width": 3.0}})).width == 3.0
-    with pytest.raises(ValidationError, match="may come apart anywhere inside"):
+    with pytest.raises(ValidationError, match="may separate anywhere inside"):
         tank(pressure={"model": "unilateral"})
     with pytest.raises(ValidationError, match=r'needs pressure\.surface = "ghost-fluid"'):
         tank(pressure={"surface": "voxel"})

@@ -193,7 +193,7 @@ def test_an_interrupted_run_writes_the_same_table(tmp_path: Path) -> None:
     assert rows[0]["b_vx"] == "", "no velocity in air"
     (whole / "probes.csv").write_text("\n".join((whole / "probes.csv").read_text().split("\n")[:3]) + "\n")
     again = run_into(dam(tmp_path, 0.5), whole, resume=True)
-    assert any(warning.startswith("probes.csv: rows are missing") for warning in again.warnings)
+    assert any(warning.startswith("probes.csv: rows of steps") for warning in again.warnings)
 
 
 def test_a_run_that_fails_keeps_its_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,9 +215,9 @@ def test_a_run_that_fails_keeps_its_table(tmp_path: Path, monkeypatch: pytest.Mo
         ({"position": [0.1, 0.1, 0.1]}, "must have 2 entries"),
         ({"position": [0.1, 0.9]}, "lies outside the domain"),
         ({"position": [0.1, float("nan")]}, "finite"),
-        ({"name": "a b"}, "must be a name of letters"),
-        ({"name": ""}, "must be a name of letters"),
-        ({"name": "b"}, "is the name of another probe of the pressure"),
+        ({"name": "a b"}, "must consist of letters"),
+        ({"name": ""}, "must consist of letters"),
+        ({"name": "b"}, "is also the name of another probe of the pressure"),
         ({"quantity": "speed"}, "'pressure', 'velocity' or 'level'"),
         ({"quantity": "level", "gravity": [0.0, 0.0]}, "needs gravity"),
     ],

@@ -112,7 +112,7 @@ def test_damaged_files_are_refused(tmp_path):
     (path,) = files(tmp_path)
     whole, kept = path.read_bytes(), dict(np.load(path))
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=r"problem_000000\.npz: no recorded problem"):
+    with pytest.raises(ValueError, match=r"problem_000000\.npz: is not a recorded problem"):
         load(path)
     np.savez(path, **{**kept, "format": FORMAT + 1})
     with pytest.raises(ValueError, match="its format is 2, this version reads 1"):
@@ -121,7 +121,7 @@ def test_damaged_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="it lacks b"):
         load(path)
     np.savez(path, **{**kept, "b": kept["b"][1:]})
-    with pytest.raises(ValueError, match="no recorded problem"):
+    with pytest.raises(ValueError, match="is not a recorded problem"):
         load(path)
 
 
@@ -141,7 +141,7 @@ def test_arrays_must_fit_the_cells(tmp_path, name, array, message):
     (path,) = files(tmp_path)
     np.savez_compressed(path, **{**np.load(path), name: array})
     for read in (load, cell_counts):
-        with pytest.raises(ValueError, match=rf"problem_000000\.npz: no recorded problem: {message}"):
+        with pytest.raises(ValueError, match=rf"problem_000000\.npz: is not a recorded problem: {message}"):
             read(path)
 
 

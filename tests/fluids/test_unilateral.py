@@ -33,7 +33,7 @@ def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
     simulation.particles.sort()
     window = simulation.grid.everywhere
     simulation.kick_dt = dt
-    simulation.bring_to_faces(window)
+    simulation.particles_to_grid(window)
     projection = simulation.projection
     simulation.surface.mark(simulation.particles, window, projection.kind)
     u, v = (field.numpy()[1].astype(np.float64) for field in simulation.velocity)

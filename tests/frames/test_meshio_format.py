@@ -94,7 +94,7 @@ def test_what_a_format_holds_comes_back(tmp_path, name, part):
     assert FRAME_FILE.fullmatch(file.name)
     if held.dress is None:
         assert name not in WHOLE
-        with pytest.raises(ValueError, match="does not hold"):
+        with pytest.raises(ValueError, match="cannot store"):
             write_meshio(file, given, name)
         assert list(tmp_path.iterdir()) == []
         return
@@ -105,7 +105,7 @@ def test_what_a_format_holds_comes_back(tmp_path, name, part):
     bare = held.dress is Dress.BARE
     found = from_meshio(getattr(meshio, MODULES.get(name, name)).read(str(file)))
     if name in WRITTEN_ONLY:
-        with pytest.raises(ValueError, match="are for other programs"):
+        with pytest.raises(ValueError, match="are written for other programs"):
             read_meshio(file, name)
     if name == "stl":  # which holds triangles one by one, and no points beside
         np.testing.assert_allclose(found.points[found.corners], given.points[given.corners], rtol=1e-6, atol=1e-7)
@@ -297,10 +297,10 @@ def test_cells_as_images_beside_another_format(scene_file, tmp_path):
 
 
 REFUSED = {
-    "stl": "does not hold particles and grid",
+    "stl": "cannot store particles and grid",
     "off": "output.particles = false, output.grid = false, or choose vtu or xdmf or vtk or gmsh",
-    "obj": "does not hold particles",
-    "tecplot": "does not hold particles",
+    "obj": "cannot store particles",
+    "tecplot": "cannot store particles",
 }
 
 
@@ -322,7 +322,7 @@ def test_what_else_is_refused(scene_file, tmp_path):
         load_scene(scene_file, ["output.format=doc"])
     with pytest.raises(SceneError, match="surface_ply"):
         check_scene(str(scene_file), ["output.format=ply", "output.surface_ply=true", "output.grid=false"])
-    with pytest.raises(SceneError, match=r"writes .vtu pieces alone"):
+    with pytest.raises(SceneError, match=r"writes only .vtu pieces"):
         check_ranks(load_scene(scene_file, ["output.format=xdmf"]))
     if importlib.util.find_spec("netCDF4") is None:
         with pytest.raises(SceneError, match="needs netCDF4"):
@@ -332,9 +332,9 @@ def test_what_else_is_refused(scene_file, tmp_path):
 def test_fields_that_a_format_does_not_hold_are_told(scene_file, tmp_path):
     scene = load_scene(scene_file, ["time.duration=0.1", "output.format=permas"])
     record = run_into(scene, tmp_path / "out", observer=quiet())
-    assert record.warnings == ['output.format = "permas" holds the shape of particles and grid, without their fields']
+    assert record.warnings == ['output.format = "permas" writes the geometry of particles and grid, without fields']
     assert json.loads((tmp_path / "out" / "run.json").read_text())["warnings"] == record.warnings
-    with pytest.raises(RenderError, match="the frames have no velocity, which --color speed needs; plain needs nothing"):
+    with pytest.raises(RenderError, match="the frames have no velocity, which --color speed needs; choose plain"):
         list(render_run(tmp_path / "out", looks=Looks(cut=True, color=Color.SPEED)))
     assert list(render_run(tmp_path / "out", looks=Looks(cut=True, color=Color.PLAIN)))
 

@@ -160,7 +160,7 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
     folder = RunFolder(out, load_scene(tmp_path / "scene.toml"))
     folder.check_new(force=True)
     (out / "frames" / "rank_0001" / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError, match=r"holds files that are no run's \(frames.rank_0001.notes.txt, "):
+    with pytest.raises(OutputError, match=r"holds files that do not belong to a run \(frames.rank_0001.notes.txt, "):
         folder.check_new(force=True)
     (out / "frames" / "rank_0001" / "notes.txt").unlink()
     folder.start(RunRecord("dots", "dots", "cpu"))
@@ -223,5 +223,5 @@ def test_entities_are_refused(tmp_path):
     """A few lines that would become 10^9 characters."""
     lines = "".join(f'<!ENTITY a{n + 1} "{f"&a{n};" * 10}">' for n in range(9))
     (tmp_path / "a.pvtu").write_text(f'<!DOCTYPE x [<!ENTITY a0 "xxxxxxxxxx">{lines}]><VTKFile>&a9;</VTKFile>')
-    with pytest.raises(ValueError, match="declares a type of its own"):
+    with pytest.raises(ValueError, match="declares a document type"):
         piece_files(tmp_path / "a.pvtu")

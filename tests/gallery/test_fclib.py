@@ -109,7 +109,7 @@ def test_wrong_files_are_named(tmp_path):
     write_local(path, np.eye(3), np.zeros(3), np.array([0.1]))
     with h5py.File(path, "a") as file:
         file["fclib_local/W/nz"][0] = -7
-    with pytest.raises(ValueError, match="is no sparse matrix"):
+    with pytest.raises(ValueError, match="is not a sparse matrix"):
         read_fclib(path)
     with h5py.File(path, "a") as file:
         del file["fclib_local/W"]
@@ -147,12 +147,12 @@ def hostile(file, name):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("size", "W has shape 2147483647 x 2147483647: the vectors beside it ask for 3 x 3"),
-        ("column", "is no sparse matrix"),
+        ("size", "W has shape 2147483647 x 2147483647: expected, from the vectors, 3 x 3"),
+        ("column", "is not a sparse matrix"),
         ("never written", "these take 8e[+]03 GB, and the file has 0 bytes"),
         ("packed", "and the file has 0 bytes"),
         ("link", "W/x is in another file"),
-        ("group", "x is no dataset of this file"),
+        ("group", "x is not a dataset of this file"),
         ("text", r"x is \|S3: must be finite numbers"),
     ],
 )

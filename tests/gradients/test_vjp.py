@@ -379,7 +379,7 @@ def test_what_is_refused():
         wl.vjp(result, np.ones(3))
     with pytest.raises(ValueError, match="cotangent holds 1 values that are not finite"):
         wl.vjp(result, np.array([1.0, np.nan]))
-    with pytest.raises(ValueError, match="does not know its problem"):
+    with pytest.raises(ValueError, match="has no problem"):
         wl.vjp(pickle.loads(pickle.dumps(result)), g)
     affine = wl.LCP(A, np.array([-1.0, -2.0]), *wl.AffineBounds.friction([-1, 0], 0.5))
     with pytest.raises(ValueError, match="bounds that are affine in x"):
@@ -391,7 +391,7 @@ def test_changes_in_place_are_refused():
     operator = wl.SparseOperator(A, device="cpu")
     result = wl.solve(wl.LCP(operator, np.array([0.5, -2.5])))
     operator.update(2 * A.data)
-    with pytest.raises(ValueError, match="older than its operator"):
+    with pytest.raises(ValueError, match="has changed in place since"):
         wl.vjp(result, np.ones(2))
     dense = wl.DenseOperator(A.toarray(), device="cpu")
     problem = wl.LCP(dense, np.array([0.5, -2.5]))

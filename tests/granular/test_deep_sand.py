@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from small_sands import GRAVITY, box, create, scene
-from warp_lcp.granular.coupled import AcceleratedProjection
+from warp_lcp.granular.coupled import HeavyBallProjectedGradient
 from warp_lcp.granular.simulator import SandSimulation
 
 
@@ -30,7 +30,7 @@ def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction:
     dx = 0.02
     sand = [box([0.0, 0.0], [8 * dx, cells * dx])]
     simulation = create(scene(size=[8 * dx, (cells + 4) * dx], resolution=cells + 4, sand=sand, friction=friction))
-    simulation.method = AcceleratedProjection(cold=AcceleratedProjection().least)
+    simulation.method = HeavyBallProjectedGradient(cold=HeavyBallProjectedGradient().least)
     row = simulation.step(0.5 * float(np.sqrt(dx / GRAVITY)))
     assert row["solve_status"] == "CONVERGED"
     assert row["solve_iterations"] <= (3.0 if friction else 5.0) * cells + 40
@@ -39,9 +39,9 @@ def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction:
 def test_a_limit_of_the_momentum_leaves_less_of_the_residual_where_deep_sand_yields() -> None:
     """Sand of 40 degrees that runs out of a silo: pressure and the friction's bound drive each other on."""
     medians = []
-    for limits in ((), AcceleratedProjection().calm):
+    for limits in ((), HeavyBallProjectedGradient().calm):
         simulation = silo(24, 48, 6, material={"friction_angle": 40.0}, density_correction={})
-        simulation.method = AcceleratedProjection(calm=limits)
+        simulation.method = HeavyBallProjectedGradient(calm=limits)
         rows = [simulation.step(min(simulation.stable_dt(), 0.01)) for _ in range(30)]
         medians.append(float(np.median([row["coupled_residual"] for row in rows[10:]])))
     assert medians[1] < 0.75 * medians[0]

@@ -209,8 +209,8 @@ def test_a_floor_goes_on_across_the_sides() -> None:
     [
         ({"domain": {"periodic": [True, True]}}, "along x and z only"),
         ({"domain": {"open": ["left"]}}, "side of a periodic axis"),
-        ({"solver": {"method": "interleaved-sweeps"}}, "without an end"),
-        ({"density_correction": {}}, "goes without"),
+        ({"solver": {"method": "interleaved-sweeps"}}, "cannot be combined with periodic axes"),
+        ({"density_correction": {}}, "cannot be combined with density_correction"),
     ],
 )
 def test_what_does_not_go_together_is_refused(tables: dict[str, Any], message: str) -> None:

@@ -86,8 +86,8 @@ def test_both_methods_find_the_same_velocity() -> None:
     ("friction", "expected"),
     [
         ({"dynamic_angle": 40.0}, "friction.grain_size: must be given with friction.dynamic_angle"),
-        ({"grain_size": 1e-3}, "friction.grain_size = 0.001: goes with friction.dynamic_angle, which is missing"),
-        ({"inertial_number": 0.3}, "friction.inertial_number = 0.3: goes with friction.dynamic_angle, which is missing"),
+        ({"grain_size": 1e-3}, "friction.grain_size = 0.001: needs friction.dynamic_angle, which is missing"),
+        ({"inertial_number": 0.3}, "friction.inertial_number = 0.3: needs friction.dynamic_angle, which is missing"),
         (GROWS | {"dynamic_angle": 30.0}, "friction.dynamic_angle = 30.0: must be above the friction angle, 30 degrees"),
         (
             GROWS | {"dynamic_angle": 50.0},

@@ -8,7 +8,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.coupled import AcceleratedProjection
+from warp_lcp.granular.coupled import HeavyBallProjectedGradient
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress import Stress, YieldSet
@@ -42,7 +42,7 @@ class Case:
 
     def solve(self, tolerance: float = 1e-3):
         stopping = wl.StoppingCriteria(rtol=0.0, atol=tolerance * SCALE, max_iterations=2000)
-        return wl.solve(self.stress, AcceleratedProjection(), stopping=stopping)
+        return wl.solve(self.stress, HeavyBallProjectedGradient(), stopping=stopping)
 
 
 def make(
@@ -238,7 +238,7 @@ def test_bodies_far_from_sand_and_outside_change_nothing() -> None:
     gone.place(index, np.zeros((1, 3)), case.stress.walls)
     assert gone.faces is not None and len(gone.faces.face.at) == 0
     case.begin(np.array([[0.1, 0.2, 0.3]]), np.eye(3)[None])
-    case.stress.face(case.stress.walls)
+    case.stress.set_walls(case.stress.walls)
     case.solve()
     assert gone.velocity.numpy()[0].tolist() == [0.1, 0.2, 0.3]
     assert not gone.impulses().any()

@@ -10,7 +10,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.validation import inclined
-from warp_lcp.granular.coupled import AcceleratedProjection
+from warp_lcp.granular.coupled import HeavyBallProjectedGradient
 from warp_lcp.granular.cut_walls import CutWalls
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.scene import SandScene
@@ -58,7 +58,7 @@ class Case:
 
     def solve(self, tolerance: float = 1e-4) -> None:
         stopping = wl.StoppingCriteria(rtol=0.0, atol=tolerance * G * DT, max_iterations=4000)
-        wl.solve(self.stress, AcceleratedProjection(), stopping=stopping)
+        wl.solve(self.stress, HeavyBallProjectedGradient(), stopping=stopping)
 
 
 def along(values: np.ndarray, axis: int, by: int) -> np.ndarray:

@@ -103,7 +103,7 @@ def test_a_solid_that_no_cell_feels_is_told() -> None:
     """Particles stop at it, but stresses know only whole cells."""
     plate = box([0.2, 0.19], [0.8, 0.21])
     simulation = create(scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.3], [1.0, 0.5])], solid=[plate]))
-    assert any("solid[0] (box) holds no center of a cell" in note for note in simulation.notes())
+    assert any("solid[0] (box) contains no center of a cell" in note for note in simulation.notes())
 
 
 def test_the_frame_before_the_first_step_shows_the_start() -> None:

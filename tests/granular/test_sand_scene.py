@@ -92,7 +92,7 @@ def test_what_is_refused(tmp_path: Any, overrides: str, expected: str) -> None:
             "material.density = 1500.0: differs from physics.density = 1600; give one of them",
         ),
         (["domain.periodic=[true, false]", 'domain.open=["left"]'], "names a side of a periodic axis"),
-        (["domain.periodic=[true, false]", "density_correction.every=1"], "goes without density_correction"),
+        (["domain.periodic=[true, false]", "density_correction.every=1"], "cannot be combined with density_correction"),
         (
             ["material.cohesion=10", "material.tensile_strength=20"],
             "must be at most 17.32, the cohesion over the tangent of the friction angle",

@@ -84,7 +84,7 @@ def test_parts_that_overlap_are_their_union_and_are_told(shift: list[float]) -> 
     (note,) = repair_notes(TriangleMesh(surface=surface), "solid[0] (mesh)")
     assert note.startswith("solid[0] (mesh): cubes: ") and "triangles cross others, first at [" in note
     if overlap > 0.05:
-        with pytest.raises(ValueError, match=r"cubes: about \d+% of its surface lies inside itself, which would weigh twice"):
+        with pytest.raises(ValueError, match=r"cubes: about \d+% of its surface lies inside itself and would count twice"):
             mass_properties(TriangleMesh(surface=surface), 3, density=1.0)
 
 

@@ -276,7 +276,7 @@ def test_binary_stl_with_bytes_behind_its_triangles(tmp_path, head, behind):
 
 @pytest.mark.parametrize("head", [b"", b"solid cube"])
 @pytest.mark.parametrize(
-    ("count", "message"), [(13, "it says 13 and holds 12"), (2**32 - 1, "holds 12"), (0, "it says that it has no triangles")]
+    ("count", "message"), [(13, "it declares 13 triangles and holds 12"), (2**32 - 1, "holds 12"), (0, "it declares no triangles")]
 )
 def test_binary_stl_with_a_wrong_count(tmp_path, head, count, message):
     path = tmp_path / "cube.stl"
@@ -316,8 +316,16 @@ def test_coordinates_that_are_no_numbers(tmp_path, suffix, word, message):
         ("a.ply", "", "not a readable PLY"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n", "not a readable PLY"),
         ("a.ply", "ply\nformat ascii 1.0\nelement camera 3\nend_header\n", "no vertices"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\nproperty quad x\nend_header\n", "its header says 'property quad x'"),
-        ("a.ply", "ply\nformat ascii 1.0\nproperty float x\nelement vertex 3\nend_header\n", "its header says 'property float x'"),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 3\nproperty quad x\nend_header\n",
+            "unknown line in its header: 'property quad x'",
+        ),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nproperty float x\nelement vertex 3\nend_header\n",
+            "unknown line in its header: 'property float x'",
+        ),
         ("a.vtk", "", r"must be one of \.obj, \.ply, \.stl"),
     ],
 )

@@ -9,7 +9,7 @@ from warp_lcp.grid import vicinity as module
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.level_set_kernels import BINOMIAL
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import SEGMENT, StaggeredGrid, Trail, Window, pieces_of
+from warp_lcp.grid.staggered import SEGMENT, DirtyRegion, StaggeredGrid, Window, pieces_of
 from warp_lcp.grid.vicinity import Vicinity, spread
 
 GRID = StaggeredGrid((37, 20, 12), 0.1, 3, "cpu")
@@ -128,7 +128,7 @@ def test_what_was_reached_goes_along_to_another_part_of_a_domain(small: None) ->
 
 def test_trails_hold_the_parts_of_the_last_two_windows() -> None:
     one, two = random_part(1, 0.1), random_part(2, 0.1)
-    trail = Trail(GRID.everywhere)
+    trail = DirtyRegion(GRID.everywhere)
     assert trail.through(one).near is None
     both = trail.through(two)
     assert one.near is not None and two.near is not None and both.near is not None

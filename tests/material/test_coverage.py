@@ -182,11 +182,11 @@ def test_a_domain_without_far_ends() -> None:
     state = simulation.state()
     state["position"][:, 0] += np.float32(MOST_CELLS * 0.05 - state["position"][:, 0].max() - 0.3)
     simulation.restore(state)
-    with pytest.raises(SimulationFailed, match=rf"comes to {MOST_CELLS} cells along x"):
+    with pytest.raises(SimulationFailed, match=rf"extends to {MOST_CELLS} cells along x"):
         simulation.step(0.001)
     for wrong, message in (
-        ({"spacing": 0.05, "size": [1.0, 1.0], "resolution": 16, "dimension": 2}, "instead of size and resolution"),
-        ({"size": [1.0, 1.0], "resolution": 16, "dimension": 2}, "size says it"),
+        ({"spacing": 0.05, "size": [1.0, 1.0], "resolution": 16, "dimension": 2}, "replaces size and resolution"),
+        ({"size": [1.0, 1.0], "resolution": 16, "dimension": 2}, "otherwise size gives it"),
         ({"spacing": 0.05, "dimension": 2, "follow": False}, "no grid covers"),
     ):
         with pytest.raises((SceneError, ValueError), match=message):

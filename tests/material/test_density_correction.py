@@ -239,7 +239,7 @@ def test_it_acts_by_itself_where_particles_crowd_and_nowhere_else() -> None:
     assert {row["density_status"] for row in rows} == {None}
     assert 1.0 < max(row["max_density"] for row in rows) < 1.2
     assert quiet.rearrangement.correction is None
-    assert off.rearrangement.crowding is None
+    assert off.rearrangement.density_monitor is None
     assert not any("density" in name for name in (*off.columns(), *off.state(), *quiet.state()))
     for name, array in off.state().items():
         assert np.array_equal(quiet.state()[name], array), name

@@ -62,12 +62,12 @@ class Dust(ParticleSimulation):
     def step(self, dt: float) -> Row:
         totals = self.begin_step(dt)
         window = self.window(totals)
-        self.bring_to_faces(window)
+        self.particles_to_grid(window)
         self.mark()
         for marks, weight in zip(self.known, self.weights, strict=True):
             marks.assign((weight.numpy() > TINY_WEIGHT).astype(np.int8))
-        self.extend(window, self.known, self.kind, self.contact)
-        self.bring_to_particles(window, self.kind, dt)
+        self.extrapolate_velocity(window, self.known, self.kind, self.contact)
+        self.grid_to_particles(window, self.kind, dt)
         return self.logged(self.move(dt, window) | self.solve_row(None) | {"grains": 7, "unasked": 1})
 
 
@@ -138,7 +138,7 @@ def test_it_goes_on_on_a_finer_grid() -> None:
     coarse, fine = make(), make(32)
     for _ in range(3):
         coarse.step(0.02)
-    assert "512 particles for 128" in fine.resample(coarse.state())[0]
+    assert "512 particles replace 128" in fine.resample(coarse.state())[0]
     assert fine.time == coarse.time
     held = fine.particles.cells_of(fine.particles.position.numpy())[:, ::-1] + 1
     assert (np.argwhere(fine.kind.numpy() == wl.FLUID) == np.unique(held, axis=0)).all()  # marked anew: it has moved by a cell

@@ -159,7 +159,7 @@ def test_cells_are_filled_that_hold_fewer_than_half(there: int, comes: int) -> N
 
 def test_a_box_that_is_full_ends_the_run_with_a_reason() -> None:
     simulation = tap(liquid=[box([0.0, 0.0], [1.0, 1.0])])
-    with pytest.raises(SimulationFailed, match="sources run"):
+    with pytest.raises(SimulationFailed, match="or sources"):
         simulation.step(0.01)
 
 

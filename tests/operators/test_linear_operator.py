@@ -141,9 +141,9 @@ def shaped(image, **options):
         (lambda: wl.LCP(aslinearoperator(np.ones((3, 4))), np.ones(3)), r"A has shape \(3, 4\): expected \(n, n\)"),
         (lambda: wl.LCP(aslinearoperator(1j * np.eye(3)), np.ones(3)), "A has type complex128: expected real numbers"),
         (lambda: wl.LCP(shaped(np.ones(4)), np.ones(3)), r"A fails to multiply an array of shape \(3,\): cannot reshape"),
-        (lambda: wl.LCP(shaped(np.full(3, np.nan)), np.ones(3)), "A gives a product that is not finite"),
+        (lambda: wl.LCP(shaped(np.full(3, np.nan)), np.ones(3)), "the product of A with normally distributed numbers is not finite"),
         (lambda: wl.LCP(shaped(np.ones(3) + 1j), np.ones(3)), "A gives a product of type complex128"),
-        (lambda: wl.LinearOperator(lambda x: x), "shape: say which fields A takes"),
+        (lambda: wl.LinearOperator(lambda x: x), "shape: must be given if A is a function"),
         (lambda: wl.LinearOperator(lambda x: x[:2], (3,)), r"A gives a product of shape \(2,\): expected \(3,\)"),
         (lambda: wl.LinearOperator(lambda x: x, (0,)), r"shape = \(0,\): expected integers >= 1"),
         (lambda: wl.LinearOperator(lambda x: x, "ab"), "shape = 'ab': expected a tuple of integers"),
@@ -153,7 +153,7 @@ def shaped(image, **options):
         (lambda: wl.LinearOperator(lambda x: x, (3,), diagonal=np.nan), "diagonal holds a value that is not finite"),
         (lambda: wl.LinearOperator(lambda x: x, (3,), transpose=3), "transpose is a int: expected a function"),
         (lambda: wl.LinearOperator(3), "A is a int: expected a function"),
-        (lambda: wl.LCP(lambda x: x, np.ones(3)), "A is a function: wl.LinearOperator"),
+        (lambda: wl.LCP(lambda x: x, np.ones(3)), "A is a function: pass wl.LinearOperator"),
     ],
 )
 def test_what_is_refused(make, message):

@@ -187,7 +187,7 @@ def test_pickles_and_copies_are_the_same(device):
         ({(0, 0): np.nan}, {}, "not finite"),
         ({(0, 0): 1.0, (0, 1): -2.0}, {}, r"the diagonal of cell \(0, 4\) is -1, with its closed sides: must be > 0"),
         (np.zeros((3, 4)), {}, r"coefficients has shape \(3, 4\): expected \(3, 3\), or a mapping by offset"),
-        ({(0, 0): rising, (0, 1): np.ones((4, 5))}, {}, "arrays and Warp functions do not mix"),
+        ({(0, 0): rising, (0, 1): np.ones((4, 5))}, {}, "arrays and Warp functions cannot be combined"),
         ({(0, 0): rising_in_space}, {}, "rising_in_space takes 3 arguments: expected the 2 indices of a cell"),
         (NINE, {"outside": 7}, "outside = 7: allowed are wl.AIR = 0 and wl.SOLID = 2"),
         (NINE, {"shift": -1.0}, "shift holds a negative value"),

@@ -139,7 +139,7 @@ def test_other_methods_refuse(name):
         pytest.importorskip("piqp")
     A, b, _ = block_on_a_slope(0.5, 0.3)
     problem = wl.LCP(wl.DenseOperator(A, device="cpu"), b, *wl.AffineBounds.friction([-1, 0], 0.3))
-    with pytest.raises(ValueError, match="no bounds that are affine in x"):
+    with pytest.raises(ValueError, match="cannot use bounds that are affine in x"):
         wl.solve(problem, METHODS[name]())
 
 

@@ -115,8 +115,10 @@ def test_a_device_that_is_missing_becomes_the_cpu(device):
 
 def test_what_is_not_pickled_says_what_to_do(device):
     A = grid(device)
-    with pytest.raises(TypeError, match="pickle the one it was made from, and mask that again"):
+    with pytest.raises(TypeError, match="pickle the operator it was made from, and mask it again"):
         pickle.dumps(A.masked(np.ones(CELLS.shape)))
     A.layout.across = SimpleNamespace()
-    with pytest.raises(TypeError, match="GridPoisson is a part of a grid that ranks share: pickle its cells and coefficients on each rank"):
+    with pytest.raises(
+        TypeError, match="GridPoisson is distributed over ranks and cannot be pickled: pickle its cells and coefficients on each rank"
+    ):
         copy.deepcopy(A)

@@ -72,7 +72,7 @@ def test_each_capability_lets_in_the_methods_that_ask_for_it(name, capability):
     asked = getattr(cls, "supports", ())
     if asked and capability not in asked:
         assert not takes(cls, own)
-        with pytest.raises(ValueError, match=f"^{cls.__name__} needs an operator with .*; Least has none: take MinimumMapNewton"):
+        with pytest.raises(ValueError, match=f"^{cls.__name__} needs an operator with .*; Least has none: use MinimumMapNewton"):
             wl.solve(problem, cls())
         assert own.products == 0
         return

@@ -152,7 +152,7 @@ def test_without_a_method_the_fastest_is_taken():
     np.testing.assert_allclose(wl.solve(friction).x.numpy(), [1.0, 0.5], atol=1e-5)  # x_n = 1, and x_t = 1 beyond mu x_n
     assert wl.solve(wl.LCP(A, b)).history[1].step == "monotone cycle"
     assert wl.solve(dense)
-    with pytest.raises(ValueError, match="name the solver"):
+    with pytest.raises(ValueError, match="pass the solver"):
         wl.solve(dense, workspace=wl.MinimumMapNewton().init(dense))
 
 

@@ -36,16 +36,8 @@ def scene(dots, tmp_path):
         ("position = [1.0, 5.0, 0.5]", (2.0, 1.0, 1.0), "camera.up: must be given"),
         ("look_at = [1.0, 0.5, 5.0]", (2.0, 1.0, 1.0), "camera.look_at = [1.0, 0.5, 5.0]: needs camera.position"),
         ("field_of_view = 0.1", (2.0, 1.0, 1.0), "camera.field_of_view = 0.1: must be at least 1"),
-        (
-            "min = [0.0, 0.0]",
-            (2.0, 1.0, 1.0),
-            "camera.min = [0.0, 0.0]: is of no use in a scene of 3 dimensions; it may have position, look_at",
-        ),
-        (
-            "position = [1.0, 2.0]",
-            (2.0, 1.0),
-            "camera.position = [1.0, 2.0]: is of no use in a scene of 2 dimensions; it may have min, max",
-        ),
+        ("min = [0.0, 0.0]", (2.0, 1.0, 1.0), "camera.min = [0.0, 0.0]: cannot be used in 3-D; allowed are position, look_at"),
+        ("position = [1.0, 2.0]", (2.0, 1.0), "camera.position = [1.0, 2.0]: cannot be used in 2-D; allowed are min, max"),
         ("min = [0.5, 0.5]\nmax = [0.4, 1.0]", (2.0, 1.0), "camera.max = [0.4, 1.0]: min = [0.5, 0.5] must be less than max"),
         ("min = [2.5, 0.5]", (2.0, 1.0), "camera.min = [2.5, 0.5]: min = [2.5, 0.5] must be less than max = [2.0, 1.0]"),
         ("target = [0.0, 0.0, 0.0]", (2.0, 1.0, 1.0), "camera.target: unknown key"),

@@ -137,10 +137,10 @@ def test_nothing_else_is_told_and_to_nobody_else(dots, tmp_path):
         assert b"https://" not in page
         taken = CliRunner().invoke(cli.app, ["serve", str(folder), "--port", str(server.server_port)])
     assert taken.exit_code == cli.WRONG_INPUT
-    assert f"--port {server.server_port}: cannot be served on" in taken.stderr
+    assert f"--port {server.server_port}: cannot be used" in taken.stderr
     missing = CliRunner().invoke(cli.app, ["serve", str(tmp_path / "nowhere")])
     assert missing.exit_code == cli.WRONG_INPUT
-    assert "there is no such folder" in missing.stderr
+    assert "no such folder" in missing.stderr
 
 
 def test_a_run_is_served_and_shown_from_its_beginning(dots, tmp_path, monkeypatch):
@@ -246,8 +246,8 @@ def test_without_descriptors_the_page_waits(dots, tmp_path, monkeypatch):
 
 def test_a_run_goes_on_without_a_page(tmp_path, monkeypatch):
     def refuse(folder, *, port=0, show=None):
-        raise RenderError("--port 0: cannot be served on: Too many open files; 0 takes a free one")
+        raise RenderError("--port 0: cannot be used: Too many open files; 0: any free port")
 
     monkeypatch.setattr(live, "live_server", refuse)
     with live.served(tmp_path) as address:
-        assert address.startswith("none (--port 0: cannot be served on: Too many open files")
+        assert address.startswith("none (--port 0: cannot be used: Too many open files")

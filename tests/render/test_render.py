@@ -161,7 +161,7 @@ def test_how_long_drawing_takes_is_told_before_it_begins(pyvista, make_run):
     assert more[0] == 2 * said[0]
     assert more[1] > said[0] > 0.0
     result = call(folder, "--size", "320x240")
-    assert result.stderr.startswith("drawing takes about 0:00:01 of a core")
+    assert result.stderr.startswith("drawing takes about 0:00:01 on one core")
     assert "takes about" not in call(folder, "--size", "320x240", "--frame", 0).stderr
 
 

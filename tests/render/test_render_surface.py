@@ -202,8 +202,8 @@ def test_empty_surfaces_and_frames_without_bodies(pyvista, dots, tmp_path):
         (["--set", "time.duration=3"], "--set time.duration=3: only keys of [camera]"),
         (["--set", "camera.position=[0.5, 0.5, 0.5]"], "must not be the point that the camera looks at"),
         (["--set", "camera.zoom=2"], "camera.zoom: unknown key"),
-        (["--at", "0.5"], "--at: says where --slice cuts"),
-        (["--fps", "10"], "--fps: is of a film"),
+        (["--at", "0.5"], "--at: needs --slice"),
+        (["--fps", "10"], "--fps: needs --film"),
         (["--show", "cells"], "--show"),
     ],
 )

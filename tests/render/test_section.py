@@ -152,7 +152,7 @@ def test_wrong_cuts(dots, tmp_path):
     with pytest.raises(RenderError, match="--at: is for 3-D runs"):
         draw(flat, at=0.5)
     for at in (-0.1, 1.5, float("nan")):
-        with pytest.raises(RenderError, match="whose z reaches from 0 to 1 m"):
+        with pytest.raises(RenderError, match="must be inside the domain, from 0 to 1 m"):
             draw(room, at=at)
 
 

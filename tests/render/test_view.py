@@ -112,7 +112,7 @@ def test_frames_that_come_are_shown_where_the_newest_was(viewer, folder):
 
 
 def test_wrong_input(pyvista, folder, tmp_path, monkeypatch):
-    for arguments, expected in (([tmp_path / "nowhere"], "there is no such folder"), ([folder, "--show", "particles"], "holds no frames")):
+    for arguments, expected in (([tmp_path / "nowhere"], "no such folder"), ([folder, "--show", "particles"], "holds no frames")):
         result = CliRunner().invoke(cli.app, ["view", *map(str, arguments)])
         assert result.exit_code == 2
         assert expected in result.stderr.replace("\n", " ")

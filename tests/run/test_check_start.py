@@ -135,7 +135,7 @@ def test_a_narrow_band_is_foretold_about(tmp_path: Path) -> None:
 
 def test_too_many_shapes_are_refused_before_they_are_read(tmp_path: Path) -> None:
     scene = written(tmp_path / "scene.toml", [LIQUID] * (MOST_TABLES + 1))
-    with pytest.raises(SceneError, match=r"liquid: has 10,001 entries, of which a scene may have 10,000"):
+    with pytest.raises(SceneError, match=r"liquid: has 10,001 entries: at most 10,000 are allowed"):
         load_scene(scene)
 
 
@@ -158,7 +158,7 @@ def test_rotate_turns_about_the_origin_or_the_point_that_is_named(tmp_path: Path
 def test_a_shape_that_its_rotation_takes_out_of_the_domain_is_told(tmp_path: Path) -> None:
     scene = load_scene(written(tmp_path / "scene.toml", [LIQUID], solid=[{**BEAM, "rotate": 45.0}]))
     (note,) = scene.notes()
-    assert note == "solid[0] (box): rotate turns it about the origin, 0.1768 m out of the domain; about its center it turns with " + (
+    assert note == "solid[0] (box): rotate about the origin moves it 0.1768 m out of the domain; to rotate it about its center, set " + (
         "about = [0.65, 0.6]"
     )
     assert note in start(scene, "cpu").notes()
@@ -197,8 +197,8 @@ def test_a_friction_angle_is_refused_under_its_own_key(sand: dict[str, Any], mat
 @pytest.mark.parametrize(
     ("extra", "reason"),
     [
-        ({"solid": [{**BEAM, "rotate": 10.0, "density": 3000.0, "about": [0.65, 0.6]}]}, "since some move"),
-        ({"solid": [{**BEAM, "rotate": 10.0, "about": [0.65, 0.6]}], "domain": {"periodic": [True, False]}}, "since an axis is periodic"),
+        ({"solid": [{**BEAM, "rotate": 10.0, "density": 3000.0, "about": [0.65, 0.6]}]}, "because some solids move"),
+        ({"solid": [{**BEAM, "rotate": 10.0, "about": [0.65, 0.6]}], "domain": {"periodic": [True, False]}}, "because an axis is periodic"),
         (
             {"solid": [{**BEAM, "rotate": 10.0, "about": [0.65, 0.6]}], "solver": {"method": "interleaved-sweeps"}},
             'is "interleaved-sweeps"',

@@ -64,7 +64,7 @@ def test_the_scene_is_written_with_the_state(tmp_path):
 
 def test_a_renamed_checkpoint_is_not_another_step(folder):
     folder.path(12).rename(folder.path(40))
-    with pytest.raises(CheckpointError, match="holds step 12, renamed"):
+    with pytest.raises(CheckpointError, match="holds step 12; the file was renamed"):
         folder.read(40)
 
 
@@ -102,8 +102,8 @@ def damage(path: Path, how: str) -> None:
         ("text", "cut short, damaged or not a checkpoint"),
         ("flipped", "cut short, damaged or not a checkpoint"),
         ("no meta", "cut short, damaged or not a checkpoint"),
-        ("foreign key", "holds arrays that no run writes: 'surprise'"),
-        ("lost key", "its checksum does not fit"),
+        ("foreign key", "holds unexpected arrays: 'surprise'"),
+        ("lost key", "wrong checksum"),
         ("other scene", "belongs to another scene"),
         ("other format", "written in format 99, this version reads format 2"),
     ],

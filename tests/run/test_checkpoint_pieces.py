@@ -104,5 +104,5 @@ def test_a_simulator_that_cannot_join_pieces_says_so(dots, scene_file, tmp_path)
     for file in (out / "checkpoints").iterdir():
         file.unlink()
     write(out / "checkpoints", 4, whose=fingerprint(scene))
-    with pytest.raises(SceneError, match="the checkpoint is one of several ranks: continue with --engine petsc"):
+    with pytest.raises(SceneError, match="the checkpoint was written on several ranks: continue with --engine petsc"):
         run_into(scene, out, observer=watcher, resume=True)

@@ -105,7 +105,7 @@ def test_a_loop_that_is_left_resumes_bit_for_bit(tmp_path):
         if frame.index == 4:
             break
     record = json.loads((parts / "run.json").read_text())
-    assert (record["status"], record["reason"]) == ("stopped", "left by its program after frame 4")
+    assert (record["status"], record["reason"]) == ("stopped", "stopped by the program after frame 4")
     assert [frame.index for frame in wl.Run.resume(parts, device="cpu")] == [5, 6, 7, 8, 9, 10]
     one, other = contents(whole), contents(parts)
     assert {name: one[name] for name in other.keys() & one.keys() if "step" not in name} == {
@@ -229,7 +229,7 @@ def test_ctrl_c_between_frames_is_the_program_s(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         drive()
     record = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert (record["status"], record["reason"]) == ("stopped", "left by its program after frame 2")
+    assert (record["status"], record["reason"]) == ("stopped", "stopped by the program after frame 2")
 
 
 def test_a_run_in_another_thread_leaves_signals_alone(tmp_path):
@@ -335,7 +335,7 @@ def test_a_run_that_fails_says_so(tmp_path):
         ({"scene": {}}, SceneError, "scene.simulator: is missing"),
         ({"resolutoin": 96}, SceneError, "resolutoin: no such key.*resolution"),
         ({"resolution": "many"}, SceneError, "domain.resolution"),
-        ({"resolution": object()}, RunError, "domain.resolution: a value of a scene"),
+        ({"resolution": object()}, RunError, "domain.resolution: must be a number, a string"),
         ({"frames": -1}, RunError, "frames = -1"),
         ({"frames": 2.5}, RunError, "frames = 2.5"),
         ({"folder": 3}, RunError, "folder = 3"),
@@ -350,7 +350,7 @@ def test_wrong_arguments_are_named_before_any_work(arguments, error, words):
 
 def test_what_a_run_cannot_do_is_named(tmp_path):
     run = wl.Run(CRATE, device="cpu", frames=1)
-    with pytest.raises(RunError, match="has not begun"):
+    with pytest.raises(RunError, match="has not started"):
         run.push(0, [1.0, 0.0])
     for _ in run:
         with pytest.raises(RunError, match="body = 1: must be from 0 to 0"):
@@ -361,7 +361,7 @@ def test_what_a_run_cannot_do_is_named(tmp_path):
             run.gravity = [0.0, np.nan]
         with pytest.raises(SceneError, match=r"liquid\[1\]"):
             run.add(shape="box", min=[0.0, 0.0])
-    with pytest.raises(RunError, match="driven already"):
+    with pytest.raises(RunError, match="iterated already"):
         next(iter(run))
     with pytest.raises(OutputError, match="no run to resume"):
         wl.Run.resume(tmp_path)

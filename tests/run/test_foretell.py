@@ -84,9 +84,9 @@ def test_a_usual_scene_raises_no_doubts() -> None:
 
 
 def test_what_was_hardly_meant_is_told() -> None:
-    assert told(time={"duration": 500.0}) == ["15,000 frames: time.duration 500 s at time.frames_per_second 30; were so many meant?"]
+    assert told(time={"duration": 500.0}) == ["15,000 frames: time.duration 500 s at time.frames_per_second 30; is this intended?"]
     half = told(solid=[{"shape": "box", "min": [0.0, 0.0], "max": [0.625, 0.5]}])
-    assert half == ["liquid[0] (box): 62 % of it lies inside solids, and is left out"]
+    assert half == ["liquid[0] (box): 62 % of it lies inside solids and is left out"]
     tiny = {"shape": "sphere", "center": [0.5, 0.1], "radius": 0.045, "invert": True}
     full = told(solid=[tiny])
     assert full[0].startswith("solids fill 9")

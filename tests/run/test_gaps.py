@@ -74,7 +74,7 @@ def test_a_log_that_was_cut_or_deleted(out, share):
         cut(out / "log.csv", share)
     left = steps(out)[:-1] if share == 0.33 else []  # the last row is cut
     (line,) = resumed(out)
-    assert line.startswith(f"log.csv: rows are missing, of steps {len(left) + 1} to {STEP}; no checkpoint is from before them")
+    assert line.startswith(f"log.csv: rows of steps {len(left) + 1} to {STEP} are missing; no earlier checkpoint exists")
     assert steps(out)[: len(left) + 1] == [*left, STEP + 1]
 
 
@@ -86,10 +86,10 @@ def test_what_is_missing_is_made_again_as_the_line_says(out, scene_file, tmp_pat
     (out / "frames" / f"grid_{lost:06d}.vtu").unlink()
     rows = (out / "log.csv").read_text().splitlines(keepends=True)
     (out / "log.csv").write_text("".join(rows[:18] + rows[20:]))
-    again = "to have them again, move the checkpoint{} away and resume from that of step {}"
+    again = "to recompute them, move the checkpoint{} away and resume from step {}"
     assert resumed(out) == [
-        f"log.csv: rows are missing, of steps 18 to 19; {again.format(' of step 20', 16)}",
-        f"frames: grid {lost} are missing or cut; {again.format('s of steps 16 to 20', 12)}",
+        f"log.csv: rows of steps 18 to 19 are missing; {again.format(' of step 20', 16)}",
+        f"frames: grid {lost} are missing or truncated; {again.format('s of steps 16 to 20', 12)}",
     ]
     for file in out.glob("checkpoints/*.npz"):
         if int(file.stem[-6:]) > 12:
@@ -121,7 +121,7 @@ def test_files_that_say_what_ran(out, scene_file, record):
 @pytest.mark.parametrize("name", ["log.csv", "scene.toml", "frames", "checkpoints"])
 def test_a_folder_in_the_place_of_a_file_or_a_file_in_that_of_a_folder(out, scene_file, name):
     path = out / name
-    kind = "a file where a run has a folder" if path.is_dir() else "a folder where a run has a file"
+    kind = "a file, expected a folder" if path.is_dir() else "a folder, expected a file"
     path.rename(out.parent / "aside")
     path.mkdir() if path.suffix else path.touch()
     result = CliRunner().invoke(cli.app, ["run", str(scene_file), "--resume", "--out", str(out), "--device", "cpu", "--frames", "9"])
@@ -155,10 +155,10 @@ def test_whatever_is_missing_is_named(out, seed):
     lost = [f"{kind}.pvd" for kind in KINDS if not (out / f"{kind}.pvd").exists()]
     lines = resumed(out)
     holes = sorted({*range(1, STEP + 1)} - {*steps(out)})
-    told = [f"log.csv: rows are missing, of steps {spans(holes)}"] if holes else []
+    told = [f"log.csv: rows of steps {spans(holes)} are missing"] if holes else []
     listed = ", ".join(f"{kind} {spans(numbers)}" for kind, numbers in missing.items() if numbers)
-    told += [f"frames: {listed} are missing or cut"] if listed else []
-    told += [f"{name}: is missing" for name in lost]
+    told += [f"frames: {listed} are missing or truncated"] if listed else []
+    told += [f"{name}: was missing" for name in lost]
     assert [line.split(";")[0] for line in lines] == told
     assert steps(out) == sorted({*steps(out)})
     for kind in KINDS:

@@ -44,7 +44,7 @@ def test_resume_without_repeating_set_is_the_same_run(scene_file, tmp_path, way)
     named = {"the scene": [scene_file], "the folder's scene": [out / "scene.toml"], "no scene": []}[way]
     result = call("run", *named, "--out", out, "--device", "cpu", "--frames", 2, "--resume")
     assert result.exit_code == 0, result.stderr
-    assert ("--set as before: domain.resolution=16, time.dt_max=0.01" in result.stderr) == (way == "the scene")
+    assert ("earlier --set values: domain.resolution=16, time.dt_max=0.01" in result.stderr) == (way == "the scene")
     assert "changed" not in result.stderr
     record = json.loads((out / "run.json").read_text())
     assert (record["changed"], record["resampled_from_resolution"]) == ([], None)
@@ -76,7 +76,7 @@ def test_another_resolution_is_asked_for_by_name(scene_file, tmp_path):
     out, source = tmp_path / "out", str(scene_file)
     ran(out, given_scene(source, ["domain.resolution=16"]))
     (out / "run.json").write_text("{}")  # of a version that did not remember
-    with pytest.raises(OutputError, match=r"domain.resolution is 16, that of .*dots.toml 8: with --set domain.resolution=8 the run"):
+    with pytest.raises(OutputError, match=r"domain.resolution is 16, but 8 in .*dots.toml: use --set domain.resolution=8 to resample"):
         scene_to_resume(out, source, [])
     for resolution in (8, 16, 32):
         given = scene_to_resume(out, source, [f"domain.resolution={resolution}"])
@@ -84,7 +84,7 @@ def test_another_resolution_is_asked_for_by_name(scene_file, tmp_path):
     ran(out, given)
     assert scene_to_resume(out, source, []).scene.domain.resolution == 32
     edit(scene_file, resolution="64")
-    with pytest.raises(OutputError, match=r"domain.resolution is 32, that of .* 64"):
+    with pytest.raises(OutputError, match=r"domain.resolution is 32, but 64 in "):
         scene_to_resume(out, source, [])
 
 

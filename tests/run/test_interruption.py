@@ -77,7 +77,7 @@ def test_before_the_first_step_has_ended(dots, run, tmp_path, number, frames):
     assert f"{number.name}: stopping before the first step has ended" in result.stderr
     found = record(tmp_path)
     assert (found["status"], found["steps"]) == ("stopped", 0)
-    assert found["reason"] == f"interrupted by {number.name} before its first step had ended"
+    assert found["reason"] == f"interrupted by {number.name} during the first step"
     dots.before_step = at(-1)
     assert run("--resume", "--frames", frames).exit_code == 0
 
@@ -143,12 +143,12 @@ def test_a_compiler_is_not_waited_for(monkeypatch):
 
 def test_the_record_of_a_run_that_is_ended(run, tmp_path):
     assert run("--frames", 0).exit_code == 0
-    mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT before its first step had ended")
+    mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT during the first step")
     assert record(tmp_path)["status"] == "finished"
     (tmp_path / "out" / "run.json").write_text(json.dumps({**record(tmp_path), "status": "running"}))
-    mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT before its first step had ended")
+    mark_ended(tmp_path / "out", "stopped", "interrupted by SIGINT during the first step")
     found = record(tmp_path)
-    assert (found["status"], found["reason"]) == ("stopped", "interrupted by SIGINT before its first step had ended")
+    assert (found["status"], found["reason"]) == ("stopped", "interrupted by SIGINT during the first step")
     mark_ended(tmp_path, "stopped", "interrupted by SIGINT")  # of a run that has not begun
 
 

@@ -42,7 +42,7 @@ def test_a_folder_where_a_run_died_at_its_first_file_is_taken(folder):
 
 def test_an_earlier_run_needs_force(folder):
     fill(folder, RUN_FILES)
-    with pytest.raises(OutputError, match="--resume continues it, --force deletes it"):
+    with pytest.raises(OutputError, match="use --resume to continue it, --force to delete it"):
         folder.check_new(force=False)
     folder.check_new(force=True)
     folder.start(RunRecord("dots", "dots", "cpu"))
@@ -62,7 +62,7 @@ def test_leftovers_of_a_killed_run_go_too(folder):
 )
 def test_force_never_deletes_what_is_no_runs(folder, name):
     fill(folder, [*RUN_FILES, name])
-    with pytest.raises(OutputError, match="files that are no run's"):
+    with pytest.raises(OutputError, match="files that do not belong to a run"):
         folder.check_new(force=True)
     assert (folder.path / name).is_file()
     assert (folder.path / "log.csv").is_file()
@@ -70,7 +70,7 @@ def test_force_never_deletes_what_is_no_runs(folder, name):
 
 def test_a_folder_without_a_record_is_no_run(folder):
     fill(folder, ["scene.toml"])  # perhaps the user's own
-    with pytest.raises(OutputError, match="files that are no run's"):
+    with pytest.raises(OutputError, match="files that do not belong to a run"):
         folder.check_new(force=True)
 
 
@@ -81,7 +81,7 @@ def test_links_are_not_followed(folder, tmp_path):
     (folder.path / "checkpoints" / "step_000050.npz").unlink()
     (folder.path / "checkpoints").rmdir()
     (folder.path / "checkpoints").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(OutputError, match="files that are no run's"):
+    with pytest.raises(OutputError, match="files that do not belong to a run"):
         folder.check_new(force=True)
 
 
@@ -119,7 +119,7 @@ def test_a_run_killed_before_its_first_step_begins_anew(folder):
     for left in ("nothing", "a header"):
         continued = folder.resume()
         assert continued.checkpoint is None, left
-        assert "begins anew" in continued.remarks[0]
+        assert "starts again" in continued.remarks[0]
         folder.log.write_text("step,time\n")
 
 
@@ -170,13 +170,13 @@ def test_what_may_change_is_told_with_both_values(folder, scene_file):
     ]
     assert continued.resampled_from is None
     (remark,) = continued.remarks
-    assert remark.startswith("from step 8 on the steps are not those of the run that began: solver.tolerance")
+    assert remark.startswith("from step 8 on, steps differ from those of the original run: solver.tolerance")
     assert "time.duration" not in remark
 
 
 def test_a_duration_that_ends_before_the_checkpoint_would_lose_frames(folder, scene_file):
     begun(folder).checkpoints.write(Checkpoint(8, 0.4, {}))
-    with pytest.raises(OutputError, match=r"time.duration = 0.3 s ends before the checkpoint's time, 0.4 s"):
+    with pytest.raises(OutputError, match=r"time.duration = 0.3 s is less than the checkpoint's time, 0.4 s"):
         changed(folder, scene_file, "time.duration=0.3").resume()
     assert changed(folder, scene_file, "time.duration=0.4").resume().checkpoint is not None
 
@@ -218,7 +218,7 @@ def test_a_mesh_counts_by_what_is_in_it(dots, tmp_path):
     (tmp_path / "b").rename(tmp_path / "a")
     mesh.write_text("v 0 0 1\n")
     edited = RunFolder(folder.path, load_scene(tmp_path / "a" / "scene.toml"))
-    with pytest.raises(OutputError, match=r"solid\[0\].file = .*thing.obj.*: what is in the file has changed since the run began"):
+    with pytest.raises(OutputError, match=r"solid\[0\].file = .*thing.obj.*: the content of the file has changed since the run began"):
         edited.resume()
     assert edited.checkpoints.newest()[0] is None  # nor does a checkpoint by itself take the new mesh for the old
 
@@ -233,7 +233,7 @@ def test_other_software_is_told(folder):
     (folder.path / "run.json").write_text(json.dumps(record))
     (remark,) = folder.resume().remarks
     assert "numpy 1.2.3, now" in remark
-    assert "need not be the same bit for bit" in remark
+    assert "may not be bitwise identical" in remark
 
 
 def test_going_on_clears_what_was_half_written(folder):

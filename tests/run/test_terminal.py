@@ -134,7 +134,7 @@ def test_what_lies_in_the_folder_of_a_run(scene_file, tmp_path, text):
         (out / "run.lock").write_text(json.dumps({"pid": 1, "host": text, "since": text}))
         assert "another run writes there" in call(*run, 3, "--resume")
     (out / f"foreign{text}").write_text("")
-    assert "holds files that are no run's" in call(*run, 1)
+    assert "holds files that do not belong to a run" in call(*run, 1)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="names are text there")

@@ -54,7 +54,7 @@ def test_the_distance_of_a_point_that_moves(moved: float, distance: float) -> No
 def test_runs_that_were_looked_at_otherwise_are_not_compared() -> None:
     scene = load_scene("dam-break-2d", SMALL)
     a, b = trial(scene, device="cpu", frames=2), trial(scene, device="cpu", frames=2, box=0.2)
-    with pytest.raises(ValueError, match="in other boxes or at other times"):
+    with pytest.raises(ValueError, match="in different boxes or at different times"):
         a.distance(b)
 
 
@@ -157,7 +157,7 @@ def test_where_nothing_is_near_enough_the_nearest_is_chosen(monkeypatch: pytest.
     assert found.noise is not None
     assert found.noise.distance == 0.0
     words = " ".join(found.verdict("standard"))
-    assert words.startswith("the nearest that was tried, not standard: time.cfl=0.5")
+    assert words.startswith("nearest of the settings tried, but not standard: time.cfl=0.5")
     assert f"distance by a factor of {found.chosen.distance / 0.03:.2g}" in words
     assert "volume or packing by a factor" not in words
     with pytest.raises(SimulationFailed, match="no settings ran to the end of frame"):
@@ -166,9 +166,9 @@ def test_where_nothing_is_near_enough_the_nearest_is_chosen(monkeypatch: pytest.
 
 def test_what_shorter_steps_bring_tells_what_would_help(monkeypatch: pytest.MonkeyPatch) -> None:
     falls = tuned(monkeypatch, Steps(0.0, 0.2)).verdict("standard")[-1]
-    assert falls == "the distance falls with the steps: shorter ones than those tried would help"
+    assert falls == "the distance decreases with the step: shorter steps than those tried would help"
     stays = tuned(monkeypatch, Steps(0.2, 0.01)).verdict("standard")[-1]
-    assert "a higher domain.resolution would help, shorter steps hardly" in stays
+    assert "half or less: increase domain.resolution instead" in stays
     assert stays.startswith("4 times as many steps left 93 % of the distance")
 
 
@@ -205,8 +205,8 @@ def test_nothing_can_be_nearer_than_references_are_to_each_other(distance: float
     assert model.references == 3
     assert found.chosen.distance > bound
     words = found.verdict("standard")
-    assert words[0].startswith("as near as can be told, not standard: ")
-    assert f"distance by a factor of {found.chosen.distance / bound:.2g}; but runs as good as the reference differ by 0.1200" in words[2]
+    assert words[0].startswith("within the noise of the reference, but not standard: ")
+    assert f"distance by a factor of {found.chosen.distance / bound:.2g}; but runs as accurate as the reference differ by 0.12" in words[2]
     far = tuned(monkeypatch, Blurred(0.5, noise=0.12))
     assert not far.met
 
@@ -230,7 +230,7 @@ def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
     result = call("dam-break-2d", *options)
     assert result.exit_code == 0, result.stderr
     assert "preview: time.cfl=" in result.stdout
-    assert "distance: share of the mass elsewhere" in result.stdout
+    assert "distance: displaced fraction of the mass" in result.stdout
     scene = load_scene(out)
     assert scene.domain.resolution == 32
     assert f"time.cfl={scene.time.cfl:g}" in result.stdout
@@ -250,7 +250,7 @@ def test_the_command_writes_a_scene_that_runs(tmp_path: Path) -> None:
         (["dam-break-3d"], "no such built-in scene"),
         (["dam-break-2d", "--accuracy", "best"], "--accuracy"),
         (["dam-break-2d", "--frames", "0"], "--frames"),
-        (["dam-break-2d", "--out", "nowhere/tuned.toml"], "must be a file in a folder that is there"),
+        (["dam-break-2d", "--out", "nowhere/tuned.toml"], "must be a file in an existing folder"),
     ],
 )
 def test_wrong_input_exits_with_2(arguments: list[str], message: str) -> None:

@@ -45,20 +45,20 @@ def made(*solids: dict[str, Any], **more: Any) -> Any:
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"mass": 1.0, "density": 500.0}, "solid[0].density = 500.0: goes without mass: give one of them"),
+        ({"mass": 1.0, "density": 500.0}, "solid[0].density = 500.0: cannot be combined with mass: give one of them"),
         ({"mass": 0.0}, "solid[0].mass = 0.0: must be at least 1e-18 (mass of a rigid body [kg; kg/m in 2-D])"),
         ({"density": -1.0}, "solid[0].density = -1.0: must be at least 1e-18 (density of a rigid body, instead of mass [kg/m^3])"),
         (
             {"mass": 1.0, "motion": {"kind": "translation", "velocity": [1.0, 0.0]}},
-            "solid[0].motion: goes without mass: a rigid body moves as forces ask",
+            "solid[0].motion: cannot be combined with mass: a rigid body is moved by forces",
         ),
-        ({"mass": 1.0, "invert": True}, "solid[0].invert = true: goes without mass: everything but a shape has no mass"),
+        ({"mass": 1.0, "invert": True}, "solid[0].invert = true: cannot be combined with mass: the outside of a shape has no mass"),
         ({"velocity": [1.0, 0.0]}, "solid[0].velocity = [1.0, 0.0]: needs mass or density, which make the solid a rigid body"),
         ({"angular_velocity": 9.0}, "solid[0].angular_velocity = [9.0]: needs mass or density, which make the solid a rigid body"),
         ({"restitution": 0.5}, "solid[0].restitution = 0.5: needs mass or density, which make the solid a rigid body"),
         ({"mass": 1.0, "velocity": [1.0, 0.0, 0.0]}, "solid[0].velocity = [1.0, 0.0, 0.0]: must have 2 entries in 2-D"),
         ({"mass": 1.0, "angular_velocity": SPIN}, "solid[0].angular_velocity = [10.0, 20.0, 30.0]: must be one number in 2-D"),
-        ({"mass": 1.0, "translate": [2.0, 0.0]}, "solid[0]: lies outside the domain, which reaches from the origin to [1.0, 1.0] m"),
+        ({"mass": 1.0, "translate": [2.0, 0.0]}, "solid[0]: lies outside the domain, which extends from the origin to [1.0, 1.0] m"),
     ],
 )
 def test_what_makes_no_sense_is_refused(keys: dict[str, Any], message: str, simulator: str) -> None:
@@ -78,7 +78,7 @@ def test_whole_cells_do_not_move() -> None:
 
 
 def test_a_liquid_rubs_against_bodies_only_where_they_touch() -> None:
-    with pytest.raises(SceneError, match=r"solid\[0\].friction = 0.5: needs mass or density.*a liquid does not rub"):
+    with pytest.raises(SceneError, match=r"solid\[0\].friction = 0.5: needs mass or density.*a liquid has no friction"):
         build({**BLOCK, "friction": 0.5})
     assert build({**BLOCK, "friction": 0.5}, simulator="granular").wall_frictions()[1] == 0.5
     assert made({**BLOCK, "mass": 1.0}).bodies[0].friction == 0.5

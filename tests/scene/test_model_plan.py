@@ -36,7 +36,7 @@ def test_a_line_tells_why_and_what_it_takes() -> None:
     assert lines[0] == ("model", "walls: asked for; 25 % of memory, 2 ms a step (30 %)")
     assert lines[1] == ("not built", "surface: there is none")
     assert lines[2] == ("model", "band: too; 0 % of memory, 0 ms a step (0 %)"), "what saves takes nothing"
-    assert lines[3] == ("step", "about 6.6 ms by the list of prices, on one core, all models together")
+    assert lines[3] == ("step", "about 6.6 ms by the cost table, on one core, all models together")
 
 
 def test_a_measured_step_scales_the_prices() -> None:

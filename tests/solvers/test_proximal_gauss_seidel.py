@@ -219,8 +219,8 @@ def test_a_warm_start_and_a_workspace_that_serves_again():
         ({"b": [[np.nan, 0, 0]]}, "b holds values that are not finite"),
         ({"b": [[0.0, 0.0]]}, "b has shape"),
         ({"first": [1]}, "numbers of 1 bodies"),
-        ({"first": [0], "second": [0]}, "contact 0 is of a body with itself"),
-        ({"one": np.zeros((1, 3, 6))}, "contact 0 has a row that moves nothing"),
+        ({"first": [0], "second": [0]}, "contact 0 joins a body to itself"),
+        ({"one": np.zeros((1, 3, 6))}, "contact 0 has a zero row"),
         ({"one": np.zeros((1, 4, 6)), "other": np.zeros((1, 4, 6))}, "dim = 1, 2 or 3"),
     ],
 )

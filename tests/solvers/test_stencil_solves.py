@@ -119,7 +119,7 @@ def test_answers_are_those_of_the_matrix(seed):
 
 def test_methods_say_what_they_cannot():
     A = operator("wind", 20)
-    with pytest.raises(ValueError, match="A is not symmetric: ProjectedMultigrid descends an energy"):
+    with pytest.raises(ValueError, match="A is not symmetric: ProjectedMultigrid minimizes an energy"):
         wl.solve(wl.LCP(A, np.ones(A.shape)), wl.ProjectedMultigrid())
     assert isinstance(wl.default_method(wl.LCP(A, np.ones(A.shape))), wl.MinimumMapNewton)
     assert isinstance(wl.default_method(wl.LCP(operator("nine points", 20), np.ones((20, 20)))), wl.ProjectedMultigrid)

@@ -250,7 +250,7 @@ def test_advised_omega_of_a_free_set_is_that_of_its_block():
     free[0, 1:8] = 1
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), np.zeros((1, 22)))
     assert advised_omega(problem, free=free) == pytest.approx(2 / (1 + np.sin(np.pi / 8)), abs=1e-9)
-    with pytest.raises(ValueError, match="free: holds no unknown"):
+    with pytest.raises(ValueError, match="free: selects no unknown"):
         advised_omega(problem, free=0 * free)
 
 

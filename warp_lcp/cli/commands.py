@@ -46,7 +46,7 @@ RANKED_SUITE = "scaling"  # what `bench --engine petsc` measures
 app = typer.Typer(
     name="warp-lcp",
     cls=Commands,
-    help="Simulate scenes with complementarity solvers. Exit codes: 0 done, 1 the run failed or was stopped, 2 the input is wrong.",
+    help="Complementarity solvers and simulators. Exit codes: 0 success, 1 failed or stopped, 2 wrong input.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -57,7 +57,7 @@ def _begin_alike(word: str, names: Iterable[str]) -> list[str]:
 
 
 def _scenes_alike(incomplete: str) -> list[str]:
-    """Return the built-in scenes, scene files and folders that begin as the word does, for the shell."""
+    """Return the built-in scenes, scene files and folders that begin with a word, for shell completion."""
     near = sorted(Path().glob(f"{glob.escape(incomplete)}*")) if not Path(incomplete).is_absolute() else []
     folders, scene_files = [f"{path}/" for path in near if path.is_dir()], [str(path) for path in near if path.suffix == ".toml"]
     return [*_begin_alike(incomplete, built_in_scenes()), *scene_files, *folders]
@@ -73,31 +73,26 @@ def _methods_alike(incomplete: str) -> list[str]:
 
 SceneArgument = Annotated[
     str,
-    typer.Argument(
-        metavar="SCENE", help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`).", autocompletion=_scenes_alike
-    ),
+    typer.Argument(metavar="SCENE", help="Scene file, or name of a built-in scene (see `warp-lcp scenes`).", autocompletion=_scenes_alike),
 ]
 EngineOption = Annotated[
-    Engine, typer.Option(help="single: this process; petsc: the ranks that `mpiexec -n N warp-lcp ...` starts (needs petsc4py and mpi4py).")
+    Engine, typer.Option(help="single: this process; petsc: MPI ranks of `mpiexec -n N warp-lcp ...` (needs petsc4py and mpi4py).")
 ]
 RankTimeout = Annotated[
-    float,
-    typer.Option(
-        min=0.0, metavar="S", help="End all ranks, and say which one was late, if one keeps the others waiting for S seconds; 0: wait."
-    ),
+    float, typer.Option(min=0.0, metavar="S", help="Abort all ranks and name the late one after S seconds of waiting; 0: no limit.")
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a key of the scene; may be repeated. Arrays: liquid.0.max=[1,1]."),
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a scene key; repeatable. Entry of an array: liquid.0.max=[1,1]."),
 ]
 
 ThreadsOption = Annotated[
     int | None,
     typer.Option(
-        metavar="N", help="CPU threads; results do not depend on them. All cores, or WARP_LCP_THREADS, unless given.", show_default=False
+        metavar="N", help="CPU threads; results do not depend on them. Default: WARP_LCP_THREADS, else all cores.", show_default=False
     ),
 ]
-ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
+ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Do not check whether the run fits into the free memory of the device.")]
 
 
 def _tell_version(asked: bool) -> None:
@@ -108,9 +103,9 @@ def _tell_version(asked: bool) -> None:
 
 @app.callback()
 def options(
-    version: Annotated[bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and end.")] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and exit.")] = False,
 ) -> None:
-    """Take what concerns no command."""
+    """Define the options that belong to no command."""
 
 
 def main() -> None:
@@ -124,42 +119,42 @@ def run(
         str | None,
         typer.Argument(
             metavar="SCENE",
-            help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`); --resume --out DIR does without.",
+            help="Scene file, or name of a built-in scene (see `warp-lcp scenes`); optional with --resume --out DIR.",
             show_default=False,
             autocompletion=_scenes_alike,
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="The run's folder; out/NAME unless given.", show_default=False)] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda:N; a GPU where there is one unless given.", show_default=False)] = None,
-    frames: Annotated[int | None, typer.Option(min=0, metavar="N", help="End after frame N.", show_default=False)] = None,
+    out: Annotated[Path | None, typer.Option(help="Run folder. Default: out/NAME.", show_default=False)] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N. Default: a GPU, if there is one.", show_default=False)] = None,
+    frames: Annotated[int | None, typer.Option(min=0, metavar="N", help="Stop after frame N.", show_default=False)] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run in the folder, with what --set gave it, from its newest checkpoint.")
+        bool, typer.Option("--resume", help="Continue the run in the folder from its newest checkpoint, with its earlier --set values.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Delete the run in the folder first.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Delete an earlier run in the folder first.")] = False,
     force_memory: ForceMemory = False,
-    profile: Annotated[bool, typer.Option("--profile", help="Measure where the time goes; also into profile.json.")] = False,
+    profile: Annotated[bool, typer.Option("--profile", help="Measure the time of each part; print it and write profile.json.")] = False,
     record_problems: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write each step's pressure problem into DIR.", show_default=False)
+        Path | None, typer.Option(metavar="DIR", help="Write the pressure problem of each step to DIR.", show_default=False)
     ] = None,
-    page: Annotated[bool, typer.Option("--serve", help="Show the run on a page in the browser while it lasts, as `serve` does.")] = False,
+    page: Annotated[bool, typer.Option("--serve", help="Show the run on a web page while it is in progress, as `serve` does.")] = False,
     window: Annotated[bool, typer.Option("--view", help="Show the run in a window, as `view` does.")] = False,
     engine: EngineOption = Engine.SINGLE,
     rank_timeout: RankTimeout = LIMIT,
     threads: ThreadsOption = None,
     overrides: SetOption = None,
 ) -> None:
-    """Simulate a scene into a folder that ParaView opens."""
+    """Simulate a scene; ParaView opens the frames in the run folder."""
     given = {"--out": out, "--device": device, "--frames": frames, "--resume": resume, "--force": force, "--force-memory": force_memory}
     with wrong_input(), launcher_of(engine, rank_timeout=rank_timeout) as launcher:
         _use_threads(threads)
         if resume and force:
-            raise OutputError("--resume continues a run and --force deletes it: choose one")
+            raise OutputError("--resume and --force exclude each other: --resume continues a run, --force deletes it")
         loaded = launcher.load(scene, overrides or (), given)
         chosen, console = launcher.choose_device(device), launcher.console
         folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
         say(console, f"{name} on {launcher.place(chosen)}, into {folder}")
         if loaded.kept:
-            say(console, f"--set as before: {', '.join(loaded.kept)}")
+            say(console, f"earlier --set values: {', '.join(loaded.kept)}")
         request = RunRequest(
             scene=loaded.scene, out=folder, device=chosen, overrides=loaded.overrides, last_frame=frames, resume=resume, force=force,
             force_memory=force_memory, record_problems=record_problems,
@@ -190,17 +185,17 @@ for command in (render, view, serve, export):  # after `run`, in the list of com
 @app.command()
 def check(
     scene: SceneArgument,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda:N, whose memory counts.", show_default=False)] = None,
-    calibrate: Annotated[bool, typer.Option("--calibrate", help="Also take a few steps, and say how long a step takes.")] = False,
-    fix: Annotated[bool, typer.Option("--fix", help="First rewrite old names of keys in the scene file.")] = False,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N: the device whose memory is checked.", show_default=False)] = None,
+    calibrate: Annotated[bool, typer.Option("--calibrate", help="Also run a few steps and measure the time per step.")] = False,
+    fix: Annotated[bool, typer.Option("--fix", help="First replace old key names in the scene file.")] = False,
     force_memory: ForceMemory = False,
     overrides: SetOption = None,
 ) -> None:
-    """Say whether a scene is valid and fits into memory, what a run of it would do, and what it would say at its start."""
+    """Validate a scene; estimate memory, steps, run time and disk use; list suspicious settings."""
     with wrong_input():
         chosen = choose_device(device)
         if fix:
-            _print_pairs([("fixed", line) for line in fix_file(scene) or ["nothing: every key has today's name"]])
+            _print_pairs([("fixed", line) for line in fix_file(scene) or ["nothing: no key has an old name"]])
         loaded, lines = check_scene(scene, overrides or ())
         _print_pairs(lines)
         if not force_memory:
@@ -225,18 +220,18 @@ def check(
 @app.command("tune")
 def tune_scene(
     scene: SceneArgument,
-    accuracy: Annotated[PresetName, typer.Option(help="How near to the reference run: a preset's distance from it.")] = "standard",
-    frames: Annotated[int, typer.Option(min=1, metavar="N", help="Frames of each trial run.")] = FRAMES,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where the tuned scene goes.", show_default=False)] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda:N, which is to run the scene.", show_default=False)] = None,
+    accuracy: Annotated[PresetName, typer.Option(help="Target accuracy: the preset whose error to match.")] = "standard",
+    frames: Annotated[int, typer.Option(min=1, metavar="N", help="Number of frames of each trial run.")] = FRAMES,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="File for the tuned scene.", show_default=False)] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N: the device that will run the scene.", show_default=False)] = None,
     overrides: SetOption = None,
 ) -> None:
-    """Measure which settings of a scene are the fastest for an accuracy, on its first frames."""
+    """Find the fastest settings of a scene for an accuracy, by trial runs of its first frames."""
     with wrong_input():
         chosen = choose_device(device)
         loaded = load_scene(scene, overrides or ())
         if out is not None and (out.is_dir() or not out.parent.is_dir()):
-            raise OutputError(f"--out {out}: must be a file in a folder that is there")
+            raise OutputError(f"--out {out}: must be a file in an existing folder")
         check_memory(loaded, chosen)
         try:
             tuning = tune(loaded, accuracy=accuracy, device=chosen, frames=frames, say=partial(say, Terminal(stderr=True)))
@@ -252,13 +247,13 @@ def tune_scene(
 
 @app.command()
 def scenes() -> None:
-    """List the built-in scenes with what they show."""
+    """List the built-in scenes with their descriptions."""
     with wrong_input():
         _print_pairs([(name, load_scene(name).scene.description) for name in built_in_scenes()])
 
 
 @app.command()
-def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "fluids") -> None:
+def schema(simulator: Annotated[str, typer.Option(help="Simulator whose scenes the schema describes.")] = "fluids") -> None:
     """Print the JSON schema of scene files, for editors and other programs."""
     with wrong_input():
         installed = installed_simulators()
@@ -270,30 +265,35 @@ def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "flui
 @app.command()
 def solve(
     problem: Annotated[
-        Path,
-        typer.Argument(metavar="PROBLEM", help="A.mtx, A of y = A x + b, a Matrix Market file; or a recorded problem_STEP.npz of a grid."),
+        Path, typer.Argument(metavar="PROBLEM", help="Matrix A as a Matrix Market file A.mtx, or a recorded problem_STEP.npz of a grid.")
     ],
-    right_side: Annotated[Path | None, typer.Argument(metavar="[b.mtx]", help="b, a vector.", show_default=False)] = None,
+    right_side: Annotated[Path | None, typer.Argument(metavar="[b.mtx]", help="Vector b, Matrix Market.", show_default=False)] = None,
     lower: Annotated[
-        str | None, typer.Option(metavar="NUMBER|FILE", help="Lower bounds of x; -inf for none; 0 unless given.", show_default=False)
+        str | None, typer.Option(metavar="NUMBER|FILE", help="Lower bounds of x; -inf: none. Default: 0.", show_default=False)
     ] = None,
-    upper: Annotated[
-        str | None, typer.Option(metavar="NUMBER|FILE", help="Upper bounds of x; inf unless given.", show_default=False)
-    ] = None,
+    upper: Annotated[str | None, typer.Option(metavar="NUMBER|FILE", help="Upper bounds of x. Default: inf.", show_default=False)] = None,
     method: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The fastest for A unless given.", show_default=False, autocompletion=_methods_alike)
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Method by name, such as psor. Default: the fastest for A.",
+            show_default=False,
+            autocompletion=_methods_alike,
+        ),
     ] = None,
-    tolerance: Annotated[float, typer.Option(metavar="T", help="Of the residual, relative to the one at clip(0, lower, upper).")] = 1e-6,
-    max_iterations: Annotated[int, typer.Option(metavar="N", help="The most steps.")] = 1000,
+    tolerance: Annotated[
+        float, typer.Option(metavar="T", help="Tolerance of the residual, relative to the residual at clip(0, lower, upper).")
+    ] = 1e-6,
+    max_iterations: Annotated[int, typer.Option(metavar="N", help="Maximum number of iterations.")] = 1000,
     max_seconds: Annotated[
-        float, typer.Option(metavar="S", help="The most wall time of the solve; no limit unless given.", show_default=False)
+        float, typer.Option(metavar="S", help="Maximum wall time of the solve in seconds. Default: no limit.", show_default=False)
     ] = math.inf,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where x goes: x.mtx, or x.npy of a grid.", show_default=False)] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda:N, or with --engine petsc cuda.")] = "cpu",
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="File for x: x.mtx, or x.npy for a grid.", show_default=False)] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda:N; with --engine petsc: cpu or cuda.")] = "cpu",
     engine: EngineOption = Engine.SINGLE,
     rank_timeout: RankTimeout = LIMIT,
 ) -> None:
-    """Solve a complementarity problem, y = A x + b, lower <= x <= upper: of a matrix and a vector, or one that a run has recorded."""
+    """Solve the complementarity problem y = A x + b, lower <= x <= upper, from files or as recorded by a run."""
     options: dict[str, Any] = {
         "method": method, "tolerance": tolerance, "max_iterations": max_iterations, "max_seconds": max_seconds
     }  # fmt: skip
@@ -301,7 +301,7 @@ def solve(
         launcher.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
         chosen = launcher.choose_device(device)
         if out is not None and not out.parent.is_dir():
-            raise ProblemError(f"--out {out}: there is no folder {out.parent}")
+            raise ProblemError(f"--out {out}: no such folder: {out.parent}")
         if out is not None and out.is_dir():
             raise ProblemError(f"--out {out}: is a folder; name a file")
         outcome: Outcome
@@ -309,9 +309,9 @@ def solve(
             check_recorded(problem, right_side=right_side, lower=lower, upper=upper, out=out)
             outcome = solve_recorded(problem, device=chosen, ranks=launcher.ranks, **options)
         elif engine is Engine.PETSC:
-            raise ProblemError(f"{problem}: --engine petsc solves problems of grids, which `warp-lcp run --record-problems` writes")
+            raise ProblemError(f"{problem}: --engine petsc solves only grid problems, as written by `warp-lcp run --record-problems`")
         elif right_side is None:
-            raise ProblemError(f"{problem}: is a matrix: name b too, warp-lcp solve A.mtx b.mtx")
+            raise ProblemError(f"{problem}: is a matrix: b is missing; write warp-lcp solve A.mtx b.mtx")
         else:
             outcome = solve_files(problem, right_side, device=chosen, lower=lower or "0", upper=upper or "inf", **options)
         if out is not None:
@@ -332,26 +332,27 @@ def bench(
     scene: Annotated[
         str | None,
         typer.Argument(
-            metavar="[SCENE]", help="The scene of tradeoff; its own unless given.", show_default=False, autocompletion=_scenes_alike
+            metavar="[SCENE]", help="Scene of the suite tradeoff. Default: its own.", show_default=False, autocompletion=_scenes_alike
         ),
     ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
-    out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
-    size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; may be repeated.", show_default=False)] = None,
-    repeat: Annotated[int, typer.Option(min=1, metavar="K", help="Samples of each timing.")] = 5,
+    out: Annotated[Path, typer.Option(help="Folder for SUITE.json, SUITE.md and plots.")] = Path("out/bench"),
+    size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; repeatable.", show_default=False)] = None,
+    repeat: Annotated[int, typer.Option(min=1, metavar="K", help="Number of samples of each timing.")] = 5,
     engine: Annotated[
-        Engine, typer.Option(help="petsc: scaling on 1, 2 and 4 ranks, or on those of `mpiexec -n N warp-lcp ...`.")
+        Engine, typer.Option(help="petsc: scaling on 1, 2 and 4 ranks, or on the ranks of `mpiexec -n N warp-lcp ...`.")
     ] = Engine.SINGLE,
     seed: Annotated[
-        int | None, typer.Option(metavar="N", help="With extremes: the random problems of these seeds again.", show_default=False)
+        int | None,
+        typer.Option(metavar="N", help="First seed of the random problems of the suite extremes. Default: new seeds.", show_default=False),
     ] = None,
     compare: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
+        typer.Option(metavar="A.json B.json", help="Compare two result files instead of measuring.", show_default=False),
     ] = None,
     threads: ThreadsOption = None,
 ) -> None:
-    """Measure this machine, or compare two results; says how long a suite takes on two cores, and what it needs, before it begins."""
+    """Run benchmarks, or compare two results. First prints the expected time on two cores and the packages needed."""
     installed = benchmarks()
     if suite not in installed:
         end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
@@ -369,7 +370,7 @@ def bench(
             return
         asked: dict[str, Any] = ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
         if not shared:  # every rank is here
-            tell(f"{suite}: {installed[suite].takes}", error=True)
+            tell(f"{suite}: takes about {installed[suite].takes}", error=True)
         files = installed[suite].run(
             device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, shared=shared, threads=threads, **asked
         )
@@ -388,7 +389,7 @@ def info() -> None:
     lines += [(f"device {alias}", text) for alias, text in devices().items()]
     with wrong_input():
         _use_threads(None)
-        lines.append(("CPU threads", f"{get_threads()}; --threads or WARP_LCP_THREADS chooses"))
+        lines.append(("CPU threads", f"{get_threads()}; set by --threads or WARP_LCP_THREADS"))
     lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
     _print_pairs(lines)
     with wrong_input():
@@ -403,10 +404,10 @@ def _use_threads(count: int | None) -> None:
 
 
 def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
-    """Say what was measured, and which settings are the fastest."""
+    """Print what was measured and the fastest settings."""
     rows = tuning.rows()
     tell(table_lines(rows[0], rows[1:], left=range(len(rows[0]))))
-    tell(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
+    tell(f"{tuning.frames} frames on {device}; distance: displaced fraction of the mass; reference: {tuning.reference.steps} steps")
     for line in tuning.verdict(accuracy):
         tell(line)
 
@@ -417,10 +418,10 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
 
 
 def _report(record: RunRecord, folder: Path) -> None:
-    """Say how a run ended."""
+    """Print how a run ended."""
     taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
     if record.status == "finished" and record.steps and record.resumed_from_step == record.steps:
-        tell(f"finished before, nothing was left to do: {record.reason}; {record.steps} steps, {record.time:.6g} s simulated, in {folder}")
+        tell(f"finished earlier, nothing to do: {record.reason}; {record.steps} steps, {record.time:.6g} s simulated, in {folder}")
         return
     if record.status == "finished":
         tell(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")

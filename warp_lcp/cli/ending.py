@@ -1,4 +1,4 @@
-"""How a command ends: what is wrong with its input on one line, and an exit code."""
+"""Error messages and exit codes of commands."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SHOW: Any = warnings.showwarning
 
 @contextmanager
 def wrong_input() -> Iterator[None]:
-    """Report wrong input and end the command; report old names of scene keys and go on."""
+    """Print input errors in one line and exit; print renamed scene keys and continue."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", RenamedKeyWarning)
@@ -49,6 +49,6 @@ def _show_renamed_keys(
 
 
 def end(message: str, code: int) -> NoReturn:
-    """Tell why, and end with a code."""
+    """Print a message and exit with a code."""
     tell(message, error=True)
     raise typer.Exit(code)

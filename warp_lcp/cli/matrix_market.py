@@ -1,4 +1,7 @@
-"""Matrix Market files of real numbers, read so that no file harms: SciPy's reader (1.17) ends the process where a number is cut short."""
+"""Safe reader of real Matrix Market files.
+
+SciPy's reader (1.17) ends the process where a number is cut short.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +88,7 @@ def read_market(path: Path, fits: Fits, expected: str) -> Any:
 def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[int, int, list[int]]:
     """Check a header; return rows, columns and, of a sparse matrix, its number of entries."""
     if header is None:
-        raise MarketError("it does not begin with %%MatrixMarket matrix, form, field and symmetry, and its size")
+        raise MarketError("it must begin with %%MatrixMarket matrix FORM FIELD SYMMETRY and a line with its size")
     form, field, symmetry = (header[name].lower() for name in ("form", "field", "symmetry"))
     rows, columns, *more = map(int, header["size"].split())
     if field == b"complex":
@@ -93,7 +96,7 @@ def _size(header: re.Match[bytes] | None, fits: Fits, expected: str) -> tuple[in
     if not fits(rows, columns):
         raise ValueError(f"has shape {rows} x {columns}: {expected}")
     if len(more) != (form == b"coordinate") or (form == b"array" and field == b"pattern"):
-        raise MarketError("its size is not that of its form")
+        raise MarketError("the line with its size does not fit its form")
     if symmetry != b"general" and rows != columns:
         raise MarketError(f"has shape {rows} x {columns}: symmetric matrices are square")
     return rows, columns, more
@@ -123,7 +126,7 @@ def _sparse(body: bytes, rows: int, columns: int, entries: int, symmetry: bytes,
         row, column = (table[:, axis].astype(kind) - 1 for axis in range(2))
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     if not (inside & (row + 1.0 == table[:, 0]) & (column + 1.0 == table[:, 1])).all():
-        raise MarketError(f"an entry is not in one of the rows 1 to {rows} and columns 1 to {columns}")
+        raise MarketError(f"an entry is outside of rows 1 to {rows} and columns 1 to {columns}")
     value = np.ones(entries) if pattern else table[:, 2]
     if symmetry != b"general":
         other = row != column
@@ -148,9 +151,9 @@ def _numbers(body: bytes, count: int, what: str, needed: int) -> np.ndarray:
             warnings.simplefilter("error", DeprecationWarning)  # so NumPy says that something is no number
             found = np.fromstring(body, dtype=np.float64, sep=" ") if body.strip() else np.zeros(0)
     except (DeprecationWarning, ValueError) as error:
-        raise MarketError("it holds something that is no number") from error
+        raise MarketError("it holds an entry that is not a number") from error
     if len(found) != count:
-        raise MarketError(f"it holds {len(found)} numbers, {what} are {count}")
+        raise MarketError(f"it holds {len(found)} numbers, expected {count} for {what}")
     return found
 
 
@@ -178,7 +181,7 @@ def _text(path: Path, most: int | None = None) -> bytes:
                 return bytes(stream.read(most))
             text: bytes = stream.read(-1 if free is None else free // COPIES)
             if free is not None and stream.read(1):
-                raise ClaimError("what is packed in it does not fit the free memory")
+                raise ClaimError("its unpacked content does not fit into the free memory")
     except (EOFError, zlib.error, MemoryError) as error:
         raise MarketError(f"cannot be unpacked: {error}") from error
     return text

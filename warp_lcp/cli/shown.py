@@ -1,4 +1,4 @@
-"""The commands that show what a run writes: `render`, `view`, `serve`, the last two while it is at work too; and `export`."""
+"""Commands that show or convert a run: render, view, serve, export."""
 
 from __future__ import annotations
 
@@ -24,65 +24,63 @@ from warp_lcp.run.devices import devices
 from warp_lcp.run.progress import Count, Observer
 from warp_lcp.run.terminal import Terminal, say, tell
 
-RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]
+RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Run folder.")]
 ShowOption = Annotated[
     Show | None,
-    typer.Option(
-        help="What is shown; the surface where a run of liquid wrote one, else particles; bodies where the run has only those.",
-        show_default=False,
-    ),
+    typer.Option(help="Parts to show. Default: the surface if the run wrote one, else particles, else bodies.", show_default=False),
 ]
 ColorOption = Annotated[
-    Color | None, typer.Option(help="What colors the particles, on one scale for the whole run; speed unless given.", show_default=False)
+    Color | None, typer.Option(help="Color of the particles, on one scale for the whole run. Default: speed.", show_default=False)
 ]
 CameraOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; may be repeated.")
+    list[str] | None, typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; repeatable.")
 ]
 
 
 def render(
     folder: RunArgument,
     frame: Annotated[
-        list[int] | None, typer.Option(metavar="N", help="Draw frame N, counted from the end if negative; may be repeated.")
+        list[int] | None, typer.Option(metavar="N", help="Frame to draw; negative: from the end; repeatable. Default: all.")
     ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image; a sheet may be less high.")] = "1280x720",
-    out: Annotated[Path | None, typer.Option(help="The images' folder; DIR/images unless given.", show_default=False)] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Image size in pixels; a sheet may be lower.")] = "1280x720",
+    out: Annotated[Path | None, typer.Option(help="Folder for images. Default: DIR/images.", show_default=False)] = None,
     show: ShowOption = None,
     color: ColorOption = None,
-    sheet: Annotated[bool, typer.Option("--sheet", help="Draw the frames, or six of them, side by side into sheet.png.")] = False,
+    sheet: Annotated[bool, typer.Option("--sheet", help="Draw the chosen frames, or six of all, side by side into sheet.png.")] = False,
     film: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw all frames into FILE, an .mp4 or a .gif that repeats.", show_default=False)
+        Path | None, typer.Option(metavar="FILE", help="Draw all frames into a film, .mp4 or (repeating) .gif.", show_default=False)
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames a second of the film; the scene's unless given.", show_default=False)] = None,
-    cut: Annotated[bool, typer.Option("--slice", help="Draw a section with Matplotlib, which needs no pyvista.")] = False,
+    fps: Annotated[float | None, typer.Option(help="Frames per second of the film. Default: the scene's.", show_default=False)] = None,
+    cut: Annotated[bool, typer.Option("--slice", help="Draw a cross-section with Matplotlib, without pyvista.")] = False,
     at: Annotated[
-        float | None, typer.Option(metavar="Z", help="Where a 3-D run is cut, in meters; in its middle unless given.", show_default=False)
+        float | None,
+        typer.Option(metavar="Z", help="Position z of the cross-section of a 3-D run, in meters. Default: the middle.", show_default=False),
     ] = None,
     overrides: CameraOption = None,
 ) -> None:
-    """Draw a run's frames as PNG images or as a film (needs the extra `render`)."""
+    """Draw the frames of a run as PNG images or as a film (needs the extra `render`)."""
     devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
     console = Terminal(stderr=True)
 
     def estimated(seconds: float) -> None:
-        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))} of a core")
+        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))} on one core")
 
     with wrong_input(), Count(console, "drawing", "images") as told:
         looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
         if film is not None:
             if frame or sheet or out:
-                raise RenderError("--film: shows all frames in one file; leave out --frame, --sheet and --out")
+                raise RenderError("--film: draws all frames into one file; cannot be combined with --frame, --sheet or --out")
             count = len(list(film_run(folder, film, looks=looks, rate=check_rate(fps), told=told, estimated=estimated)))
             tell(f"{film}: {count} frames")
             return
         if fps is not None:
-            raise RenderError("--fps: is of a film; give --film")
+            raise RenderError("--fps: needs --film")
         images = list(render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet, told=told, estimated=estimated))
     tell(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
 
 
 def view(folder: RunArgument, show: ShowOption = None, color: ColorOption = None, overrides: CameraOption = None) -> None:
-    """Show a run in a window, frames as they come: Space plays, arrows step, the mouse turns (needs a display and the extra `render`)."""
+    """Show a run in a window, also while it is in progress (needs a display and the extra `render`)."""
     devices()
     with wrong_input():
         view_run(folder, Looks(color=color, show=show, overrides=overrides or ()))
@@ -90,14 +88,14 @@ def view(folder: RunArgument, show: ShowOption = None, color: ColorOption = None
 
 def serve(
     folder: RunArgument,
-    port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="Of the loopback address; 0 takes a free one.")] = PORT,
+    port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="Port on the loopback address; 0: any free one.")] = PORT,
     show: ShowOption = None,
 ) -> None:
-    """Show a run on a page in the browser: its frames as they come, and plots of its log; Ctrl-C ends it."""
+    """Show frames and log of a run on a web page, also while it is in progress; Ctrl-C ends it."""
     devices()
     with wrong_input():
         if not folder.is_dir():
-            raise RenderError(f"{folder}: there is no such folder; name the folder of a run, which may have just begun")
+            raise RenderError(f"{folder}: no such folder; expected the folder of a run, finished or in progress")
         server = live_server(folder, port=port, show=show)
     with server:
         tell(f"{folder}: {server.address}  (Ctrl-C ends)")
@@ -107,12 +105,12 @@ def serve(
 
 def export(
     folder: RunArgument,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="A .usdc, .usda (text) or .usd file.", show_default=False)],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="USD file: .usdc, .usda (text) or .usd.", show_default=False)],
     show: ShowOption = None,
-    first: Annotated[int | None, typer.Option(metavar="N", help="The first frame; the run's unless given.", show_default=False)] = None,
-    last: Annotated[int | None, typer.Option(metavar="N", help="The last frame; the run's unless given.", show_default=False)] = None,
+    first: Annotated[int | None, typer.Option(metavar="N", help="First frame. Default: the first of the run.", show_default=False)] = None,
+    last: Annotated[int | None, typer.Option(metavar="N", help="Last frame. Default: the last of the run.", show_default=False)] = None,
 ) -> None:
-    """Write a run's frames into one USD file, for Blender, Houdini and Maya (needs the extra `usd`)."""
+    """Write the frames of a run to one USD file, for Blender, Houdini and Maya (needs the extra `usd`)."""
     devices()
     with wrong_input(), Count(Terminal(stderr=True), "writing", "frames") as told:
         count = len(list(export_run(folder, out, show=show, first=first, last=last, told=told)))
@@ -120,7 +118,7 @@ def export(
 
 
 class _Begun:
-    """An observer that passes on what it learns, and does something once the run begins."""
+    """Observer that forwards all events and calls a function at the start."""
 
     def __init__(self, observer: Observer, begin: Callable[[], None]) -> None:
         self._observer, self._begin = observer, begin
@@ -129,14 +127,14 @@ class _Begun:
         return getattr(self._observer, name)
 
     def start(self, time: float, end: float) -> None:
-        """Learn the time [s] that the run begins and ends at."""
+        """Forward start and end time [s], and call the function."""
         self._observer.start(time, end)
         self._begin()
 
 
 @contextmanager
 def looked_on(observer: Observer, folder: Path, *, page: bool, window: bool) -> Iterator[Observer]:
-    """Serve a page of a run, or show it in a window of a process of its own, from when its folder is there; the window stays."""
+    """Serve a web page of a run, or open a window in another process, once the run folder exists; the window stays open."""
     with ExitStack() as stack:
 
         def begin() -> None:

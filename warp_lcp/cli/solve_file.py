@@ -33,7 +33,7 @@ FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was solved and how it went.
+    """Result of a solve and the problem solved.
 
     Attributes:
         problem: the problem.
@@ -106,7 +106,7 @@ def solve_files(
         upper: likewise.
         method: a name in `METHODS`; what `wl.solve` chooses if None.
         tolerance: of the residual, relative to the one at clip(0, lower, upper).
-        max_iterations: the most steps.
+        max_iterations: maximum number of steps.
         max_seconds: the most wall time of the solve.
         device: a Warp device.
 
@@ -229,7 +229,7 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
     side = huge_as_infinite(read_vector(Path(value), n, infinite=True) if number is None else np.asarray(number))
     wrong = np.inf if option == "--lower" else -np.inf
     if (side == wrong).any():
-        raise ProblemError(f"{option} {value}: {wrong}, or a magnitude of 1e20 and more, which is infinite: no x could meet it")
+        raise ProblemError(f"{option} {value}: is {wrong} (1e20 and more count as infinite): no x could meet it")
     return side if side.ndim else float(side)
 
 
@@ -239,7 +239,7 @@ def method_named(name: str, family: str, *, shared: bool = False) -> Any:
         raise ProblemError(f"--method {name}: no such method; {METHODS.nearest(name)}")
     fits = [known for known, kind in METHODS.items() if family in families(kind) and (not shared or getattr(kind, "distributed", False))]
     if name not in fits:
-        what = "work on several ranks" if shared else "take grids" if family == "grid" else f"take {family} matrices"
+        what = "work on several ranks" if shared else "solve grid problems" if family == "grid" else f"accept {family} matrices"
         raise ProblemError(f"--method {name}: does not {what}; choose from {', '.join(fits)}")
     try:
         return METHODS[name]()

@@ -1,4 +1,7 @@
-"""A problem of a grid from a file that `run --record-problems` wrote, solved by this process or by the ranks: `warp-lcp solve FILE.npz`."""
+"""Solve a recorded grid problem: `warp-lcp solve FILE.npz`.
+
+The file is written by `run --record-problems`; this process or ranks solve it.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ FIELD = ".npy"  # of their solutions
 
 @dataclass(frozen=True)
 class GridOutcome(Outcome):
-    """What was solved and how it went.
+    """Result of a solve and the grid problem solved.
 
     Attributes:
         shape: of the whole grid's cells, (nz, ny, nx) or (ny, nx).
@@ -54,7 +57,9 @@ class GridOutcome(Outcome):
         return f"{line}, ranks: {self.decomposition.ranks.size}, {boxes} boxes"
 
     def write(self, path: Path) -> None:
-        """Write x as a NumPy array of the shape of the cells; on ranks collective, the first one writes what the others send.
+        """Write x as a NumPy array of the shape of the cells; collective.
+
+        The first rank writes the parts of all.
 
         Raises:
             ProblemError: the file cannot be written.
@@ -86,7 +91,7 @@ def solve_recorded(
         path: the file.
         method: a name in `METHODS`; the default method for grids if None.
         tolerance: of the residual, relative to the one at clip(0, lower, upper).
-        max_iterations: the most steps.
+        max_iterations: maximum number of steps.
         max_seconds: the most wall time of the solve.
         device: a Warp device.
         ranks: who solve it together, each of them its own box of cells; collective. None: this process alone.
@@ -119,11 +124,11 @@ def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, up
         if value is not None:
             raise ProblemError(f"--{option} {value}: {path} has bounds of its own")
     if out is not None and out.suffix != FIELD:
-        raise ProblemError(f"--out {out}: x of a grid becomes a NumPy array: name a {FIELD} file")
+        raise ProblemError(f"--out {out}: x of a grid is written as a NumPy array: the name must end in {FIELD}")
 
 
 def file_digest(path: Path) -> str | None:
-    """Return what tells a file's content from another's; None if it cannot be read, or has no end as a device has none."""
+    """Return a digest of a file's content; None if it cannot be read."""
     if not path.is_file():
         return None
     try:
@@ -166,7 +171,7 @@ def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decompositio
 
     comm, boxes = decomposition.ranks.comm, decomposition.boxes
     if not decomposition.ranks.is_root:
-        with waiting("the root rank, which writes"):
+        with waiting("writing by the root rank"):
             comm.Send(np.ascontiguousarray(x, dtype=np.float64), dest=0)
         return
     with replacing_by_name(path) as temporary:

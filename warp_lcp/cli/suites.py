@@ -1,4 +1,4 @@
-"""What the command line asks of a suite of benchmarks, and how it finds one: the entry-point group `warp_lcp.benchmarks`."""
+"""Interface of benchmark suites, found by the entry-point group `warp_lcp.benchmarks`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ GROUP = "warp_lcp.benchmarks"
 
 @runtime_checkable
 class Benchmark(Protocol):
-    """A suite of measurements: its name, what it measures, and how long it takes and what it needs."""
+    """Benchmark suite: name, quantities measured, expected time and packages needed."""
 
     name: str
     summary: str
@@ -30,7 +30,7 @@ class Benchmark(Protocol):
         shared: bool = False,
         threads: int | None = None,
     ) -> list[Path]:
-        """Measure, and return the files written to `out`: NAME.json, NAME.md and plots.
+        """Run the benchmark and return the files written to `out`: NAME.json, NAME.md and plots.
 
         Args:
             device: Warp device.
@@ -48,10 +48,10 @@ class Benchmark(Protocol):
         """
 
     def compare(self, old: Path, new: Path) -> str:
-        """Return a table of the figures in two results with the bounds of noise.
+        """Return a table that compares two results, with noise bounds.
 
         Raises:
-            ValueError: a file is no result of a suite.
+            ValueError: a file is not a result of a suite.
         """
 
 
@@ -61,5 +61,5 @@ def benchmarks() -> dict[str, Benchmark]:
 
 
 def suite_names() -> list[str]:
-    """Return the names of the installed suites, which are not loaded."""
+    """Return the names of the installed suites without loading them."""
     return sorted({entry.name for entry in entry_points(group=GROUP)})

@@ -48,13 +48,13 @@ def tree_of(joints: Sequence[Joint], bodies: int) -> list[int]:
     """
     own = {joint.first: number for number, joint in enumerate(joints)}
     if sorted(joint.first for joint in joints) != list(range(bodies)) or any(joint.kind != "hinge" for joint in joints):
-        raise ValueError("each body needs one hinge in which it comes first, and there must be no other joints")
+        raise ValueError("every body must be the first body of exactly one hinge, and there must be no other joints")
     order: list[int] = []
     while len(order) < bodies:
         placed = {joints[number].first for number in order} | {WORLD}
         more = [number for body, number in sorted(own.items()) if body not in placed and joints[number].second in placed]
         if not more:
-            raise ValueError("hinges must form trees that hang on what stands; some form a ring")
+            raise ValueError("hinges must form trees rooted at fixed solids or in space; some form a loop")
         order += more
     return order
 

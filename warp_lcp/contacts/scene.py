@@ -17,7 +17,7 @@ from warp_lcp.scene.scene import MOST_CELLS, Domain, Output, Scene
 from warp_lcp.scene.table import Complaint, Table, Vector, counted
 from warp_lcp.settings import Count, Positive, Share
 
-NO_MATERIAL = "there is no material: bodies are all that moves"
+NO_MATERIAL = "there is no material, only bodies move"
 
 
 class ContactDomain(Domain):
@@ -29,11 +29,11 @@ class ContactDomain(Domain):
 class ContactSolver(Table):
     """[solver]: solution for the contact impulses."""
 
-    preset: PresetName | None = Field(default=None, description="not for bodies alone")
+    preset: PresetName | None = Field(default=None, description="unused with bodies alone")
     method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE] = Field(
         default=DEFAULT,
-        description="sweeps-and-newton: as for bodies in liquids; from lemke on: friction model of Stewart and Trinkle; "
-        f"proximal-gauss-seidel: circular cone; others: boxes; with joints {JOINTED}, unless given",
+        description="sweeps-and-newton: as for bodies in liquids; lemke and after: friction model of Stewart and Trinkle; "
+        f"proximal-gauss-seidel: circular cone; others: boxed friction; default with joints: {JOINTED}",
     )
     directions: int = Field(
         default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle in 3-D, even"
@@ -46,8 +46,8 @@ class ContactSolver(Table):
 class ContactOutput(Output):
     """[output]: files besides the surfaces of the bodies."""
 
-    particles: bool = Field(default=False, description="not for bodies alone")
-    grid: bool = Field(default=False, description="not for bodies alone")
+    particles: bool = Field(default=False, description="unused with bodies alone")
+    grid: bool = Field(default=False, description="unused with bodies alone")
 
 
 class JointTable(Table):
@@ -57,14 +57,14 @@ class JointTable(Table):
     solids: list[int] = Field(
         min_length=1,
         max_length=2,
-        description="numbers of [[solid]] tables from 0: a rigid body, and a body or standing solid; one number: in space",
+        description="numbers of [[solid]] tables from 0: a rigid body, and a body or fixed solid; one number: joint to space",
     )
     anchor: Vector = Field(description="anchor in the initial pose [m]")
     axis: Vector | None = Field(default=None, description="axis of a hinge in 3-D; z in 2-D")
     limits: list[float] | None = Field(
         default=None, min_length=2, max_length=2, description="least and largest angle of a hinge, 0 in the initial pose [degrees]"
     )
-    motor_speed: float | None = Field(default=None, description="speed that the motor of a hinge aims at [degrees/s]")
+    motor_speed: float | None = Field(default=None, description="target speed of the motor of a hinge [degrees/s]")
     motor_torque: Positive | None = Field(default=None, description="largest torque of the motor [N m]")
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
@@ -74,7 +74,9 @@ class JointTable(Table):
             if not 0 <= number < len(solids):
                 found.append(Complaint(("solids",), self.solids, f"must be numbers of [[solid]]s, from 0 to {len(solids) - 1}"))
             elif solids[number].motion is not None:
-                found.append(Complaint(("solids",), self.solids, f"solid[{number}] has a motion: what bodies are joined to stands"))
+                found.append(
+                    Complaint(("solids",), self.solids, f"solid[{number}] has a motion: bodies can be joined only to a fixed solid")
+                )
         if not found and not solids[self.solids[0]].is_body:
             found.append(Complaint(("solids",), self.solids, "the first must be a rigid body: give it a density or a mass"))
         if len(set(self.solids)) < len(self.solids):
@@ -85,15 +87,15 @@ class JointTable(Table):
                 found.append(Complaint((key,), value, f"must {counted(dimension)} in {dimension}-D"))
         for key in ("axis", "limits", "motor_speed", "motor_torque"):
             if not hinge and getattr(self, key) is not None:
-                found.append(Complaint((key,), getattr(self, key), f"is of hinges: this joint is {self.kind}"))
+                found.append(Complaint((key,), getattr(self, key), f"is only for hinges: this joint is {self.kind}"))
         if (self.motor_speed is None) != (self.motor_torque is None):
-            found.append(Complaint(("motor_torque",), self.motor_torque, "needs motor_speed, and motor_speed needs it"))
+            found.append(Complaint(("motor_torque",), self.motor_torque, "must be given together with motor_speed"))
         if hinge and dimension == 3 and (self.axis is None or not any(self.axis)):
-            found.append(Complaint(("axis",), self.axis, "of a hinge in 3-D must be given, and not zero"))
+            found.append(Complaint(("axis",), self.axis, "must be given for a hinge in 3-D, and not be zero"))
         if hinge and dimension == 2 and self.axis is not None:
-            found.append(Complaint(("axis",), self.axis, "is z in 2-D: leave it out"))
+            found.append(Complaint(("axis",), self.axis, "must be left out in 2-D, where it is z"))
         if self.kind == "ball" and dimension == 2:
-            found.append(Complaint(("kind",), self.kind, "is a hinge in 2-D"))
+            found.append(Complaint(("kind",), self.kind, "must be hinge in 2-D"))
         if self.limits is not None and not -180.0 <= self.limits[0] <= self.limits[1] <= 180.0:
             found.append(Complaint(("limits",), self.limits, "must be in order and within 180 degrees"))
         return found
@@ -178,14 +180,18 @@ class ContactScene(Scene):
             found.append(Complaint(("physics", "density"), self.physics.density, f"{NO_MATERIAL}; density is a key of each [[solid]]"))
         for key, usual in (("wall", "separating"), ("solids", "cut-cell"), ("follow", True)):
             if getattr(self.domain, key) != usual:
-                found.append(Complaint(("domain", key), getattr(self.domain, key), f"has no meaning here: {NO_MATERIAL}"))
+                found.append(Complaint(("domain", key), getattr(self.domain, key), f"must be left out: {NO_MATERIAL}"))
         if self.solver.preset is not None:
-            found.append(Complaint(("solver", "preset"), self.solver.preset, "not for bodies alone: give time.dt_max and solver.tolerance"))
+            found.append(
+                Complaint(
+                    ("solver", "preset"), self.solver.preset, "must be left out for bodies alone: give time.dt_max and solver.tolerance"
+                )
+            )
         if self.solver.precision != "double":
             found.append(Complaint(("solver", "precision"), self.solver.precision, "must be double"))
         if self.solver.directions != 4 and self.solver.method not in STEWART_TRINKLE:
-            others = "takes the circular cone" if self.solver.method in CONE else "takes friction in boxes"
-            message = f"is of the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} {others}"
+            others = "uses the circular cone" if self.solver.method in CONE else "uses the boxed friction model"
+            message = f"is only for the methods {', '.join(STEWART_TRINKLE)}; {self.solver.method} {others}"
             found.append(Complaint(("solver", "directions"), self.solver.directions, message))
         return found + (self._joint_complaints() if self.joint else []) + (self._target_complaints() if self.target else [])
 
@@ -197,7 +203,7 @@ class ContactScene(Scene):
             for c in table.complaints(self.dimension, self.solid)
         ]
         if self.solver.method not in KINEMATIC:
-            message = f"is not for inverse kinematics; choose from {', '.join(KINEMATIC)}"
+            message = f"cannot be used for inverse kinematics; choose from {', '.join(KINEMATIC)}"
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         for index, table in enumerate(self.joint):
             if table.motor_torque is not None:
@@ -220,7 +226,7 @@ class ContactScene(Scene):
             message = f"cannot solve joints, which are equations; choose from {', '.join((*BOXED, *STEWART_TRINKLE))}"
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.domain.open:
-            found.append(Complaint(("domain", "open"), self.domain.open, "must be left out: a scene with joints has closed sides"))
+            found.append(Complaint(("domain", "open"), self.domain.open, "must be left out in a scene with joints"))
         for index, solid in enumerate(self.solid):
             if solid.restitution:
                 found.append(Complaint(("solid", index, "restitution"), solid.restitution, "must be 0 where there are joints"))

@@ -95,7 +95,7 @@ class ContactSimulation:
         """
         missing = {"clock", "step_count", "bodies"} - set(state)
         if missing:
-            raise ValueError(f"the state is not one of bodies alone: it has no {', '.join(sorted(missing))}")
+            raise ValueError(f"the state does not belong to a scene of bodies alone: it lacks {', '.join(sorted(missing))}")
         self.bodies.restore(state)
         self.time, self._last_dt = (float(value) for value in state["clock"])
         self.step_count = int(state["step_count"])
@@ -104,7 +104,7 @@ class ContactSimulation:
         """Return facts for the start of a run, and settings that look like mistakes."""
         sides = " x ".join(f"{side:g}" for side in self.scene.domain.size)
         count = len(self.bodies.bodies)
-        room = "a domain without far ends" if self.scene.domain.boundless else f"{sides} m"
+        room = "an unbounded domain" if self.scene.domain.boundless else f"{sides} m"
         return [f"{count} rigid {'body' if count == 1 else 'bodies'} in {room}", *self.scene.notes()]
 
     def _row(self, dt: float, status: str) -> dict[str, float | int | str | None]:

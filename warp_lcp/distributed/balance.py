@@ -154,7 +154,7 @@ class Balance:
         everyone = part.ranks.collect(load.best(part.ranks.size, now.parts, rank=part.ranks.rank))
         least, cut = min((found for found in everyone if found is not None), default=(math.inf, now.parts))  # none end between blocks
         gains = cut != now.parts and max(work) + fixed > self.bound * (least + fixed)
-        return now.cut_anew(cut) if gains else None
+        return now.repartition(cut) if gains else None
 
 
 def edge_of_blocks(counts: Triple, ranks: int) -> int:

@@ -44,20 +44,20 @@ class Failure:
 
 
 class Collective:
-    """Blocks that all ranks enter, and leave in the same way.
+    """Collective blocks of code: an exception on one rank is raised on all ranks.
 
-    At the end of a block the ranks meet and tell each other how it went. If it failed on some, all raise: the error's own kind if that is
-    among `planned`, with a message that names the rank; else `RankFailed`. A rank that failed while the others are in the midst of a
-    collective operation, which it will not take part in, waits PATIENCE seconds for them and then ends all processes.
+    At the end of a block the ranks exchange its outcome. If it failed on some ranks, all raise: the error's own class if that is
+    among `planned`, with a message that names the rank; else `RankFailed`. If a rank fails while the others are inside a
+    collective operation, it waits PATIENCE seconds for them and then aborts all processes.
 
     Args:
-        ranks: who meet.
-        planned: kinds of errors whose message is enough.
-        last_words: takes the message before the processes are ended.
+        ranks: the ranks.
+        planned: expected errors, which are reported without a traceback.
+        last_words: called with the message before the processes are aborted.
 
     Attributes:
         failed: the ranks on which the last block failed.
-        watchdog: that sees to it that no rank waits for ever, where there is one.
+        watchdog: deadlock watchdog, or None.
 
     >>> alone = Collective.of_one()
     >>> with alone.together():
@@ -81,27 +81,30 @@ class Collective:
 
     @classmethod
     def of_one(cls) -> Collective:
-        """Return that of a process that has no others, which needs no MPI."""
+        """Return the collective of a single process; needs no MPI."""
         return cls(Ranks(SimpleNamespace(rank=0, size=1)))
 
     def together(self) -> AbstractContextManager[None]:
-        """Return the context of what all ranks do."""
+        """Return the context of a block that all ranks execute."""
         return self._block(named=True)
 
     def led(self) -> AbstractContextManager[None]:
-        """Return the context of what the root rank does for all; its message speaks for itself."""
+        """Return the context of a block that the root rank executes for all."""
         return self._block(named=False)
 
     def exchange(self, value: Any) -> list[Any]:
-        """Return what each rank has given."""
+        """Return an object of every rank."""
         return self._own.collect(value)
 
     def share(self, value: Any) -> Any:
-        """Return what the root rank has given."""
+        """Return the object of the root rank."""
         return self._own.share(value)
 
     def share_of_device(self, device: str) -> float:
-        """Return what part of the work is on this rank's device, which others of its machine may have too."""
+        """Return the fraction of the work on this rank's device.
+
+        Other ranks of the same machine may use the same device.
+        """
         places = self.exchange((socket.gethostname(), device))
         return places.count(places[self.ranks.rank]) / len(places)
 
@@ -172,15 +175,15 @@ class Collective:
 
     def _end_all(self, error: BaseException) -> None:
         text = str(error) if isinstance(error, self._planned) else "".join(traceback.format_exception(error)).rstrip()
-        self.end_all(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks end")
+        self.end_all(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks are aborted")
 
     def told_as(self, error: BaseException) -> BaseException:
-        """Return another error that is to take the place of what a block has raised; all ranks know of it."""
+        """Return the error to raise in place of a block's error; the same on all ranks."""
         self._told = error
         return error
 
     def end_all(self, text: str) -> None:
-        """End all processes, wherever they are, with a message."""
+        """Abort all processes on all machines, with a message."""
         self.last_words(text)
         self.ranks.comm.Abort(1)
 

@@ -16,6 +16,7 @@ import numpy as np
 from warp_lcp.distributed.collective import Collective
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.settings import renamed_method
 
 UNEVEN = 1.125  # the largest part may exceed an even share by this factor, so that cuts lie at multiples of large powers of two
 
@@ -24,56 +25,56 @@ Triple = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class CellBox:
-    """Cells from `low` up to `high`, exclusive, along x, y, z."""
+    """Box of cells from `low` to `high` (exclusive) along x, y, z."""
 
     low: Triple
     high: Triple
 
     @classmethod
     def of(cls, low: Iterable[int], high: Iterable[int]) -> CellBox:
-        """Return the box between two corners of any type."""
+        """Return the box between two corners given as any sequences."""
         (a, b, c), (d, e, f) = low, high
         return cls((int(a), int(b), int(c)), (int(d), int(e), int(f)))
 
     @property
     def counts(self) -> Triple:
-        """Cells along x, y, z; 0 where the box is empty."""
+        """Number of cells along x, y, z; 0 if the box is empty."""
         nx, ny, nz = (max(h - l, 0) for l, h in zip(self.low, self.high, strict=True))
         return nx, ny, nz
 
     @property
     def cells(self) -> int:
-        """How many cells it has."""
+        """Number of cells."""
         return math.prod(self.counts)
 
     @property
     def slices(self) -> tuple[slice, slice, slice]:
-        """Where it lies in an array (nz, ny, nx) of all cells."""
+        """Slices of the box in an array (nz, ny, nx) of all cells."""
         x, y, z = (slice(l, h) for l, h in zip(self.low, self.high, strict=True))
         return z, y, x
 
     def grown(self, width: int) -> CellBox:
-        """Return the box with so many cells more on all sides."""
+        """Return the box enlarged by a number of cells on all sides."""
         return CellBox.of((l - width for l in self.low), (h + width for h in self.high))
 
     def common(self, other: CellBox) -> CellBox:
-        """Return the cells that are in both."""
+        """Return the intersection with another box."""
         return CellBox.of(map(max, self.low, other.low), map(min, self.high, other.high))
 
     def moved(self, by: Sequence[int], sign: int = 1) -> CellBox:
-        """Return the box moved by so many cells along x, y, z, or back."""
+        """Return the box shifted by a number of cells along x, y, z, or back."""
         return CellBox.of(*([a + sign * b for a, b in zip(corner, by, strict=True)] for corner in (self.low, self.high)))
 
 
 class Decomposition:
-    """Boxes of a grid's cells, one a rank, as a DMDA of PETSc has them.
+    """Domain decomposition: one box of cells per rank, as in a DMDA of PETSc.
 
     Args:
         counts: cells (nx, ny, nz) of the whole grid; nz = 1 in 2-D.
-        ranks: who share them.
-        processes: ranks along x, y, z; None: those with the least cells at cuts.
+        ranks: the ranks.
+        processes: ranks along x, y, z; None: those with the fewest cells at cuts.
         cuts: cells of each box along x, y, z; None: even ones, with cuts at multiples of a power of two.
-        periodic: axes without an end.
+        periodic: periodic axes.
 
     Attributes:
         boxes: of all ranks.
@@ -89,27 +90,32 @@ class Decomposition:
         self.counts, self.ranks, self.periodic = counts, ranks, tuple(periodic)
         self.processes = processes or _processes(counts, ranks.size)
         if math.prod(self.processes) != ranks.size:
-            raise ValueError(f"processes = {self.processes}: their product must be the number of ranks, {ranks.size}")
+            raise ValueError(f"processes = {self.processes}: the product must be the number of ranks, {ranks.size}")
         self.parts = [list(c) for c in cuts] if cuts else [parts(n, p) for n, p in zip(counts, self.processes, strict=True)]
         starts = [[0, *itertools.accumulate(part)] for part in self.parts]
         places = map(self.place, range(ranks.size))
         self.boxes = [CellBox.of(*([s[p + n] for s, p in zip(starts, place, strict=True)] for n in range(2))) for place in places]
 
-    def cut_anew(self, cuts: Sequence[Sequence[int]]) -> Decomposition:
-        """Return other boxes of the same cells and ranks, as many along x, y, z as there are cells of each in `cuts`."""
+    def repartition(self, cuts: Sequence[Sequence[int]]) -> Decomposition:
+        """Return a decomposition of the same cells and ranks with other box sizes.
+
+        `cuts` holds the cells of each box along x, y, z.
+        """
         px, py, pz = map(len, cuts)
         other = Decomposition(self.counts, self.ranks, processes=(px, py, pz), cuts=cuts, periodic=self.periodic)
         other.collective = self.collective  # a communicator of its own for each would use them up
         return other
 
+    cut_anew = renamed_method("cut_anew", repartition)
+
     def place(self, rank: int) -> Triple:
-        """Return where a rank is among the ranks along x, y, z, as DMDA numbers them."""
+        """Return the position of a rank among the ranks along x, y, z (DMDA order)."""
         px, py, _ = self.processes
         return rank % px, rank // px % py, rank // (px * py)
 
     @property
     def box(self) -> CellBox:
-        """The box of this rank's cells."""
+        """Box of this rank's cells."""
         return self.boxes[self.ranks.rank]
 
     @property
@@ -119,12 +125,15 @@ class Decomposition:
 
     @property
     def joined(self) -> tuple[int, ...]:
-        """Axes without an end along which there is more than one rank: the boxes at their sides are neighbors."""
+        """Periodic axes with more than one rank: boxes at opposite sides are neighbors."""
         return tuple(axis for axis in self.cut_axes if axis in self.periodic)
 
     @property
     def shifts(self) -> list[Triple]:
-        """The cells along x, y, z by which other ranks' cells come again around a box: none first."""
+        """Periodic shifts in cells along x, y, z; the first is zero.
+
+        Neighboring cells appear once for each shift.
+        """
         return self._shifts(self.joined)
 
     def _shifts(self, axes: Sequence[int]) -> list[Triple]:
@@ -132,11 +141,14 @@ class Decomposition:
         return [(x, y, z) for x in each[0] for y in each[1] for z in each[2]]
 
     def meet(self, box: CellBox, other: CellBox) -> bool:
-        """Tell whether two boxes have cells in common, also where axes without an end have led one of them around."""
+        """Return whether two boxes share cells, periodic images included."""
         return any(box.moved(shift).common(other).cells for shift in self._shifts(self.periodic))
 
     def neighbor(self, axis: int, side: int) -> int | None:
-        """Return the rank beyond this one's lower (0) or upper (1) side along an axis; None where the domain ends."""
+        """Return the neighbor rank at the lower (0) or upper (1) side along an axis.
+
+        None at a side of the domain.
+        """
         place = list(self.place(self.ranks.rank))
         place[axis] += 2 * side - 1
         if axis in self.joined:
@@ -147,7 +159,10 @@ class Decomposition:
         return place[0] + px * (place[1] + py * place[2])
 
     def coarser(self, factors: Triple) -> Decomposition | None:
-        """Return the boxes of aggregates of so many cells along x, y, z; None if an aggregate would be cut, or a rank left without."""
+        """Return the decomposition of aggregates of cells along x, y, z.
+
+        None if a box boundary would cut an aggregate, or a rank would have no cells.
+        """
         new = []
         for part, factor in zip(self.parts, factors, strict=True):
             if len(part) > 1 and (any(m % factor for m in part[:-1]) or -(-part[-1] // factor) < 1 or min(part) < factor):
@@ -158,19 +173,19 @@ class Decomposition:
 
     @cached_property
     def halo(self) -> Any:
-        """What fills one layer of ghost cells, made once for all operators on these boxes."""
+        """Halo exchange of one ghost layer, shared by all operators on these boxes."""
         from warp_lcp.distributed.halo import Halo
 
         return Halo(self, 1)
 
     @cached_property
     def collective(self) -> Collective:
-        """Blocks of code that the ranks leave alike: what fails on one fails on all."""
+        """Collective blocks: an exception on one rank is raised on all."""
         return Collective(self.ranks, planned=(ValueError, OSError), last_words=sys.stderr.write)
 
     @cached_property
     def dmda(self) -> Any:
-        """The same as a DMDA of PETSc: one number a cell, 7-point stencils."""
+        """DMDA of PETSc with these boxes: one value per cell, 7-point stencils."""
         PETSc = petsc()
         made = PETSc.DMDA().create(
             dim=3, dof=1, sizes=self.counts, proc_sizes=self.processes, ownership_ranges=self.parts, stencil_width=1,

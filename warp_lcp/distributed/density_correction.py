@@ -12,22 +12,22 @@ from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import Trail, Window
-from warp_lcp.material.density_correction import Crowding, DensityCorrection
+from warp_lcp.grid.staggered import DirtyRegion, Window
+from warp_lcp.material.density_correction import DensityCorrection, DensityMonitor
 from warp_lcp.rows.vectors import convert
 
 
-class SharedCrowding(Crowding):
+class SharedDensityMonitor(DensityMonitor):
     """How much of the material of all ranks is in over-full cells; `measure` and `found` are collective.
 
     Args:
         part: where this rank works.
-        settings: as of `Crowding`, the part's grid among them.
+        settings: as of `DensityMonitor`, the part's grid among them.
     """
 
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         super().__init__(*settings, **more)
-        self.part, self._counted, self._trail = part, part.owned, Trail(part.owned)
+        self.part, self._counted, self._trail = part, part.owned, DirtyRegion(part.owned)
         self._known: tuple[float, float] | None = None
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:

@@ -13,11 +13,11 @@ from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
 
 
 class DistributedGridPoisson(GridPoisson):
-    """A `GridPoisson` whose grid is shared by the ranks: each has a box of its cells, and stores the cells of others that touch it.
+    """Distributed `GridPoisson`: each rank stores its box and a layer of ghost cells.
 
-    All that `GridPoisson` takes and gives is of this rank's box: cells (nz, ny, nx), coefficients of its faces, the upper ones too (those
-    at a cut are known to both ranks), fields. An `LCP` with it is one problem of all ranks, and `wl.solve` of it collective: every rank
-    calls it, and gets its box of x with the status, the residual and the history of the whole. On one rank it is what a `GridPoisson` is.
+    All arguments and fields are those of this rank's box: cells (nz, ny, nx), coefficients of its faces, upper faces included (those
+    at a cut are stored by both ranks). An `LCP` with it is one problem of all ranks, and `wl.solve` of it is collective: every rank
+    calls it, and gets its box of x with the status, residual and history of the whole. On one rank it equals a `GridPoisson`.
 
     Args:
         decomposition: the boxes.
@@ -43,7 +43,7 @@ class DistributedGridPoisson(GridPoisson):
         with decomposition.collective.together():
             self._check(cells, coefficients)
         kinds = [(name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items()) if name not in ("device", "dtype")]
-        decomposition.ranks.agree("what the coefficients are", kinds)
+        decomposition.ranks.agree("the kind of coefficients", kinds)
         if decomposition.ranks.size > 1:
             self._ghosts, self._across = decomposition.halo, decomposition.ranks
         with decomposition.collective.together():
@@ -54,7 +54,7 @@ class DistributedGridPoisson(GridPoisson):
         boxes = self.decomposition
         shape, expected = tuple(np.shape(cells)), tuple(reversed(boxes.box.counts))
         if any(coefficients.pop("periodic", ())):
-            raise ValueError("periodic: axes that wrap around are not shared by ranks yet; take one rank")
+            raise ValueError("periodic: periodic axes are not supported on several ranks; use one rank")
         if shape != expected and not (shape == expected[1:] and boxes.counts[2] == 1):
             raise ValueError(f"cells has shape {shape}: expected {expected}, the cells of rank {boxes.ranks.rank}")
         for axis in boxes.cut_axes:

@@ -19,11 +19,11 @@ from warp_lcp.rows.program import Launch, Task
 
 
 class Halo:
-    """Fills ghost cells of fields that each rank stores for its box, with so many of them on all sides.
+    """Halo exchange: fill the ghost cells of fields that each rank stores for its box.
 
-    A star forest of PETSc says which cell of which rank each ghost cell repeats, in the DMDA's boxes: neighbors send each other what they
-    have at their sides, edges and corners in one message each. Elements of 1, 2, 4 and 8 bytes of any meaning travel. Ghost cells at the
-    domain's own sides keep what they hold.
+    A star forest of PETSc maps each ghost cell to a cell of another rank: neighbors send each other the values
+    at their sides, edges and corners in one message each. Elements have 1, 2, 4 or 8 bytes. Ghost cells at the
+    domain's own sides keep their values.
 
     Args:
         decomposition: the boxes.
@@ -53,25 +53,25 @@ class Halo:
 
     @property
     def whole(self) -> tuple[int, int, int]:
-        """Cells (nz, ny, nx) of the whole grid."""
+        """Number of cells (nz, ny, nx) of the whole grid."""
         nx, ny, nz = self.decomposition.counts
         return nz, ny, nx
 
     @property
     def cuts(self) -> list[tuple[int, int]]:
-        """Sides with another rank beyond: axis x, y, z as 0, 1, 2, and 0 for the lower, 1 for the upper side."""
+        """Sides of the box with a neighbor rank, as (axis, 0 lower or 1 upper)."""
         d = self.decomposition
         return [(axis, side) for axis in d.cut_axes for side in range(2) if d.neighbor(axis, side) is not None]
 
     @property
     def hierarchy(self) -> Any:
-        """The class of multigrid hierarchies on such grids."""
+        """Class of the multigrid hierarchies on distributed grids."""
         from warp_lcp.distributed.hierarchy import DistributedHierarchy
 
         return DistributedHierarchy
 
     def coarser(self, factors: tuple[int, int, int]) -> Halo | None:
-        """Return the halo of aggregates of so many cells along x, y, z; None if aggregates would be cut."""
+        """Return the halo of aggregates of cells along x, y, z; None if one is cut."""
         if factors not in self._coarser:  # solves on the same boxes share what it takes to exchange
             decomposition = self.decomposition.coarser(factors)
             self._coarser[factors] = None if decomposition is None else Halo(decomposition, self.width)
@@ -79,11 +79,14 @@ class Halo:
 
     @cached_property
     def gathering(self) -> Gathering:
-        """What collects the ranks' fields on every rank."""
+        """Gathers the fields of all ranks on every rank."""
         return Gathering(self.decomposition)
 
     def fill(self, field: wp.array[Any] | np.ndarray) -> None:
-        """Fill the ghost cells of a contiguous field of `shape`, or of that many elements; collective."""
+        """Fill the ghost cells of a contiguous field; collective.
+
+        The field has shape `shape`, or as many elements.
+        """
         if self._forest is None:
             return
         if isinstance(field, wp.array) and field.device.is_cuda:
@@ -92,7 +95,10 @@ class Halo:
         exchange(self._forest, field.numpy() if isinstance(field, wp.array) else field)
 
     def filling(self, field: wp.array[Any]) -> Task:
-        """Return what fills the ghost cells of a field, now or among the launches of a program; ranks have more than one box."""
+        """Return the halo exchange of a field, to run now or within a recorded program.
+
+        For more than one rank.
+        """
         if field.device.is_cuda:
             return Task(partial(self.fill, field))
         assert self._forest is not None

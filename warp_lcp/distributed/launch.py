@@ -1,4 +1,4 @@
-"""Start a Python program on ranks of this machine, and say why that cannot be done here."""
+"""Launch Python programs on MPI ranks of this machine; report missing packages."""
 
 from __future__ import annotations
 
@@ -32,12 +32,17 @@ RANK = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")  # what mpiexec and sru
 
 
 def rank_here() -> int | None:
-    """Return the number of this process among those that mpiexec has started, None if it started none; without starting MPI."""
+    """Return this process's MPI rank, or None if mpiexec started none.
+
+    MPI is not initialized.
+    """
     return next((int(os.environ[name]) for name in RANK if name in os.environ), None)
 
 
 def find_petsc() -> None:
-    """Let this interpreter find Debian's petsc4py: it lies beside the build of PETSc that PETSC_DIR names when Python starts.
+    """Add Debian's petsc4py to the import path of this interpreter.
+
+    It is located next to the PETSc build that PETSC_DIR names when Python starts.
 
     Does nothing where petsc4py is found already, where PETSC_DIR is set, and in an interpreter without Debian's mpi4py.
     """
@@ -49,7 +54,7 @@ def find_petsc() -> None:
 
 
 def petsc() -> Any:
-    """Return the module PETSc, with MPI started.
+    """Return the PETSc module, with MPI initialized.
 
     Raises:
         ImportError: petsc4py or mpi4py cannot be imported; the message says how to install them.
@@ -64,12 +69,12 @@ def petsc() -> Any:
 
 
 def debian_petsc() -> list[str]:
-    """Return Debian's newest build of PETSc as a list of one directory, an empty one without any."""
+    """Return the newest PETSc build of Debian, as a list of at most one folder."""
     return sorted(glob.glob(DEBIAN_PETSC))[-1:]
 
 
 def missing() -> str:
-    """Return why this interpreter starts no programs on ranks, "" if it does."""
+    """Return the packages missing for programs on ranks; "" if none is."""
     if shutil.which("mpiexec") is None:
         return f"no mpiexec: {INSTALL}"
     find_petsc()
@@ -78,12 +83,14 @@ def missing() -> str:
 
 
 def command(ranks: int, *arguments: str) -> list[str]:
-    """Return the command that runs this interpreter with `arguments` on as many ranks."""
+    """Return the command that runs this interpreter with `arguments` on ranks."""
     return ["mpiexec", "-n", str(ranks), sys.executable, *arguments]
 
 
 def environment(given: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return an environment for that command: one thread a rank, any number of ranks and Debian's PETSc where `given` is silent.
+    """Return the environment for `command`.
+
+    One thread per rank, any number of ranks, and Debian's PETSc, unless `given` sets them.
 
     Args:
         given: variables that stay as they are; this process's own if None.

@@ -65,4 +65,4 @@ def cuts_of(pieces: Sequence[Piece], part: Subdomain) -> list[list[int]] | None:
     boxes = [CellBox.of(*piece["box"]) for piece in pieces]
     cuts = [np.diff([*sorted({box.low[axis] for box in boxes}), n]).tolist() for axis, n in enumerate(now.counts)]
     fits = math.prod(map(len, cuts)) == len(boxes) and all(len(cut) == 1 or min(cut) >= part.layers for cut in cuts)
-    return cuts if fits and now.cut_anew(cuts).boxes == boxes else None
+    return cuts if fits and now.repartition(cuts).boxes == boxes else None

@@ -56,7 +56,7 @@ def take_pieces(
                 found.append({name: np.asarray(piece[name])[inside] for name in own})
         own = {name: np.ascontiguousarray(np.concatenate([p[name] for p in found])) for name in own}
         if covered != part.box.cells:
-            raise ValueError("the pieces do not cover the domain: some are missing, or twice there")
+            raise ValueError("the pieces do not cover the domain: some are missing or duplicated")
         if any(values.dtype.kind == "f" and not np.isfinite(values).all() for values in (*own.values(), *cells.values())):
             raise ValueError("the pieces hold values that are not finite")
         if base is not None and not np.array_equal(cells["cells"] == wl.SOLID, part.box_of(base.numpy()) == wl.SOLID):
@@ -73,7 +73,7 @@ def _numbers(pieces: Sequence[Piece], names: Sequence[str], others: Sequence[str
     if not np.array_equal(numbers["signature"], signature):
         raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
     if any(not np.array_equal(numbers[name], piece[name]) for piece in pieces for name in names):
-        raise ValueError("the pieces are of different states")
+        raise ValueError("the pieces belong to different states")
     return numbers
 
 

@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
-from warp_lcp.distributed.density_correction import SharedCrowding, SharedDensityCorrection
+from warp_lcp.distributed.density_correction import SharedDensityCorrection, SharedDensityMonitor
 from warp_lcp.distributed.extension import Refill, too_far
 from warp_lcp.distributed.flight import SharedFlights
 from warp_lcp.distributed.migration import cuts_of, handed_over
@@ -88,9 +88,11 @@ class SharedParticleSimulation(ParticleSimulation):
         return self.band.held if self.band is not None else 0
 
     def _rearrangement(self) -> Rearrangement:
-        crowding, correction = partial(SharedCrowding, self.part), partial(SharedDensityCorrection, self.part)
+        density_monitor, correction = partial(SharedDensityMonitor, self.part), partial(SharedDensityCorrection, self.part)
         reseeding = partial(SharedReseeding, self.part)
-        return Rearrangement(self.scene, self.grid, self.boundary, crowding=crowding, correction=correction, reseeding=reseeding)
+        return Rearrangement(
+            self.scene, self.grid, self.boundary, density_monitor=density_monitor, correction=correction, reseeding=reseeding
+        )
 
     def _surface_mesh(self) -> SurfaceMesh | None:
         return make_surface_mesh(self.scene, self.grid, self.boundary, partial(SharedSurfaceMesh, self.part))
@@ -136,15 +138,15 @@ class SharedParticleSimulation(ParticleSimulation):
 
     def _rebalance(self) -> None:
         """Go on in the boxes in which the busiest rank has least to do, if they are much better than those there are; collective."""
-        with self.watch.stage("cutting anew", self.particles.position):
+        with self.watch.stage("repartitioning", self.particles.position):
             found = self.balance.better(self.part, self.particles, self.scene.particles.per_axis**self.part.dimension)
             if found is not None:
-                self.cut_anew(found)
+                self.repartition(found)
 
-    def cut_anew(self, decomposition: Decomposition) -> None:
+    def repartition(self, decomposition: Decomposition) -> None:
         """Go on in other boxes of the same ranks; collective."""
         before, piece, names = self.part, self.piece_state(), list(self.particles.arrays())
-        self._work_on(before.cut_anew(decomposition))
+        self._work_on(before.repartition(decomposition))
         self._take_pieces([handed_over(piece, names, before, self.part, self.particles.post)])
 
     def _work_on(self, part: Subdomain) -> None:
@@ -178,34 +180,34 @@ class SharedParticleSimulation(ParticleSimulation):
             self.restore_bodies()
             raise
 
-    def bring_to_faces(self, window: Window) -> None:
+    def particles_to_grid(self, window: Window) -> None:
         """Bring the particles' velocities to the faces, and let gravity act on them."""
-        super().bring_to_faces(window)
+        super().particles_to_grid(window)
         with self.watch.stage("exchange between ranks", *self.velocity, *self.weights):
             self.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
 
-    def extend(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
+    def extrapolate_velocity(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
         """Continue the velocity into air and walls, see the base class; it is then right in all ghost layers.
 
         Raises:
             StepFailed: it is so fast that particles would leave the ghost layers.
         """
-        super().extend(window, known, kind, contact)
+        super().extrapolate_velocity(window, known, kind, contact)
         self.part.fill(*self.velocity)
         cells = float(self.part.ranks.max(too_far(self.part, self.velocity, self._dt)))
         if cells > 0.0:
             raise StepFailed(
-                f"step {self.step_count}: the velocity would take {self.scene.materials()[0]} {cells:.1f} cells far, and a rank knows "
-                f"{self.part.layers - 1} around its box"
+                f"step {self.step_count}: {self.scene.materials()[0]} would move {cells:.1f} cells, more than the ghost layers of a rank, "
+                f"{self.part.layers - 1}"
             )
 
     def _layer_filled(self) -> Join | None:
         return Refill(self.part)
 
-    def bring_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
+    def grid_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
         """Give this rank's own particles the velocity of the faces."""
         self.particles.drop_ghosts()
-        super().bring_to_particles(window, kind, dt)
+        super().grid_to_particles(window, kind, dt)
 
     def met(self) -> tuple[int, int, int]:
         """Return how many of all met a wall, were pushed by a solid, and are stuck inside one."""
@@ -232,7 +234,7 @@ class SharedParticleSimulation(ParticleSimulation):
         """
         totals = super().checked_totals(when)
         if totals.count != self._everyone:
-            raise SimulationFailed(f"{when} step {self.step_count}: {totals.count} particles are there, of {self._everyone}")
+            raise SimulationFailed(f"{when} step {self.step_count}: {totals.count} particles are left of {self._everyone}")
         return totals
 
     def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
@@ -295,7 +297,7 @@ class SharedParticleSimulation(ParticleSimulation):
         with self.part.decomposition.collective.led():
             cuts = cuts_of(pieces, self.part)
         if cuts is not None and cuts != self.part.decomposition.parts:
-            self._work_on(self.part.cut_anew(self.part.decomposition.cut_anew(cuts)))
+            self._work_on(self.part.repartition(self.part.decomposition.repartition(cuts)))
         self._take_pieces(pieces)
         if cuts is None and self.part.ranks.size > 1:
             self.particles.totals()

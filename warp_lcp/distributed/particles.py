@@ -73,7 +73,7 @@ class MpiPost:
         sizes = np.array([[len(outgoing[rank]) for rank in neighbors], [0] * len(neighbors)], dtype=np.int64)
         requests = [comm.Irecv(sizes[1, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
         requests += [comm.Isend(sizes[0, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
-        with waiting("how many particles come"):
+        with waiting("counts of migrating particles"):
             MPI.Request.Waitall(requests)
         kind = outgoing[neighbors[0]].dtype if neighbors else np.dtype(np.int64)
         incoming = [np.empty(int(size), dtype=kind) for size in sizes[1]]

@@ -22,19 +22,21 @@ LEAST = 0.5  # by which a linear solve reduces its residual at least
 
 @dataclass(frozen=True, kw_only=True)
 class PetscActiveSet(Settings):
-    """The primal-dual active set as the outer loop, PETSc's KSP for what is linear (Hintermueller, Ito, Kunisch 2003; [Book] 2.4.1).
+    """Primal-dual active-set method with linear solves by PETSc's KSP.
+
+    [Hintermueller, Ito, Kunisch 2003; [Book] 2.4.1.]
 
     Unknowns with x - y / A_ii outside their bounds are held there; PETSc solves on the others, matrix-free, by conjugate gradients
     preconditioned with one multigrid cycle, and the step is safeguarded as MinimumMapNewton's is. For grids, on one process or on ranks
-    that share one. MinimumMapNewton and ProjectedMultigrid are faster; this one is for those who want PETSc's methods, monitors and
+    that share one. MinimumMapNewton and ProjectedMultigrid are faster; use this one for PETSc's methods, monitors and
     options. `init` reads them from PETSC_OPTIONS in the environment, or from what a program gave `petsc4py.init`:
 
-    - `-ksp_type`: cg unless given; fcg, pipecg and groppcg (fewer waits for sums over the ranks), minres, gmres, fgmres, bcgs, richardson,
+    - `-ksp_type`: default cg; fcg, pipecg and groppcg (fewer waits for sums over the ranks), minres, gmres, fgmres, bcgs, richardson,
       preonly (the cycle alone) and most others. A is symmetric.
-    - `-pc_type`: python, our cycle, unless given; jacobi, bjacobi, none. PETSc refuses what needs a matrix's entries (sor, ilu, gamg).
+    - `-pc_type`: default python, our cycle; jacobi, bjacobi, none. Methods that need matrix entries (sor, ilu, gamg) fail.
     - `-ksp_norm_type`: unpreconditioned where the method has that norm, else its own; `eta` counts in it.
     - `-ksp_rtol`, `-ksp_atol`, `-ksp_max_it`: instead of what `eta`, the whole solve's tolerance and `max_linear_iterations` ask for.
-    - `-ksp_monitor`, `-ksp_converged_reason`, `-ksp_view`, `-log_view`, `-options_left`: PETSc tells what it does, on standard output.
+    - `-ksp_monitor`, `-ksp_converged_reason`, `-ksp_view`, `-log_view`, `-options_left`: PETSc prints reports to standard output.
 
     With `prefix="wall_"` those of KSP and PC read `-wall_ksp_type` and so on.
 
@@ -44,11 +46,11 @@ class PetscActiveSet(Settings):
         monotone_cycles: projected multigrid cycles of a cold start, not by PETSc.
         eta: each linear solve reduces its residual by this factor, by its square once the active set has settled, or to what the whole
             solve still needs.
-        max_linear_iterations: the most iterations of KSP in one step.
-        backtracks: halvings of a step before it is given up.
-        memory: residuals that a step may fall back to.
+        max_linear_iterations: maximum number of iterations of KSP in one step.
+        backtracks: maximum number of halvings of a step.
+        memory: number of last residuals; a step may not exceed their maximum (nonmonotone search).
         prefix: of PETSc's options.
-        cycle: how multigrid cycles go.
+        cycle: settings of multigrid cycles.
 
     Raises:
         ValueError: an argument is outside its range.
@@ -68,7 +70,7 @@ class PetscActiveSet(Settings):
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
     def as_newton(self) -> MinimumMapNewton:
-        """Return the method with these settings whose linear solves are our own."""
+        """Return the same method with the project's own linear solver."""
         return MinimumMapNewton(**{f.name: getattr(self, f.name) for f in fields(self) if f.name != "prefix"})
 
     def init(self, problem: LCP) -> KSPWorkspace:
@@ -82,7 +84,7 @@ class PetscActiveSet(Settings):
         return KSPWorkspace(problem, self)
 
     def step(self, problem: LCP, work: KSPWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
+        """Take a monotone cycle during a cold start, else a safeguarded Newton step."""
         return work.step(x)
 
 

@@ -160,19 +160,19 @@ class CyclePreconditioner:
 
 
 class PetscGrid:
-    """A grid operator and its multigrid as PETSc's objects, on all unknowns or on a free set.
+    """Grid operator and multigrid cycle as PETSc objects.
 
-    With them PETSc's own methods work on the operator, matrix-free: KSP with the cycle; SNES's vinewtonrsls and TAO's tron and gpcg, which
+    PETSc's own methods then work on the operator, matrix-free: KSP with the cycle; SNES's vinewtonrsls and TAO's tron and gpcg, which
     take free sets out of the operator themselves, with `-pc_type none` or jacobi. Everything here is collective where ranks share the
     operator. Keep the grid while PETSc uses its objects.
 
-    Grids whose FLUID cells touch neither AIR nor a shift are singular: tell PETSc the constants as the matrices' null space.
+    Grids whose FLUID cells touch neither AIR nor a shift are singular: set the constants as the null space of PETSc's matrices.
 
     Args:
-        A: the operator, one process's or one that ranks share.
+        A: the operator, of one process or distributed over ranks.
         hierarchy: of A, its finest diagonal filled by the caller; None: one of its own, for all unknowns until `hold` is called.
         real: type in which its cycles work.
-        cycle: how they go.
+        cycle: settings of the cycles.
 
     Attributes:
         operator: A as a Mat, the identity on cells that are no FLUID.
@@ -205,31 +205,33 @@ class PetscGrid:
 
     @cached_property
     def operator(self) -> PETSc.Mat:
-        """Make it when it is first asked for."""
+        """Matrix of A on all unknowns, built at first access."""
         return self._keep(StencilMatrix(self._A.stencil, VectorCopies(self._A.stencil, self.copies.comm)).as_mat())
 
     def vector(self, field: Any = None) -> PETSc.Vec:
-        """Return a vector with a field of A's shape, of zeros if None."""
+        """Return a vector with the values of a field of A's shape; zeros if None."""
         v = self.copies.vector()
         if field is not None:
             v.setArray(np.ascontiguousarray(field, dtype=np.float64).ravel())
         return v
 
     def field(self, v: PETSc.Vec) -> np.ndarray:
-        """Return a vector's values as a field of A's shape, a copy."""
+        """Return the values of a vector as a field of A's shape, a copy."""
         return v.getArray(readonly=True).reshape(self._A.shape).copy()
 
     def hold(self, free: wp.array[Any]) -> None:
-        """Take another free set, a stored uint8 field: the others are held."""
+        """Set another free set, a stored uint8 field; other unknowns are held fixed."""
         self.hierarchy.hold(self._A.stencil.d, free)
         self.hierarchy.rebuild_changed()
         self.matrix.stateIncrease()
 
     def solver(self, prefix: str = "") -> PETSc.KSP:
-        """Return conjugate gradients on `matrix`, preconditioned by a cycle; PETSc's options with this prefix change them.
+        """Return a KSP on `matrix`: conjugate gradients preconditioned by a cycle.
+
+        PETSc options with the given prefix change it.
 
         Args:
-            prefix: of the options, say "wall_" for `-wall_ksp_type`.
+            prefix: of the options, such as "wall_" for `-wall_ksp_type`.
         """
         PETSc = petsc()
         ksp = PETSc.KSP().create(self.copies.comm)

@@ -19,9 +19,12 @@ from warp_lcp.rows.team import Operation
 
 @dataclass(frozen=True)
 class Ranks:
-    """The ranks of a communicator. All methods are collective: every rank calls them, in the same order, and gets the same answer.
+    """Ranks of an MPI communicator.
 
-    Sums are made in the order of the ranks from what each has sent to all, so that every rank has the same bits and takes the same
+    All methods are collective: every rank must call them, in the same order, and gets the same
+    result.
+
+    Every rank sends its part to all and adds the parts in rank order, so that all ranks have the same bits and take the same
     decisions.
 
     Args:
@@ -41,21 +44,24 @@ class Ranks:
 
     @property
     def rank(self) -> int:
-        """This process's number, from 0."""
+        """Number of this process, from 0."""
         return int(self.comm.rank)
 
     @property
     def size(self) -> int:
-        """How many ranks there are."""
+        """Number of ranks."""
         return int(self.comm.size)
 
     @property
     def is_root(self) -> bool:
-        """Whether this is the root rank, which writes and tells for all."""
+        """Whether this is rank 0, which writes files and prints."""
         return self.rank == 0
 
     def gather(self, values: Any) -> np.ndarray:
-        """Return numbers of every rank, which each has equally many of, shape (ranks, *values.shape)."""
+        """Return an array of every rank (MPI allgather).
+
+        All arrays have the same shape; the result has shape (ranks, *values.shape).
+        """
         mine = np.ascontiguousarray(values)
         if self.size == 1:
             return mine[None].copy()
@@ -65,53 +71,56 @@ class Ranks:
         return everyone
 
     def collect(self, value: Any) -> list[Any]:
-        """Return what each rank has given, of any type that can be pickled."""
+        """Return an object of every rank, in rank order; objects must be picklable."""
         if self.size == 1:
             return [value]
         with waiting("a gather"):
             return list(self.comm.allgather(value))
 
     def share(self, value: Any) -> Any:
-        """Return what the root rank has given, of any type that can be pickled."""
+        """Return the object of the root rank (broadcast); it must be picklable."""
         if self.size == 1:
             return value
         with waiting("a broadcast"):
             return self.comm.bcast(value)
 
     def sum(self, values: Any) -> Any:
-        """Return sums over the ranks of a number or an array."""
+        """Return the sum over the ranks of a number or an array."""
         return self._shaped(self.gather(values).sum(axis=0), values)
 
     def adding(self, sums: np.ndarray) -> Operation:
-        """Return what replaces float64 sums by those over the ranks, in place, as an operation of the team."""
+        """Return an operation that replaces float64 sums by their sum over the ranks.
+
+        It works in place and runs among the launches of the thread pool.
+        """
         return adding(self.comm, sums)
 
     def total(self, counts: np.ndarray) -> np.ndarray:
-        """Return sums over the ranks of an array of integers, whose order does not matter."""
+        """Return the sum over the ranks of an integer array; exact in any order."""
         everyone = np.empty_like(counts)
         with waiting("a sum"):
             self.comm.Allreduce(counts, everyone)
         return everyone
 
     def max(self, values: Any) -> Any:
-        """Return the largest of the ranks' numbers, entry by entry; NaN where one is."""
+        """Return the maximum over the ranks, entry by entry; NaN if any is NaN."""
         return self._shaped(self.gather(values).max(axis=0), values)
 
     def min(self, values: Any) -> Any:
-        """Return the smallest of the ranks' numbers, entry by entry; NaN where one is."""
+        """Return the minimum over the ranks, entry by entry; NaN if any is NaN."""
         return self._shaped(self.gather(values).min(axis=0), values)
 
     def any(self, condition: bool) -> bool:
-        """Return whether it holds on some rank."""
+        """Return whether a condition holds on any rank."""
         return bool(self.gather(np.uint8(bool(condition))).any())
 
     def join(self, key: bytes) -> bytes:
-        """Return a key of 16 bytes that stands for those of all ranks."""
+        """Return a 16-byte key computed from the keys of all ranks."""
         mine = np.frombuffer(hashlib.blake2b(key, digest_size=16).digest(), dtype=np.uint8)
         return hashlib.blake2b(self.gather(mine).tobytes(), digest_size=16).digest()
 
     def agree(self, name: str, value: Any) -> None:
-        """Check that a value, of a type that can be pickled, is the same on all ranks.
+        """Check that a picklable value is the same on all ranks.
 
         Raises:
             ValueError: it is not; on all ranks.
@@ -120,15 +129,21 @@ class Ranks:
         found = self.gather(mine)
         others = np.flatnonzero((found != found[0]).any(axis=1))
         if others.size:
-            raise ValueError(f"{name} on rank {others[0]} is not what it is on rank 0: start all ranks with the same command and files")
+            raise ValueError(f"{name} on rank {others[0]} differs from rank 0: start all ranks with the same command and files")
 
     def free_ended(self) -> None:
-        """Free what PETSc keeps of objects that Python has ended on every rank, which it does for all ranks at once."""
+        """Free PETSc objects that Python has released on every rank.
+
+        PETSc frees such objects collectively.
+        """
         if self.size > 1:
             petsc().garbage_cleanup(self.comm)
 
     def in_rows(self, count: int) -> Ranks:
-        """Return those of so many ranks one after another that this one is among, the first of them a multiple of the number."""
+        """Return the consecutive ranks of this rank's group.
+
+        A group begins at a multiple of its number of ranks.
+        """
         return _in_rows(self.comm.py2f(), count)
 
     @staticmethod
@@ -142,7 +157,7 @@ def _in_rows(handle: int, count: int) -> Ranks:
     from mpi4py import MPI
 
     comm = MPI.Comm.f2py(handle)
-    with waiting("a communicator of some ranks"):
+    with waiting("making a communicator"):
         return Ranks(comm.Split(comm.rank // count, comm.rank))
 
 
@@ -157,7 +172,7 @@ def _world() -> Any:
 
 
 def device_of_rank(ranks: Ranks, name: str | None = None) -> str:
-    """Return the device of this rank; collective.
+    """Return the Warp device of this rank; collective.
 
     Ranks on GPUs exchange ghost cells through the host's memory. None has run on more than one GPU so far.
 
@@ -169,7 +184,7 @@ def device_of_rank(ranks: Ranks, name: str | None = None) -> str:
     Raises:
         ValueError: the machine of this rank has no such device; the message names the rank.
     """
-    with waiting("what finds the ranks of a machine"):
+    with waiting("finding the ranks of a machine"):
         of_machine = ranks.comm.Split_type(_shared())
     number = int(of_machine.rank)
     of_machine.Free()

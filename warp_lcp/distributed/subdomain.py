@@ -67,8 +67,8 @@ class Subdomain:
             least, most = min(decomposition.parts[axis]), max(decomposition.counts[axis] // layers, 1)
             if least < layers:
                 raise ValueError(
-                    f"{decomposition.processes[axis]} ranks along {'xyz'[axis]} have boxes of {least} cells, but what a step looks at "
-                    f"around a box takes {layers}: start fewer ranks (along that axis {most} at most), or refine the grid"
+                    f"{decomposition.processes[axis]} ranks along {'xyz'[axis]} have boxes of {least} cells, but a step needs "
+                    f"{layers} layers around a box: start fewer ranks (at most {most} along that axis), or refine the grid"
                 )
         cells = self._cells(self.box)
         self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts)
@@ -81,7 +81,7 @@ class Subdomain:
             for side in range(2):
                 self.cuts |= (decomposition.neighbor(axis, side) is not None) << (2 * axis + side)
 
-    def cut_anew(self, decomposition: Decomposition) -> Subdomain:
+    def repartition(self, decomposition: Decomposition) -> Subdomain:
         """Return the part that this rank works on with other boxes."""
         grid = self.grid
         return Subdomain(decomposition, spacing=grid.spacing, dimension=self.dimension, device=grid.device, layers=self.layers)

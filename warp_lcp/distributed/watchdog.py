@@ -153,7 +153,7 @@ class Watchdog:
             elif text := self._look(mine):
                 threading.Timer(GRACE, os._exit, [1]).start()
                 self._board.clear(range(self._ranks.size))
-                self._end(f"{text}\nall ranks end: --rank-timeout {self._limit:g}")
+                self._end(f"{text}\nall ranks are aborted: --rank-timeout {self._limit:g}")
                 return
 
     def _look(self, mine: Post) -> str:
@@ -186,9 +186,9 @@ def verdict(posts: Mapping[int, Post | None]) -> str:
         return ""  # all compute
     waits = _grouped({rank: f"{post.name} ({post.place})" for rank, post in inside.items()})
     if not outside and not silent:
-        return f"all ranks wait for each other, and not in the same operation: {waits}"
+        return f"all ranks wait for each other in different operations: {waits}"
     late = [f"rank {rank} has been at {post.place} for {post.seconds:.0f} s" for rank, post in outside.items()]
-    late += [f"{_named(silent)} told nothing: stopped, out of reach, or in a library that does not return"] * bool(silent)
+    late += [f"{_named(silent)} sends no heartbeat: stopped, unreachable, or inside a library call that does not return"] * bool(silent)
     if not inside:
         return "; ".join(late)
     who, seconds = sorted([*outside, *silent]), max(post.seconds for post in inside.values())

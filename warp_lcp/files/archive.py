@@ -82,7 +82,7 @@ class Archive:
         """Open a file and read what it says of its arrays."""
         with _faults_named():
             if path.exists() and not path.is_file():  # a pipe would be waited for
-                raise ArchiveError("it is no file")
+                raise ArchiveError("it is not a file")
             self._stream = open(path, "rb")  # noqa: SIM115 - `close` closes it; zipfile leaves a broken file open
         try:
             with _faults_named():
@@ -151,12 +151,12 @@ class Archive:
         """Refuse members of which one says what another denies, or more than the file has."""
         infos = self._file.infolist()
         if len(self._members) != len(infos):
-            raise ArchiveError("it holds two arrays of one name")
+            raise ArchiveError("two arrays have the same name")
         if sum(info.compress_size for info in infos) > size:
             raise ArchiveError(f"its arrays take more than its {size} bytes")
         for name, info in self._members.items():
             if info.filename != name + SUFFIX or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
-                raise ArchiveError(f"{info.filename!r} is no plain array")
+                raise ArchiveError(f"{info.filename!r} is not a plain array")
             most = info.compress_size * (DEFLATED if info.compress_type == zipfile.ZIP_DEFLATED else 1)
             check_claim(f"{name!r} of {info.file_size} bytes", 0, stored=info.file_size, held=most)
 
@@ -170,7 +170,7 @@ class Archive:
             begin = np.lib.format.MAGIC_LEN + LENGTH_BYTES[version] + length
             match = HEADER.fullmatch(_exactly(stream, length)) if length <= LONGEST else None
             if match is None:
-                raise ArchiveError("its header is not one of NumPy's, or of structured values")
+                raise ArchiveError("its header is not a NumPy header, or it declares structured values")
             dtype = np.dtype(match["type"].decode())
             if dtype.hasobject:
                 raise ArchiveError("it holds objects")

@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 SPARE = ".spare"  # of room that is kept
 SUFFIX = ".part"  # of the temporary files, which a killed run may leave behind
-LINK = "is a link, which is not written through"
+LINK = "is a link and is not followed"
 TEMPORARY = re.compile(rf"\.(?P<name>.+?)(?:\.[0-9a-f]{{16}})?{re.escape(SUFFIX)}")  # those of older versions have no random part
 NO_LINKS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 BY_DESCRIPTOR = {os.open, os.rename, os.unlink} <= os.supports_dir_fd  # not on Windows
@@ -130,8 +130,8 @@ def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
     if stat.S_ISREG(status.st_mode) and status.st_nlink <= 1:
         return descriptor
     os.close(descriptor)
-    what = "has other names too" if stat.S_ISREG(status.st_mode) else "is not a plain file"
-    raise OSError(errno.ELOOP, f"{what}: it is not written", str(path))
+    what = "has other hard links" if stat.S_ISREG(status.st_mode) else "is not a plain file"
+    raise OSError(errno.ELOOP, f"{what} and is not written", str(path))
 
 
 def sync_folder(folder: Path) -> None:

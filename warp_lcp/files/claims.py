@@ -49,12 +49,12 @@ def read_whole(path: Path, *, copies: int = 2) -> bytes:
 
     Raises:
         OSError: it cannot be read.
-        ClaimError: it is no file, or does not fit the free memory.
+        ClaimError: it is not a file, or does not fit the free memory.
     """
     size = path.stat().st_size
     if not path.is_file():
-        raise ClaimError("it is no file")
-    check_claim("what is in it", copies * size)
+        raise ClaimError("it is not a file")
+    check_claim("its content", copies * size)
     return path.read_bytes()
 
 

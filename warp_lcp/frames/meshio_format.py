@@ -100,7 +100,7 @@ def from_meshio(mesh: Any) -> Mesh:
     filled = [block for block in mesh.cells if len(block.data)]
     kinds = {block.type for block in filled}
     if len(kinds) > 1 or not kinds <= CORNERS.keys():
-        raise ValueError(f"its cells are of the kinds {', '.join(sorted(kinds))}; those of a frame are all {', '.join(CORNERS)}")
+        raise ValueError(f"its cells are of the kinds {', '.join(sorted(kinds))}; allowed are only {', '.join(CORNERS)}")
     each = CORNERS[kinds.pop()] if kinds else 1
     corners = np.concatenate([np.asarray(block.data) for block in filled]) if filled else np.zeros((0, each), dtype=np.int32)
     if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
@@ -131,7 +131,7 @@ def write_meshio(path: Path, part: Points | Cells | Surface, name: str) -> None:
     """
     dress = holds(name, *kind_of(part)).dress
     if dress is None:
-        raise ValueError(f"{path}: {name} does not hold {part.name}")
+        raise ValueError(f"{path}: the format {name} cannot store {part.name}")
     mesh = _dressed(mesh_of(part), dress)
     with replacing_by_name(path) as temporary:
         try:
@@ -151,7 +151,7 @@ def read_meshio(path: Path, name: str) -> Mesh:
     """
     path.stat()  # whose error is the system's
     if name in WRITTEN_ONLY:
-        raise ValueError(f"{path}: is not a readable frame: {name} files are for other programs, meshio's reader may not end")
+        raise ValueError(f"{path}: is not a readable frame: {name} files are written for other programs and cannot be read back")
     try:
         return from_meshio(_module(name).read(str(path)))
     except _faults() as error:

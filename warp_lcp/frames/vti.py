@@ -71,7 +71,7 @@ def read_vti(path: Path) -> Cells:
     with read_back(path):
         text, mark, data = read_whole(path).partition(APPENDED)
         if not mark:
-            raise ValueError("no cells with raw bytes")
+            raise ValueError("has no cells stored as raw bytes")
         image = root(text + b"</VTKFile>", "ImageData")
         extent = [int(number) for number in image.get("WholeExtent", "").split()]
         low, end = np.array(extent[::2], dtype=np.int64), np.array(extent[1::2], dtype=np.int64)
@@ -82,7 +82,7 @@ def read_vti(path: Path) -> Cells:
             data
         )
         if len(extent) != 6 or not 0.0 < spacing < math.inf or not fits:
-            raise ValueError(f"its arrays are not those of {' x '.join(map(str, counts))} cells")
+            raise ValueError(f"its arrays do not match its {' x '.join(map(str, counts))} cells")
         shown = np.flatnonzero(arrays.pop(GHOSTS) == 0)
         index = np.stack(np.unravel_index(shown, counts, order="F"), axis=-1) + low
         fields = {name: array[shown] for name, array in arrays.items()}

@@ -108,14 +108,14 @@ def root(text: bytes, kind: str) -> ElementTree.Element:
         ParseError: it is not XML.
     """
     if b"<!" in text:
-        raise ValueError("declares a type of its own")
+        raise ValueError("declares a document type, which is not allowed")
     try:
         file = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ValueError(f"not XML: {error}") from error
     data = file.find(kind)
     if data is None or (file.get("byte_order"), file.get("header_type")) != ("LittleEndian", "UInt64") or file.get("compressor"):
-        raise ValueError(f"no {kind} as a run writes it, little-endian, with lengths of 64 bits and without compression")
+        raise ValueError(f"not a {kind} as a run writes it: little-endian, 64-bit lengths, uncompressed")
     return data
 
 
@@ -146,7 +146,7 @@ def array_values(array: ElementTree.Element, data: bytes, at: int = 0) -> np.nda
     size = int.from_bytes(data[at : at + LENGTH_BYTES], "little")
     held = len(data) - at - LENGTH_BYTES
     if at < 0 or not 0 <= size <= held or components < 1 or size % (components * dtype.itemsize):
-        raise ValueError(f"{array.get('Name')!r} of {size} bytes is cut short, or has no rows of {components}")
+        raise ValueError(f"{array.get('Name')!r} of {size} bytes is cut short, or not a multiple of {components} values")
     found = np.frombuffer(data, dtype, size // dtype.itemsize, at + LENGTH_BYTES)
     return found.reshape(-1, components) if components > 1 else found
 

@@ -1,4 +1,4 @@
-"""Articulated figures: trees of hinges with limits, their end effectors and derivatives."""
+"""Articulated figures: trees of hinges with limits, end effectors, derivatives."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ Z = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class ArticulatedFigure:
-    """A tree of hinges: each turns its link about an axis that its parent's link carries ([Book] 1.3.4).
+    """Tree of hinges ([Book] 1.3.4).
+
+    Each hinge turns its link about an axis fixed in its parent's link.
 
     With R_j = R_parent Rot(axis_j, theta_j) and p_j = p_parent + R_parent offset_j, an end effector on link j is at p_j + R_j tip.
 
@@ -54,14 +56,14 @@ class ArticulatedFigure:
         """Check the tree and the shapes."""
         n, e = len(self.parents), len(self.effectors)
         if n == 0 or not all(-1 <= parent < j for j, parent in enumerate(self.parents)):
-            raise ValueError(f"parents = {self.parents}: need one hinge at least, and each parent before its children")
+            raise ValueError(f"parents = {self.parents}: expected at least one hinge, and each parent before its children")
         for name, shape in (("axes", (n, 3)), ("offsets", (n, 3)), ("tips", (e, 3)), ("lower", (n,)), ("upper", (n,))):
             if np.shape(getattr(self, name)) != shape:
                 raise ValueError(f"{name} has shape {np.shape(getattr(self, name))}: expected {shape}")
         if e == 0 or not all(0 <= j < n for j in self.effectors):
-            raise ValueError(f"effectors = {self.effectors}: need one at least, each a hinge")
+            raise ValueError(f"effectors = {self.effectors}: expected at least one, each the number of a hinge")
         if not np.allclose(np.linalg.norm(self.axes, axis=1), 1):
-            raise ValueError("axes holds a vector that is no unit vector")
+            raise ValueError("axes: each must be a unit vector")
         if not 0 < self.reach < np.inf:
             raise ValueError(f"offsets and tips: an end effector must be some way from the first hinge, but reach = {self.reach:.6g} m")
         if not (self.lower <= self.upper).all():
@@ -71,7 +73,7 @@ class ArticulatedFigure:
 
     @property
     def hinges(self) -> int:
-        """How many angles there are."""
+        """Number of hinges."""
         return len(self.parents)
 
     @cached_property
@@ -86,7 +88,10 @@ class ArticulatedFigure:
 
     @cached_property
     def reach(self) -> float:
-        """The length of the longest way from the first hinge on it to an end effector [m]: what makes errors and angles comparable."""
+        """Length of the longest path from the first hinge to an end effector [m].
+
+        The length scale of errors and angles.
+        """
         links = np.linalg.norm(self.offsets, axis=1) * (np.array(self.parents) >= 0)
         return float((self.ancestors @ links + np.linalg.norm(self.tips, axis=1)).max())
 
@@ -103,16 +108,22 @@ class ArticulatedFigure:
         return places, axes, places[carriers] + np.einsum("eij,ej->ei", turns[carriers], self.tips)
 
     def positions(self, theta: Vector) -> Vector:
-        """Return f(theta), the end effectors' places [m], shape (e, dimension)."""
+        """Return the positions f(theta) of the end effectors [m], shape (e, dimension)."""
         return self._frames(theta)[2][:, : self.dimension]
 
     def skeleton(self, theta: Vector) -> tuple[Vector, Vector]:
-        """Return places of the hinges [m], shape (n, dimension), and of the end effectors, shape (e, dimension): what a picture needs."""
+        """Return positions of hinges and end effectors [m], to draw the figure.
+
+        Shapes (n, dimension) and (e, dimension).
+        """
         places, _, ends = self._frames(theta)
         return places[:, : self.dimension], ends[:, : self.dimension]
 
     def jacobian(self, theta: Vector) -> Vector:
-        """Return df/dtheta [m], shape (e dimension, n): a_j x (f_i - p_j) where hinge j moves effector i, else 0."""
+        """Return the Jacobian df/dtheta [m], shape (e dimension, n).
+
+        a_j x (f_i - p_j) where hinge j moves effector i, else 0.
+        """
         places, axes, ends = self._frames(theta)
         arms = np.cross(axes[None], ends[:, None] - places[None]) * self.ancestors[..., None]
         return arms[..., : self.dimension].transpose(0, 2, 1).reshape(-1, self.hinges)
@@ -149,7 +160,7 @@ def planar_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, uppe
     """
     n = len(lengths)
     if n == 0 or not np.isfinite(lengths).all() or not np.any(lengths):
-        raise ValueError(f"lengths = {lengths}: expected finite lengths [m], one that is not 0 at least")
+        raise ValueError(f"lengths = {lengths}: expected finite lengths [m], at least one of them not 0")
     offsets = np.zeros((n, 3))
     offsets[1:, 0] = lengths[:-1]
     tips = np.array([[lengths[-1], 0.0, 0.0]])
@@ -158,7 +169,9 @@ def planar_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, uppe
 
 
 def spatial_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0) -> ArticulatedFigure:
-    """Return a chain in space that lies along x at theta = 0; its hinges' axes are z, y, x, z, y, x and so on.
+    """Return a chain in space that lies along x at theta = 0.
+
+    The axes of its hinges are z, y, x, z, y, x and so on.
 
     Args:
         lengths: of the links [m].
@@ -171,7 +184,9 @@ def spatial_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upp
 
 
 def branching_figure() -> ArticulatedFigure:
-    """Return the upper half of a body: a spine of 3 hinges, two arms of 5 and a head of 2; their ends are the three end effectors.
+    """Return the upper half of a body with three end effectors.
+
+    A spine of 3 hinges, two arms of 5 and a head of 2.
 
     y is up at theta = 0, with the arms hanging out sideways; 1 m from hip to shoulders and to a hand; limits are a person's, roughly.
     """

@@ -1,4 +1,6 @@
-"""Coulomb friction at contacts as an LCP with a polyhedral cone, as a boxed problem, and as a proximal map ([Book] 1.3.5).
+"""Models of Coulomb friction: polyhedral-cone LCP, boxed problem, proximal map.
+
+See [Book] 1.3.5.
 
 All start from a `ContactSystem`: relative velocities at the contacts after impulses r, u = B r + q, whatever made them.
 """
@@ -23,9 +25,9 @@ class ContactSystem:
     The rows of a contact are consecutive: normal, then `dim - 1` tangents; joints follow the contacts.
 
     Args:
-        name: what touches.
+        name: of the scene.
         B: J M^-1 J', symmetric positive semi-definite [1/kg], scipy.sparse, shape (dim k + m, dim k + m).
-        q: velocities without impulses, with what removes errors of position [m/s], shape (dim k + m,).
+        q: velocities without impulses, plus position correction [m/s], shape (dim k + m,).
         friction: coefficient mu >= 0 of each contact, shape (k,).
         lower: least impulse of each joint row [N s], shape (m,); none where -inf.
         upper: the largest one.
@@ -115,7 +117,10 @@ class ContactSystem:
 
 
 def project_cone(r: np.ndarray, friction: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return (max(0, r_n), r_t projected onto the disk of radius mu max(0, normal)), shape (k, dim)."""
+    """Project impulses onto the friction cone of given normal impulses.
+
+    Returns (max(0, r_n), r_t projected onto the disk of radius mu max(0, normal)), shape (k, dim).
+    """
     out = r.copy()
     out[:, 0] = np.maximum(r[:, 0], 0.0)
     radius, length = friction * np.maximum(normal, 0.0), np.linalg.norm(r[:, 1:], axis=1)
@@ -124,16 +129,16 @@ def project_cone(r: np.ndarray, friction: np.ndarray, normal: np.ndarray) -> np.
 
 
 class ContactModel(Protocol):
-    """How friction becomes a problem."""
+    """Friction model: turns a contact system into a problem."""
 
     def problem(self, system: ContactSystem) -> Problem:
-        """Return the problem of a system."""
+        """Return the problem of a contact system."""
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
-        """Return r of the problem's unknowns."""
+        """Return the impulses r of a solution."""
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
-        """Return unknowns whose impulses are near r."""
+        """Return a first guess whose impulses are near r."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +152,7 @@ class BoxedModel:
     """
 
     def problem(self, system: ContactSystem) -> Problem:
-        """Return the boxed problem: its x are the impulses r."""
+        """Return the boxed problem, whose x are the impulses r."""
         n, normal, mu = len(system.q), np.full(len(system.q), -1), np.zeros(len(system.q))
         normal[system.tangents] = system.normals[:, None]
         mu[system.tangents] = system.friction[:, None]
@@ -158,11 +163,11 @@ class BoxedModel:
         return Problem(f"{system.name}: boxed", system.B, system.q, lower, upper, None, frozenset(facts))
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
-        """Return x, which are the impulses themselves."""
+        """Return x: the unknowns are the impulses."""
         return x
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
-        """Return r clipped to the bounds that it makes."""
+        """Return r clipped to the bounds at r."""
         x = r.copy()
         x[system.joints] = np.clip(x[system.joints], system.lower, system.upper)
         x[system.normals] = np.maximum(x[system.normals], 0.0)
@@ -235,7 +240,7 @@ class StewartTrinkleModel:
         return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
 
     def problem(self, system: ContactSystem) -> Problem:
-        """Return the LCP, mixed where joints have equations."""
+        """Return the LCP; it is mixed if joints have equations."""
         k, m, T = system.contacts, len(system.lower), self.unfold(system)
         K = len(self.spread(system.dim)) - 1
         beta = np.zeros((2 + K, 2 + K))
@@ -252,11 +257,11 @@ class StewartTrinkleModel:
         return Problem(f"{system.name}: Stewart-Trinkle, {K} sides", A, T @ system.q, lower, upper, None, frozenset(facts))
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
-        """Return r: friction is summed over the vectors."""
+        """Return r: friction is the sum over the tangent vectors."""
         return np.asarray(self.unfold(system).T @ x)
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
-        """Return unknowns whose impulses are near r.
+        """Return a first guess whose impulses are near r.
 
         Friction is split onto the two nearest vectors; beta comes from the slip at r.
         """
@@ -291,7 +296,7 @@ def proximal_sweeps(
     systems of up to some hundred contacts.
 
     Args:
-        system: what to solve.
+        system: the contact system.
         tolerance: of `system.residual`, relative to that at r = 0.
         most: sweeps.
         r0: first impulses; 0 if None.

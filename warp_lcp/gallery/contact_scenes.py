@@ -1,4 +1,6 @@
-"""The scenes of figures 2.9 and 2.11 of the book: stacks, walls, heavy on light, snakes of hinges, inclines, gears, motors.
+"""Contact scenes of the book's figures 2.9 and 2.11.
+
+Stacks, walls, heavy on light bodies, chains of hinges, inclines, gears, motors.
 
 Each makes a `World`, deterministic by its seed, in meters and kilograms; `contact_scene` makes a problem of one by its name.
 """
@@ -36,7 +38,10 @@ def box(center: Vector, half: Vector, turn: Rotation | None = None) -> Box:
 
 
 def gear(center: Vector, half: Vector, phase: float) -> list[Box]:
-    """Return BARS bars of half sides [m] that cross in the center, in the xz plane, the first at an angle [rad]."""
+    """Return a gear of crossed bars in the xz plane.
+
+    BARS bars of half sides [m], the first at an angle [rad].
+    """
     return [box(center, half, about((1.0, 0.0, 0.0), np.pi / 2) * about((0.0, 0.0, 1.0), phase + np.pi * k / BARS)) for k in range(BARS)]
 
 
@@ -56,7 +61,7 @@ def _check(name: str, value: float, least: float) -> None:
 
 
 def sphere_stack(count: int = 6, *, seed: int = 2015) -> World:
-    """Return spheres of one radius, 0.25 m, and masses that differ by up to a tenth, on top of each other.
+    """Return a stack of spheres of radius 0.25 m with masses within a tenth.
 
     Raises:
         ValueError: there is no sphere.
@@ -69,7 +74,7 @@ def sphere_stack(count: int = 6, *, seed: int = 2015) -> World:
 
 
 def box_stack(count: int = 10, *, seed: int = 2015) -> World:
-    """Return boxes of equal mass on top of each other, each moved and turned a little (fig. 2.9c, 2.11c, f).
+    """Return a stack of boxes, each slightly displaced (fig. 2.9c, 2.11c, f).
 
     Raises:
         ValueError: there is no box.
@@ -82,7 +87,10 @@ def box_stack(count: int = 10, *, seed: int = 2015) -> World:
 
 
 def wall(rows: int = 4, *, columns: int = 4, seed: int = 2015) -> World:
-    """Return a running bond of bricks 1:0.5:0.5, every second row with half bricks at its ends, densities within a tenth.
+    """Return a wall of bricks in running bond.
+
+    Bricks are 1:0.5:0.5, every second row has half bricks at its ends, densities are within a
+    tenth.
 
     Raises:
         ValueError: rows or columns are missing.
@@ -100,7 +108,9 @@ def wall(rows: int = 4, *, columns: int = 4, seed: int = 2015) -> World:
 
 
 def heavy_on_light(layers: int = 2, *, ratio: float = 1000.0, seed: int = 2015) -> World:
-    """Return a box on layers of 2 x 2 smaller ones, each `ratio` times lighter (fig. 2.9d, 2.11h).
+    """Return a heavy box on layers of 2 x 2 lighter ones (fig. 2.9d, 2.11h).
+
+    Each layer's boxes are `ratio` times lighter.
 
     Raises:
         ValueError: layers are missing, or the ratio is not positive.
@@ -141,7 +151,9 @@ def _next_but_one(links: int) -> frozenset[tuple[int, int]]:
 
 
 def arched_snake(links: int = 9, *, heavy: float = 0.0, seed: int = 2015) -> World:
-    """Return an arch of boxes joined by hinges whose limits hold it up (fig. 2.9a, b; 2.11g); a body on top if `heavy` > 0.
+    """Return an arch of boxes joined by hinges with limits (fig. 2.9a, b; 2.11g).
+
+    A body lies on top if `heavy` > 0.
 
     Hinges turn by up to 0.02 to 0.04 rad either way.
 
@@ -166,7 +178,9 @@ def arched_snake(links: int = 9, *, heavy: float = 0.0, seed: int = 2015) -> Wor
 
 
 def hanging_snake(links: int = 8, *, seed: int = 2015) -> World:
-    """Return a chain of boxes in the air whose first link is fixed, held by the limits of its hinges (fig. 2.11i).
+    """Return a hanging chain of hinged boxes, the first one fixed (fig. 2.11i).
+
+    The limits of the hinges hold it.
 
     Raises:
         ValueError: there are less than two links.
@@ -179,7 +193,9 @@ def hanging_snake(links: int = 8, *, seed: int = 2015) -> World:
 
 
 def incline(count: int = 1, *, angle: float = 0.3, friction: float = 0.5, seed: int = 2015) -> World:
-    """Return boxes in a row along a slope (fig. 2.9e, 2.11a): each rests below atan(mu) and slides with g (sin - mu cos) above.
+    """Return boxes in a row on a slope (fig. 2.9e, 2.11a).
+
+    Each rests below atan(mu) and slides with g (sin - mu cos) above.
 
     The plane goes through the origin and rises toward -x; boxes are 1:1:0.5, so that they do not topple, with masses within a tenth.
 
@@ -203,7 +219,9 @@ def incline(count: int = 1, *, angle: float = 0.3, friction: float = 0.5, seed: 
 
 
 def leaning_wall(rows: int = 4, *, columns: int = 3, angle: float = 0.25, seed: int = 2015) -> World:
-    """Return a wall on a slope of `angle` [rad] along it: friction holds every brick (fig. 2.9h, 2.11b).
+    """Return a wall on a slope of `angle` [rad] (fig. 2.9h, 2.11b).
+
+    Friction holds every brick.
 
     Raises:
         ValueError: an argument is out of range.
@@ -216,7 +234,9 @@ def leaning_wall(rows: int = 4, *, columns: int = 3, angle: float = 0.25, seed: 
 
 
 def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
-    """Return a pyramid of gears with six teeth that lean on each other, the lowest row between posts (fig. 2.9f, g; 2.11d, e).
+    """Return a pyramid of six-toothed gears (fig. 2.9f, g; 2.11d, e).
+
+    The gears lean on each other, the lowest row between posts.
 
     Gears of a row are a tooth's width apart, those above are let in from a little height: it needs some steps to settle.
 
@@ -239,7 +259,9 @@ def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
 
 
 def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> World:
-    """Return an arm of boxes on a fixed base whose hinges have motors that turn it: speeds up to 0.5 rad/s, torques limited [N m].
+    """Return an arm of boxes on a fixed base with motors in its hinges.
+
+    Speeds up to 0.5 rad/s, torques limited [N m].
 
     Motors near the base carry more; their limits grow with the square of the links they carry, times `torque` / links^2.
 
@@ -257,7 +279,7 @@ def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> Wor
 
 
 def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
-    """Return gears on fixed axles in a row whose teeth mesh; a motor turns the first.
+    """Return a row of meshing gears on fixed axles; a motor turns the first.
 
     Raises:
         ValueError: there is no gear.
@@ -359,5 +381,5 @@ def contact_scene(
             stepper.step()
     system = world.assemble(dt).system
     if not len(system.q):
-        raise ValueError(f"{world.name}: nothing touches, there is no problem")
+        raise ValueError(f"{world.name}: there are no contacts, hence no problem")
     return (model or BoxedModel()).problem(system)

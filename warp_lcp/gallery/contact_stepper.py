@@ -1,6 +1,6 @@
-"""Time steps of rigid bodies at the level of velocities: semi-implicit Euler, any method that takes the friction model.
+"""Velocity-level time stepper of rigid bodies: semi-implicit Euler, any method.
 
-Made to see scenes stand, slide and turn; no general engine: one coefficient of friction, no restitution.
+For experiments with contact methods; not a general engine: one coefficient of friction, no restitution.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STABILIZATIONS = ("baumgarte", "split", "none")
 
 @dataclass(frozen=True)
 class StepReport:
-    """What a step did.
+    """Report of a contact step.
 
     Args:
         time: at its end [s].
@@ -49,13 +49,13 @@ class ContactStepper:
 
     A step detects contacts, solves for impulses, changes velocities, and moves the bodies.
 
-    v' = v + dt g + M^-1 J'r, x' = x + dt v'. Overlaps are removed by what is added to the normal velocity: "baumgarte" adds a part of
+    v' = v + dt g + M^-1 J'r, x' = x + dt v'. Overlaps are removed by position correction: "baumgarte" adds a part of
     the overlap over dt in the problem itself, which bodies keep as velocity; "split" moves bodies by a second, frictionless problem's
     velocities, which are forgotten (50 sweeps of projected Gauss-Seidel); "none" leaves them. Impulses start from those of the step
     before at the same contacts, as `ContactMemory` knows them.
 
     Args:
-        world: what moves; its state is written.
+        world: the world; its state is updated.
         method: a method of `wl.METHODS` that takes the model's problem, or a function that returns one for a system, as blocks depend on
             it; projected Gauss-Seidel if None.
         model: how friction becomes a problem.
@@ -104,7 +104,7 @@ class ContactStepper:
         self._joints: np.ndarray | None = None  # impulses of the last step; those of contacts are in the world's memory
 
     def step(self) -> StepReport:
-        """Advance the world by dt, and return what the solve did."""
+        """Advance the world by dt and return the report of the solve."""
         world, dt = self.world, self.dt
         assembly = world.assemble(dt, rate=self.rate if self.stabilization == "baumgarte" else 0.0)
         system = assembly.system

@@ -1,4 +1,4 @@
-"""Families of small problems, for sweeps over methods: a name and a function of the seed each."""
+"""Families of small random problems: a name and a function of the seed each."""
 
 from __future__ import annotations
 

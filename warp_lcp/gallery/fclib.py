@@ -1,4 +1,6 @@
-"""Frictional contact problems of the collection FCLIB, which are HDF5 files (extra `contact`: h5py).
+"""Frictional contact problems of the FCLIB collection, HDF5 files (needs h5py).
+
+Extra `contact`.
 
 Layout, as FCLIB's own writer makes it (github.com/FrictionalContactLibrary/fclib, src/fclib.h and src/fclib.c):
 /fclib_local holds spacedim, matrices W and, together, V and R, and vectors/{q, mu, s}: u = W r + V l + q, V'r + R l + s = 0;
@@ -46,7 +48,7 @@ def read_fclib(path: Path | str) -> FclibProblem:
 
     Raises:
         ImportError: h5py is missing.
-        ValueError: the file is no FCLIB problem; the message names what is missing or wrong.
+        ValueError: the file is not an FCLIB problem; the message names what is missing or wrong.
     """
     try:
         import h5py
@@ -122,7 +124,7 @@ def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.
         raise ValueError(f"{path}: {group.name} has no matrix {name}")
     m, n, nz = (_number(group, f"{name}/{key}", path) for key in ("m", "n", "nz"))
     if (m, n) != shape:
-        raise ValueError(f"{path}: {group.name}/{name} has shape {m} x {n}: the vectors beside it ask for {shape[0]} x {shape[1]}")
+        raise ValueError(f"{path}: {group.name}/{name} has shape {m} x {n}: expected, from the vectors, {shape[0]} x {shape[1]}")
     p, i = (_values(group, f"{name}/{key}", path, "iu").astype(np.int64) for key in ("p", "i"))
     x = _values(group, f"{name}/x", path)
     try:
@@ -136,7 +138,7 @@ def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.
         stored.check_format(full_check=True)  # an index beyond the shape would be written to
         return scipy.sparse.csr_array(stored)
     except (ValueError, IndexError) as error:
-        raise ValueError(f"{path}: {group.name}/{name} is no sparse matrix: {error}") from error
+        raise ValueError(f"{path}: {group.name}/{name} is not a sparse matrix: {error}") from error
 
 
 def _symmetric(B: Any, path: Path) -> scipy.sparse.csr_array:
@@ -161,7 +163,7 @@ def _number(group: Any, name: str, path: Path) -> int:
     """Return a dataset of one whole number."""
     values = _values(group, name, path, "iu")
     if len(values) != 1:
-        raise ValueError(f"{path}: {group.name}/{name} has {len(values)} values: must be one")
+        raise ValueError(f"{path}: {group.name}/{name} has {len(values)} values: expected one")
     return int(values[0])
 
 
@@ -173,7 +175,7 @@ def _dataset(group: Any, name: str, path: Path) -> Any:
     for part in name.split("/"):
         found = _inside(found, part, path)
     if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
-        raise ValueError(f"{path}: {group.name}/{name} is no dataset of this file")
+        raise ValueError(f"{path}: {group.name}/{name} is not a dataset of this file")
     size, stored = int(found.nbytes), int(found.id.get_storage_size())
     if stored == 0 and size <= UNWRITTEN and not found.chunks:  # its fill value, which is 0: FCLIB makes datasets that it writes nothing to
         return found

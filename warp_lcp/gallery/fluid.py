@@ -1,4 +1,4 @@
-"""Pressure problems of liquids that let go of walls: p >= 0 at walls, or everywhere, and no other bound."""
+"""Pressure problems of liquids with separating walls: p >= 0."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ class Splash:
         return LCP(A, self.b if b is None else b, self.lower(bounds))
 
     def problem(self, bounds: str, device: str, b: Any = None) -> LCP:
-        """Return `lcp(bounds, device=device, b=b)`; the name until version 0.1."""
+        """Return `lcp(bounds, device=device, b=b)`; deprecated, use `lcp`."""
         warnings.warn("Splash.problem is now Splash.lcp(bounds, device=...)", DeprecationWarning, stacklevel=2)
         return self.lcp(bounds, device=device, b=b)
 
     def matrix(self) -> scipy.sparse.csr_array:
-        """Assemble A on the FLUID cells, in their order, for solvers that want a matrix."""
+        """Return A on the FLUID cells in their order, as a sparse matrix."""
         return grid_matrix(GridPoisson(self.cells, device="cpu", dtype=wp.float64, **self.faces))
 
     def named(self, bounds: str, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
-        """Return it as a problem of the gallery; no solution is known.
+        """Return the splash as a gallery problem, without a known solution.
 
         Args:
             bounds: one of BOUNDS.
@@ -82,7 +82,7 @@ class Splash:
 
 @dataclass(frozen=True)
 class SplashPart:
-    """Some of the cells of a splash.
+    """Cells of a part of a splash.
 
     Args:
         cells: their types with those of the cells around, SOLID beyond the box of the liquid: two more along each axis than `b`.
@@ -108,13 +108,13 @@ def splash(n: int, *, phase: float = 0.0) -> Splash:
         ValueError: n < 1.
     """
     if n < 1:
-        raise ValueError(f"n = {n}: must be >= 1 cells a side")
+        raise ValueError(f"n = {n}: must be >= 1, the cells along a side")
     whole = splash_part(n, (slice(0, n),) * 3, phase=phase)
     return Splash(n, np.ascontiguousarray(whole.cells[1:-1, 1:-1, 1:-1]), whole.b, whole.wall)
 
 
 def splash_part(n: int, part: tuple[slice, ...], *, phase: float = 0.0) -> SplashPart:
-    """Return some of the cells of `splash(n)`, made without the others.
+    """Return a part of `splash(n)`, computed without the rest.
 
     Args:
         n: cells along a side of the whole.
@@ -148,7 +148,7 @@ def splash_part(n: int, part: tuple[slice, ...], *, phase: float = 0.0) -> Splas
 
 
 def basin(n: int) -> Splash:
-    """Return a closed box full of liquid under a layer of AIR, with random b.
+    """Return a closed box of liquid below a layer of AIR, with random b.
 
     Every row of the grid is in use.
     """

@@ -1,4 +1,7 @@
-"""American and European puts where the variance is random, too (Heston): a mixed derivative, no symmetry, a problem each time step."""
+"""American and European puts in the Heston model of stochastic volatility.
+
+The operator has a mixed derivative and is not symmetric; each time step is an LCP.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,10 @@ DENSE = 0.2  # of K: within it nodes of S are as dense as can be
 
 
 def differences(x: np.ndarray, diffusion: np.ndarray, drift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights, below and above, of diffusion u'' + drift u' on nodes x; central, upwind where that would make one negative.
+    """Return difference weights of diffusion u'' + drift u' at nodes x.
+
+    Weights below and above the diagonal: central differences, upwind where a central weight would
+    be negative.
 
     Args:
         x: nodes, rising, shape (n,); the last one has the spacing of the one before.
@@ -130,7 +136,7 @@ class Heston:
         return a
 
     def put(self, ns: int, nv: int, steps: int, *, american: bool = True, device: Any = None) -> Prices:
-        """Return the prices today.
+        """Return the prices of the put at time 0.
 
         Each time step is a complementarity problem, which starts from the last one's solution.
 
@@ -194,7 +200,7 @@ class Heston:
 
 @dataclass(frozen=True, eq=False)
 class Prices:
-    """Prices on a grid.
+    """Option prices on a grid.
 
     Attributes:
         S: prices of the stock, shape (ns + 1,).
@@ -207,5 +213,5 @@ class Prices:
     u: np.ndarray
 
     def at(self, spot: Any, variance: float) -> Any:
-        """Return prices between the nodes, by cubic splines: first in v, then in S."""
+        """Return interpolated prices: cubic splines, first in v, then in S."""
         return scipy.interpolate.CubicSpline(self.S, scipy.interpolate.CubicSpline(self.v, self.u)(variance))(spot)

@@ -25,7 +25,9 @@ DEFINITE = 1e-6  # of reach^2: the least eigenvalue that a model with curvature 
 
 @dataclass(frozen=True, eq=False)
 class StepProblem:
-    """A step's problem: minimize 1/2 d'H d + c'd, c = -J'(g - f), with the joint limits at theta + d and |d_i| <= radius.
+    """Step problem: minimize 1/2 d'H d + c'd within joint limits and a trust region.
+
+    c = -J'(g - f), with the limits at theta + d and |d_i| <= radius.
 
     Args:
         H: the model's symmetric matrix [m^2], shape (n, n).
@@ -44,7 +46,9 @@ class StepProblem:
         return LCP(DenseOperator(self.H, device=device), self.c, self.lower, self.upper)
 
     def multipliers(self, *, device: Any = None) -> LCP:
-        """Return the book's LCP in the 2n multipliers of the limits ([Book] eq. 1.143-1.144), all of which must be finite.
+        """Return the book's LCP in the 2n multipliers of the limits.
+
+        [Book] eq. 1.143-1.144; all limits must be finite.
 
         With B = [I; -I]: H d + c = B'x, so that 0 <= x is complementary to B H^-1 B' x + (-l; u) - B H^-1 c >= 0. The matrix is positive
         semi-definite of rank n: a limit's two rows are each other's negatives.
@@ -53,7 +57,7 @@ class StepProblem:
             ValueError: H is singular: without damping it is wherever there are more hinges than goals; or a bound is infinite.
         """
         if not np.isfinite([self.lower, self.upper]).all():
-            raise ValueError("lower and upper must be finite for a multiplier each")
+            raise ValueError("lower and upper must be finite, for one multiplier each")
         B = np.concatenate([np.eye(len(self.c)), -np.eye(len(self.c))])
         try:
             solved = np.linalg.solve(self.H, np.column_stack([B.T, self.c]))
@@ -63,18 +67,18 @@ class StepProblem:
         return LCP(DenseOperator(0.5 * (M + M.T), device=device), np.concatenate([-self.lower, self.upper]) - B @ solved[:, -1])
 
     def step(self, x: Vector) -> Vector:
-        """Return the step that multipliers x of `multipliers` stand for: d = H^-1 (B'x - c)."""
+        """Return the step d = H^-1 (B'x - c) of multipliers x."""
         n = len(self.c)
         return np.linalg.solve(self.H, x[:n] - x[n:] - self.c)
 
     def decrease(self, d: Vector) -> float:
-        """Return by how much the model falls [m^2]."""
+        """Return the predicted decrease of the objective [m^2]."""
         return float(-d @ (self.c + 0.5 * (self.H @ d)))
 
 
 @dataclass(frozen=True, eq=False)
 class ReachedPose:
-    """What `InverseKinematics.solve` returns.
+    """Result of `InverseKinematics.solve`.
 
     Args:
         theta: angles [rad], shape (n,), within the limits.
@@ -105,14 +109,16 @@ class ReachedPose:
 
 @dataclass(frozen=True, kw_only=True)
 class InverseKinematics(Settings):
-    """Minimize 1/2 |g - f(theta)|^2 within joint limits, a boxed LCP a step ([Book] 1.3.4, eqs. 1.130-1.144).
+    """Inverse kinematics within joint limits: one boxed LCP per step.
+
+    Minimizes 1/2 |g - f(theta)|^2 ([Book] 1.3.4, eqs. 1.130-1.144).
 
     The Gauss-Newton model at theta, (J'J + mu I) d - J'(g - f) = y with max(l - theta, -radius) <= d <= min(u - theta, radius), is solved
     by any method. The book takes its steps as they are; here a step is taken only if the objective falls, and the box's radius follows how
-    well the model foretells it. Converged: |theta - clip(theta - grad / reach^2, l, u)| <= tolerance in the largest angle.
+    well the model predicts it. Converged: |theta - clip(theta - grad / reach^2, l, u)| <= tolerance in the largest angle.
 
     The damping mu keeps H definite, which most methods need, and shortens steps where J is nearly singular, at a price in iterations:
-    docs/theory.md has it measured. A goal out of reach leaves a residual, which Gauss-Newton's model does not know the curvature of:
+    see docs/theory.md for measurements. A goal out of reach leaves a residual, whose curvature the Gauss-Newton model lacks:
     `curvature` adds -sum_k (g - f)_k f_k'' and shifts the sum to be definite.
 
     Args:
@@ -120,7 +126,7 @@ class InverseKinematics(Settings):
         damping: mu in units of reach^2, >= 0.
         radius: first largest change of an angle in a step [rad], > 0.
         tolerance: of the projected gradient [rad], > 0.
-        max_iterations: the most LCPs, >= 0.
+        max_iterations: maximum number of LCPs, >= 0.
         curvature: model the objective's second derivative wholly.
         multipliers: solve the book's LCP in the multipliers of the limits instead of the boxed one in the step.
         device: Warp device of the LCPs; the default device if None.
@@ -146,10 +152,12 @@ class InverseKinematics(Settings):
     device: Any = None
 
     def solve(self, figure: ArticulatedFigure, goals: Vector, start: Vector | None = None) -> ReachedPose:
-        """Return a pose whose end effectors are as near to their goals as they come from the start.
+        """Return the pose whose end effectors are closest to their goals.
+
+        A local minimum near the start.
 
         Args:
-            figure: what moves.
+            figure: the articulated figure.
             goals: g [m], shape (e, dimension).
             start: angles [rad], shape (n,), clipped to the limits; 0 clipped to them if None.
 

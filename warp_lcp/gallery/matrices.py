@@ -1,4 +1,7 @@
-"""Matrices of known kind: banded, positive definite, semi-definite, P-matrices on which plain Newton methods cycle."""
+"""Dense and banded random matrices of known definiteness, and P-matrices.
+
+On the P-matrices of `period_three` plain Newton methods cycle.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +117,11 @@ def period_three(blocks: int = 1, *, plant: Plant | None = None, seed: int | Non
 
 
 def banded_matrix(n: int, bands: int, rng: np.random.Generator) -> scipy.sparse.csr_array:
-    """Return I with `bands` constant off-diagonals -U(0, 1) on both sides, shifted by (0.5 - lambda_min) I if not positive definite."""
+    """Return the identity plus random constant off-diagonals, made positive definite.
+
+    `bands` off-diagonals -U(0, 1) on each side; shifted by (0.5 - lambda_min) I if not positive
+    definite.
+    """
     values = -rng.random(bands)
     diagonals = [np.ones(n), *(np.full(n, v) for v in values)]
     lowest = float(scipy.linalg.eigvals_banded(np.stack(diagonals), lower=True, select="i", select_range=(0, 0))[0])

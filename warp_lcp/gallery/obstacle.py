@@ -1,4 +1,4 @@
-"""Obstacle problems of the literature: a membrane over a ball or sines, a bar that yields, a dam, the film in a journal bearing."""
+"""Obstacle problems of the literature: membranes, torsion, dam, journal bearing."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ SLOPE = RADIUS**2 / np.sqrt(1 - RADIUS**2)  # of the membrane against -log r
 
 
 def ball_height(r: np.ndarray) -> np.ndarray:
-    """Return psi: sqrt(1 - r^2) for r <= EDGE, its tangent beyond."""
+    """Return the obstacle psi: sqrt(1 - r^2) for r <= EDGE, its tangent beyond."""
     edge = np.sqrt(1 - EDGE**2)
     return np.where(r <= EDGE, np.sqrt(1 - np.minimum(r, EDGE) ** 2), edge - EDGE / edge * (r - EDGE))
 
 
 def membrane_height(r: np.ndarray) -> np.ndarray:
-    """Return the solution: psi for r <= a, SLOPE log(2 / r) beyond, harmonic, with psi's value and slope at a."""
+    """Return the exact solution of the ball obstacle problem.
+
+    psi for r <= a, SLOPE log(2 / r) beyond: harmonic, with psi's value and slope at a.
+    """
     return np.where(r <= RADIUS, ball_height(r), SLOPE * np.log(2 / np.maximum(r, RADIUS)))
 
 
@@ -45,7 +48,7 @@ def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
         ValueError: there is no inner node.
     """
     if n < 3:
-        raise ValueError(f"n = {n}: must be >= 3, the nodes a side with those on the border")
+        raise ValueError(f"n = {n}: must be >= 3, the nodes along a side, border included")
     s = np.linspace(-2, 2, n)
     r = np.hypot(*np.meshgrid(s, s))
     exact, inner = membrane_height(r), (slice(1, -1),) * 2
@@ -79,7 +82,7 @@ def torsion(n: int, load: float = 5.0, *, border: float = 1.0, device: Any = Non
         ValueError: there is no inner node, or the border has no weight.
     """
     if n < 1:
-        raise ValueError(f"n = {n}: must be >= 1, the inner nodes a side")
+        raise ValueError(f"n = {n}: must be >= 1, the inner nodes along a side")
     cells = np.pad(np.full((n, n), FLUID, dtype=np.int8), 1, constant_values=AIR)
     X, Y = np.meshgrid(*(np.linspace(0, 1, n + 2),) * 2)
     distance = np.minimum(np.minimum(X, 1 - X), np.minimum(Y, 1 - Y))
@@ -120,7 +123,7 @@ def sine_obstacle(nx: int, ny: int, *, between: bool = False, device: Any = None
         ValueError: there is no inner node.
     """
     if min(nx, ny) < 3:
-        raise ValueError(f"nx, ny = {nx}, {ny}: must be >= 3, the nodes with those on the border")
+        raise ValueError(f"nx, ny = {nx}, {ny}: must be >= 3, the nodes, border included")
     cells = np.pad(np.full((ny - 2, nx - 2), FLUID, dtype=np.int8), 1, constant_values=AIR)
     hx, hy = 1 / (nx - 1), 1 / (ny - 1)
     X, Y = np.meshgrid(np.linspace(0, 1, nx), np.linspace(0, 1, ny))
@@ -176,7 +179,7 @@ def journal_bearing(
 def dam(
     nx: int, ny: int, *, width: float = 16.0, high: float = 24.0, low: float = 4.0, device: Any = None, dtype: Any = wp.float32
 ) -> Problem:
-    """Return the seepage of water through a dam.
+    """Return the problem of water seepage through a dam.
 
     From a full reservoir to water of depth `low`.
 
@@ -196,7 +199,7 @@ def dam(
         ValueError: there is no inner node.
     """
     if min(nx, ny) < 3:
-        raise ValueError(f"nx, ny = {nx}, {ny}: must be >= 3, the nodes with those on the border")
+        raise ValueError(f"nx, ny = {nx}, {ny}: must be >= 3, the nodes, border included")
     x, y = np.linspace(0, width, nx), np.linspace(0, high, ny)
     w = np.zeros((ny, nx))
     w[0] = (high**2 * (width - x) + low**2 * x) / (2 * width)

@@ -1,4 +1,4 @@
-"""Problems with a known solution: x and y are chosen complementary first, then b = y - A x."""
+"""Problems with a known solution: x and y are chosen first, then b = y - A x."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Plant(Settings):
 
 
 def planted(A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts: frozenset[str]) -> Problem:
-    """Return a problem with this matrix and a planted solution.
+    """Return a problem with a given matrix and a planted solution.
 
     l <= x <= u, y >= 0 where x = l, y <= 0 where x = u, y = 0 elsewhere and on equations; the lower bounds are 0, or in
     [-1, 0] times `plant.size` where there are upper ones.
@@ -77,7 +77,10 @@ def planted(A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts:
 
 
 def random_cells(shape: tuple[int, ...], rng: np.random.Generator, *, air: float, solid: float, ring: bool) -> np.ndarray:
-    """Return cell types: a share of AIR and of SOLID at random, AIR all around if `ring`; liquid that touches no AIR becomes SOLID."""
+    """Return random cell types: fractions of AIR and SOLID.
+
+    AIR all around if `ring`; FLUID without AIR in its component becomes SOLID.
+    """
     cells = rng.choice(np.array([AIR, FLUID, SOLID], dtype=np.int8), shape, p=[air, 1 - air - solid, solid])
     if ring:
         cells = np.pad(cells, 1, constant_values=AIR)

@@ -1,4 +1,4 @@
-"""What a gallery function returns: data on the host, a solution where one is known, and what holds for it."""
+"""Problems of the gallery: host data, known solution and properties."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ M_MATRIX = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """An LCP to try methods on: y = A x + b, lower <= x <= upper.
+    """Test problem: y = A x + b, lower <= x <= upper.
 
     Args:
         name: what it is, with its parameters.
@@ -69,13 +69,13 @@ class Problem:
 
     @property
     def kind(self) -> str:
-        """The family of its operator: "grid", "sparse" or "dense"."""
+        """Family of the operator: "grid", "sparse" or "dense"."""
         if isinstance(self.A, GridPoisson):
             return "grid"
         return "sparse" if scipy.sparse.issparse(self.A) else "dense"
 
     def lcp(self, *, device: Any = None, dtype: Any = wp.float64) -> LCP:
-        """Return the problem for a solver.
+        """Return the problem as an LCP for a solver.
 
         The operator of a grid has its device and type already.
 
@@ -88,7 +88,7 @@ class Problem:
         return LCP(A, self.b, _number_or_field(self.lower), _number_or_field(self.upper))
 
     def energy(self, x: Any) -> float:
-        """Return x'A x / 2 + b'x, in float64.
+        """Return the energy x'A x / 2 + b'x in float64.
 
         A solution minimizes it within the bounds if A is symmetric.
 
@@ -101,7 +101,7 @@ class Problem:
         return float((host * (Ax / 2 + b)).sum())
 
     def sparse(self) -> Problem:
-        """Return the problem of a grid's FLUID cells with a scipy.sparse matrix.
+        """Return the problem with a scipy.sparse matrix of the grid's FLUID cells.
 
         Rows have the cells' order; a problem that is no grid's is returned as it is.
         """
@@ -113,7 +113,7 @@ class Problem:
         return Problem(f"{self.name} as sparse", grid_matrix(self.A), b, lower, upper, x, self.facts)
 
     def dense(self) -> Problem:
-        """Return the problem with a numpy matrix, of a grid's FLUID cells alone."""
+        """Return the problem with a numpy matrix; of a grid, only its FLUID cells."""
         if self.kind == "dense":
             return self
         p = self.sparse()

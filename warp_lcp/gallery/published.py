@@ -1,4 +1,4 @@
-"""Numbers that others have printed for the gallery's problems, and how each is computed here."""
+"""Published figures of the gallery's problems and how they are recomputed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SPG = "CSPG.jl"  # its table of CUTEst's problems, by the spectral projected gra
 
 @dataclass(frozen=True)
 class Published:
-    """A number as it was printed, and how it is found here.
+    """Published figure and the function that recomputes it.
 
     Attributes:
         problem: whose it is, a heading of docs/problems.md.
@@ -54,7 +54,7 @@ class Published:
 
 
 def solution(problem: Problem) -> np.ndarray:
-    """Return the solution of a problem of the gallery, to 12 digits, on the host.
+    """Return the solution of a gallery problem to 12 digits, on the host.
 
     Raises:
         RuntimeError: it was not found; the message has the status.
@@ -151,7 +151,9 @@ def _dam(nx: int) -> np.ndarray:
 
 
 def seepage_height(w: np.ndarray, *, high: float = 24.0, low: float = 4.0) -> float:
-    """Return how far above the water behind the dam the highest wet node beside its face lies, as p4pdes/dam.c does.
+    """Return the height of the seepage face of a dam above the water behind it.
+
+    Of the highest wet node beside the face, as in p4pdes/dam.c.
 
     Args:
         w: solution of `dam`, shape (ny, nx).

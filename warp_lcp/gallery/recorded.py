@@ -1,4 +1,4 @@
-"""Problems of grids as files, `problem_<step>.npz`: the pressure problems that a run met, for every method to be tried on."""
+"""Recorded grid problems, `problem_<step>.npz`: pressure problems of a run."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ d (x - clip(x - y / d, lower, upper)) with d the diagonal of A. `absolute_tolera
 
 @dataclass(frozen=True, eq=False)
 class RecordedProblem(Problem):
-    """A problem that a simulation met.
+    """Problem recorded by a simulation.
 
     Args:
         x0: where the simulation started, a field like b.
@@ -75,7 +75,9 @@ class RecordedProblem(Problem):
 
 
 def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
-    """Return what a file holds of a problem on a grid, as host arrays; `NUMBERS` are the caller's to add.
+    """Return the arrays of a recorded problem, on the host.
+
+    The caller adds `NUMBERS`.
 
     Args:
         problem: whose operator is a GridPoisson.
@@ -86,7 +88,7 @@ def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
     """
     A = problem.A
     if not isinstance(A, GridPoisson) or any(A.periodic):
-        raise ValueError("a file holds problems of a GridPoisson without periodic axes")
+        raise ValueError("only problems of a GridPoisson without periodic axes can be recorded")
     cells = _inner(A.cells, A)
     fluid = cells == FLUID
     kept: dict[str, np.ndarray] = {"format": np.array(FORMAT), "cells": cells}
@@ -116,13 +118,13 @@ def _inner(field: wp.array[Any], A: GridPoisson, axis: int | None = None) -> np.
 
 
 def files(folder: Path) -> list[Path]:
-    """Return the problems of a folder in the order of their steps; none if there is no such folder."""
+    """Return the problem files of a folder by step; empty if there is no folder."""
     found = [(int(match["step"]), path) for path in folder.glob("problem_*.npz") if (match := PROBLEM_FILE.fullmatch(path.name))]
     return [path for _, path in sorted(found)]
 
 
 def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> RecordedProblem:
-    """Read a problem.
+    """Read a recorded problem.
 
     Args:
         path: the file.
@@ -143,7 +145,7 @@ def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> Recorded
 
 
 def check(path: Path) -> None:
-    """Look whether a file is one of a problem, without reading its fields.
+    """Check that a file holds a recorded problem, without reading its fields.
 
     Raises:
         ValueError: it is not, or is cut short or of a later version; the message names it.
@@ -154,18 +156,18 @@ def check(path: Path) -> None:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Archive]:
-    """Open a problem's file and look whether it is one, without reading its fields.
+    """Open a recorded problem and check it, without reading its fields.
 
     Raises:
-        ValueError: it is not, is damaged, of a later version, or larger than the free memory; the message names it. What the block raises
-            of what is in the file is told so too.
+        ValueError: it is not, is damaged, of a later version, or larger than the free memory; the message names it. Errors of the block
+            about the content of the file are reported in the same way.
     """
     try:
         with Archive(Path(path)) as archive:
             _check(archive)
             yield archive
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: no recorded problem: {error}") from error
+        raise ValueError(f"{path}: is not a recorded problem: {error}") from error
 
 
 def _check(archive: Archive) -> None:
@@ -201,7 +203,9 @@ def cell_counts(path: Path) -> tuple[int, ...]:
 
 
 def load_part(path: Path, part: tuple[slice, ...]) -> dict[str, np.ndarray]:
-    """Return the arrays of a recorded problem in a box of cells: `cells`, `b`, bounds, coefficients of its faces (upper ones too), shift.
+    """Return the arrays of a recorded problem in a box of cells.
+
+    `cells`, `b`, bounds, face coefficients (upper faces included) and shift.
 
     The file is read from its start to the box's end, one plane of cells (in 2-D one row) at a time.
 

@@ -1,4 +1,4 @@
-"""Bodies, ground, hinges and gravity, and the velocity problem of their next time step."""
+"""World of bodies, ground, hinges and gravity, and its velocity problem."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class World:
     Attributes:
         bodies: their state; steps write it.
         fixed: which do not move, shape (n,).
-        contact_solve: what finds contacts, and remembers their impulses.
+        contact_solve: finds contacts and stores their impulses.
         size: reach of the smallest body [m].
 
     Raises:
@@ -71,7 +71,7 @@ class World:
         if not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity = {self.gravity}: must be finite, in m/s^2")
         if not len(self.solids):
-            raise ValueError("solids is empty: there must be a body")
+            raise ValueError("solids is empty: expected at least one body")
         self.fixed = np.isposinf(self.mass)
         made = [_made(solid, 1.0 if m == FIXED else m) for solid, m in zip(self.solids, self.mass, strict=True)]
         self.bodies = [RigidBody(properties, name=f"body {i}", friction=self.friction) for i, (properties, _) in enumerate(made)]
@@ -84,7 +84,7 @@ class World:
         return np.array([body.velocities(3) for body in self.bodies])
 
     def contacts(self, dt: float = 0.0, *, margin: float | None = None) -> Contacts:
-        """Return the contacts of now, or those possible within dt [s].
+        """Return the current contacts, or those possible within dt [s].
 
         dt assumes that two bodies meet at the largest speed of all.
 
@@ -133,18 +133,18 @@ class World:
         return Assembly(system, contacts, J, response, falling, bias)
 
     def energy(self) -> float:
-        """Return kinetic and potential energy of the bodies that move [J]."""
+        """Return kinetic plus potential energy of the moving bodies [J]."""
         moving = [body for body, still in zip(self.bodies, self.fixed, strict=True) if not still]
         return sum(body.kinetic_energy + body.potential_energy(np.array(self.gravity)) for body in moving)
 
     def deepest(self) -> float:
-        """Return the largest overlap of bodies [m], 0 where there is none."""
+        """Return the largest overlap of bodies [m], 0 without overlap."""
         return max(0.0, -float(self.contacts().gap.min(initial=0.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """A step's velocity problem, and what its impulses do.
+    """Velocity problem of a step and the response to its impulses.
 
     Args:
         system: B, q, friction, bounds of joints.

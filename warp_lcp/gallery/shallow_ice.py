@@ -1,4 +1,7 @@
-"""The steady shallow ice sheet: thickness H >= 0 of ice that flows by its own slope, a nonlinear problem as a sequence of linear ones."""
+"""Steady shallow ice sheet: thickness H >= 0, a nonlinear obstacle problem.
+
+It is solved as a sequence of LCPs.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +64,7 @@ class IceDome:
     def __post_init__(self) -> None:
         """Check that all numbers are in range."""
         if self.nodes < 3:
-            raise ValueError(f"nodes = {self.nodes}: must be >= 3, a side's with those on the border")
+            raise ValueError(f"nodes = {self.nodes}: must be >= 3, the nodes along a side, border included")
         for name, least in (("side", 0), ("radius", 0), ("height", 0), ("exponent", 1), ("softness", 0), ("slope", 0)):
             if not least < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be > {least} and finite")

@@ -20,12 +20,14 @@ def solve(
     A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, *, coefficients: Mapping[str, Any] | None = None,
     adjoint: StoppingCriteria | None = None, **options: Any,
 ) -> Any:  # fmt: skip
-    """Return x of y = A x + b with bounds as an array of b's type, with gradients to all that is given.
+    """Return the solution x as a JAX array with gradients to all arguments.
+
+    x solves y = A x + b with bounds; it has the type of b.
 
     Callbacks are pure: going back begins with a solve from x, which takes no step where x has not been rounded to float32.
 
     Args:
-        A: an operator, or what makes one of `coefficients`, say `functools.partial(wl.GridPoisson, cells)`; on any device.
+        A: an operator, or a function of `coefficients` that returns one, such as `functools.partial(wl.GridPoisson, cells)`; any device.
         b: as of `wl.LCP`.
         lower: an array or a number.
         upper: likewise.

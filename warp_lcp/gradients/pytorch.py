@@ -20,10 +20,12 @@ def solve(
     A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, *, coefficients: Mapping[str, Any] | None = None,
     adjoint: StoppingCriteria | None = None, **options: Any,
 ) -> Any:  # fmt: skip
-    """Return x of y = A x + b with bounds as a tensor of b's type, with gradients to all tensors given.
+    """Return the solution x as a PyTorch tensor with gradients to all tensors given.
+
+    x solves y = A x + b with bounds; it has the type of b.
 
     Args:
-        A: an operator, or what makes one of `coefficients`, say `functools.partial(wl.GridPoisson, cells)`; on the tensors' device.
+        A: an operator, or a function of `coefficients` that returns one, such as `functools.partial(wl.GridPoisson, cells)`; same device.
         b: as of `wl.LCP`, a tensor.
         lower: a tensor or a number.
         upper: likewise.

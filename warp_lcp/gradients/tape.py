@@ -21,13 +21,15 @@ def solve(
     tape: wp.Tape, A: Any, b: Any, lower: Any = 0.0, upper: Any = np.inf, *, coefficients: Mapping[str, Any] | None = None,
     adjoint: StoppingCriteria | None = None, **options: Any,
 ) -> SolveResult:  # fmt: skip
-    """Solve y = A x + b with bounds and record that; `tape.backward` adds to the gradients of what has one.
+    """Solve y = A x + b with bounds and record the solve on a Warp tape.
+
+    `tape.backward` then adds to the gradients of all arrays that have one.
 
     Call it outside of the tape's `with`, which would record, and keep, each launch of the solve.
 
     Args:
         tape: continued by what follows the solve.
-        A: an operator, or what makes one of `coefficients`, say `functools.partial(wl.GridPoisson, cells)`.
+        A: an operator, or a function of `coefficients` that returns one, such as `functools.partial(wl.GridPoisson, cells)`.
         b: as of `wl.LCP`; like bounds and coefficients an array with `requires_grad=True` if its gradient is wanted.
         lower: likewise.
         upper: likewise.

@@ -100,7 +100,9 @@ class Gradients:
 
 
 def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | None = None, allow_inexact: bool = False) -> Gradients:
-    """Return the gradients of a scalar L(x) through the solution x of a problem.
+    """Return the gradients of a scalar L(x) of the solution x of a problem.
+
+    Vector-Jacobian product of the solution map.
 
     They cost one linear solve on the free unknowns.
 
@@ -135,7 +137,7 @@ def vjp(result: SolveResult, cotangent: Array, *, stopping: StoppingCriteria | N
     adjoint, multiplier = _adjoint(problem, cells, g, free, result.grid is not None, stopping or StoppingCriteria())
     ended = f"{adjoint.status.name} at {adjoint.relative_residual:.1e} of its right-hand side ({adjoint.status.value})"
     if not (adjoint or allow_inexact):
-        raise ArithmeticError(f"the linear solve of the gradients: {ended}; allow_inexact=True takes what there is")
+        raise ArithmeticError(f"the linear solve of the gradients: {ended}; allow_inexact=True returns the inexact gradient")
     A, varying, z = problem.A, problem.bounds.varying, y
     _gather(problem, multiplier, g, z)
     found = A.coefficient_gradient(multiplier, x) if has(A, HasCoefficients) else {}
@@ -162,17 +164,17 @@ def _checked(result: Any, allow_inexact: bool) -> LCP:
         raise ValueError(f"result is a {type(result).__name__}: expected what wl.solve returned")
     problem = result.problem
     if problem is None:
-        raise ValueError("result does not know its problem, which is not pickled with it: solve again")
+        raise ValueError("result has no problem, which pickling leaves out: solve again")
     if not isinstance(problem, LCP):
         raise ValueError(f"result is that of a {type(problem).__name__}: gradients are those of an LCP")
     if problem.bounds.affine is not None:
         raise ValueError("result is that of a problem with bounds that are affine in x: gradients need numbers or fields")
     if problem.layout.across is not None:
-        raise ValueError("result is that of a problem that ranks share: gradients are those of one process")
+        raise ValueError("result belongs to a problem on several ranks: gradients need one process")
     if not (result or allow_inexact):
         raise ValueError(f"result did not converge ({result.status.name}): solve further, or pass allow_inexact=True")
     if version_of(problem.A) != result.version:
-        raise ValueError("result is older than its operator, which has changed in place since: solve again")
+        raise ValueError("the operator has changed in place since the result was computed: solve again")
     return problem
 
 

@@ -1,10 +1,10 @@
-"""Particles and fields carried by the grid's velocity.
+"""Advection of particles and fields by the velocity of the grid.
 
 Third-order Runge-Kutta with the weights 2/9, 3/9, 4/9 at 0, 1/2, 3/4 of the step [Ralston 1962]. Three ways:
 
 Particles among whole cells (`advect`) never enter a SOLID one. Every stage walks from cell to cell: a particle that meets a closed face
-stops short of it and slides on along it. With solids of whole cells no distance is needed, and none would do: pushing particles out along
-a distance strands them in SOLID cells. The number of cells to the nearest solid tells which particles nothing can stop; only the others
+stops before it and slides along it. Whole-cell solids need no distance, and a distance would not work: pushing particles out along
+it strands them in SOLID cells. The number of cells to the nearest solid shows which particles cannot be stopped; only the others
 walk.
 
 Particles among walls that are given by their distance (`advect_with_distance`). One whose distance to walls exceeds its way needs no care.
@@ -77,20 +77,20 @@ def _runge_kutta(module: str, name: str, walls: dict[str, Any], endless: int, **
 
 @functools.cache
 def advect_pass(endless: int) -> RowPass:
-    """Return the pass of `advect` for a domain whose axis n has no end where bit n is set."""
+    """Return the kernel of `advect` for a set of periodic axes (bit n: axis n)."""
     return _runge_kutta("warp_lcp.grid.advection", "advect", {"room": wp.int8}, endless)
 
 
 @functools.cache
 def distance_pass(endless: int) -> RowPass:
-    """Return the pass of `advect_with_distance` for such a domain."""
+    """Return the kernel of `advect_with_distance` for a set of periodic axes."""
     walls, more = {"distance": wp.float32}, {"numbers": {"open_sides": int}, "constants": _WALLS}
     return _runge_kutta("warp_lcp.grid.distance_advection", "advect_with_distance", walls, endless, **more)
 
 
 @functools.cache
 def carry_pass(axis: int) -> RowPass:
-    """Return the pass of `carry_field` for the faces of an axis or `CENTERS`."""
+    """Return the kernel of `carry_field` for the faces of an axis or `CENTERS`."""
     name, numbers = f"warp_lcp.grid.semi_lagrangian_{axis}.carry", {"planes": int, "h": wp.float32, "least": wp.float32}
     numbers |= dict.fromkeys(("before_x", "before_y", "before_z"), int)
     constants = {"AXIS": axis, "CENTERS": CENTERS, "ENDLESS": 0}
@@ -119,7 +119,9 @@ def clearance_kernel(cells: wp.array3d(dtype=wp.int8), planes: int, distance: in
 
 
 def clearance(grid: StaggeredGrid, cells: wp.array) -> wp.array:
-    """Return how many cells away the nearest SOLID cell is, diagonals counting as 1: 0 in SOLID cells, at most MAX_CLEARANCE.
+    """Return the distance to the nearest SOLID cell in cells, diagonals counting 1.
+
+    0 in SOLID cells, at most MAX_CLEARANCE.
 
     Args:
         grid: the grid.
@@ -137,7 +139,7 @@ def clearance(grid: StaggeredGrid, cells: wp.array) -> wp.array:
 def advect(
     grid: StaggeredGrid, fields: list[wp.array], room: wp.array, dt: float, position: wp.array, stopped: wp.array, endless: int = 0
 ) -> None:  # fmt: skip
-    """Move particles through the grid's velocity for a time step.
+    """Advect particles for a time step among whole-cell solids.
 
     Args:
         grid: the grid.
@@ -158,7 +160,9 @@ def advect_with_distance(
     grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, position: wp.array, stopped: wp.array, *,
     open_sides: int = 0, endless: int = 0,
 ) -> None:  # fmt: skip
-    """Move particles through the grid's velocity for a time step; nobody ends within MARGIN cells of a wall who did not start there.
+    """Advect particles for a time step among walls given by their distance.
+
+    No particle ends within MARGIN cells of a wall unless it started there.
 
     Where no way back out of a wall is found within a cell, a particle stays where its last stride was open. A move goes at most 1024
     cells, and 32 along walls.
@@ -171,7 +175,7 @@ def advect_with_distance(
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
-        open_sides: of `warp_lcp.grid.sides.side_bits`: they stop nobody. Who crosses them ends on them or beyond.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or beyond.
         endless: has bit n set if axis n has no end, see `advect`; its sides are open, and alike.
     """
     u, v, w = [*fields, None][:3]
@@ -180,7 +184,9 @@ def advect_with_distance(
 
 
 def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0) -> None:
-    """Put particles that walls have run over, or come too near, back into the open along the gradient of the distance.
+    """Push particles out of walls along the gradient of the distance.
+
+    Of walls that have moved over them or come too close.
 
     Args:
         grid: the grid.
@@ -197,7 +203,7 @@ def carry_field(
     grid: StaggeredGrid, window: Window, velocity: list[wp.array], dt: float, field: wp.array, out: wp.array, *, axis: int, level: wp.array,
     least: float, before: tuple[int, int, int] = (0, 0, 0),
 ) -> None:  # fmt: skip
-    """Find what a field will be after a time step.
+    """Advect a field for a time step (semi-Lagrangian).
 
     Args:
         grid: the grid.

@@ -1,4 +1,4 @@
-"""Solids that cut cells: which part of each face they leave open, and how they move.
+"""Cut cells: open fractions of faces and the velocity of solids.
 
 All of it comes from the solids' signed distances at the nodes of the grid (the cells' corners), linear in between: exact for planes, of
 second order for smooth walls; at a solid's edges, and where it or a gap is thinner than two cells, off by a part of a cell.
@@ -25,7 +25,7 @@ DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
 
 
 class CutCells:
-    """Say what solids leave open of the faces and cells of a grid, at a time.
+    """Cut cells: open fractions of faces and cells beside solids at a time.
 
     Node (k, j, i) is the low corner of stored cell (k, j, i), face (k, j, i) of a component the cell's lower face; 2-D uses plane k = 1.
 
@@ -54,7 +54,7 @@ class CutCells:
         notes: warnings worth a line at the start of a run.
         whole_cells: whether every face is open or closed, no solid reaches into a cell with an open face and nothing moves.
         moves: whether a solid moves.
-        moving: what tells kernels which solids that move cover a face.
+        moving: kernel argument with the moving solids that cover a face.
 
     Raises:
         ValueError: a solid that stands still lies wholly outside the domain, or the solids leave no open cell.
@@ -107,11 +107,13 @@ class CutCells:
 
     @property
     def dropped(self) -> int:
-        """Number of faces whose open fraction was below 1e-3 and became 0."""
+        """Number of faces with an open fraction below 1e-3, set to 0."""
         return int(self._counts.numpy()[0])
 
     def move(self, time: float, dt: float) -> None:
-        """Put the moving solids where they are at a time, with the velocity that took them there; nothing happens if none moves.
+        """Move the solids to a time and set their velocity.
+
+        The velocity is that of the step that ends then; nothing happens if none moves.
 
         Args:
             time: [s].
@@ -121,7 +123,10 @@ class CutCells:
         self.set_velocity(time, -dt)
 
     def place(self, time: float) -> None:
-        """Put the moving solids where they are at a time [s] and refill all fields but the velocity; nothing happens if none moves."""
+        """Place the solids at a time [s] and recompute all fields but the velocity.
+
+        Nothing happens if none moves.
+        """
         if not self.moves:
             return
         self._nodes.copy_from(self._standing)
@@ -130,7 +135,7 @@ class CutCells:
         self._refresh()
 
     def set_velocity(self, time: float, dt: float) -> None:
-        """Fill the velocity: the way of the solids' points from one time to another, divided by the time between.
+        """Set the velocity: displacement of the solids' points over a time, divided by it.
 
         So the volume that a wall sweeps is its displacement's, whatever the motion is like within the step. Bodies that the material moves
         have the velocities of their state: those are what it changes, and no rotation of such a field changes a volume.
@@ -171,7 +176,10 @@ class CutCells:
         self._moved_from = self._moved_to
 
     def moving_block(self) -> tuple[list[int], list[int]] | None:
-        """Return the low and high cell (x, y, z), both included, of a block with all cells beside solids that move, if there are any."""
+        """Return the block of cells beside moving solids, or None.
+
+        Low and high cell (x, y, z), both included.
+        """
         if not self._moved_to:
             return None
         low = np.min([block[0] for block in self._moved_to], axis=0) - 1

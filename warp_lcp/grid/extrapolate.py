@@ -1,4 +1,4 @@
-"""Velocity from known faces to the faces around them, a layer of faces at a time."""
+"""Extrapolation of a velocity from known faces, layer by layer."""
 
 import typing
 from collections.abc import Callable, Sequence
@@ -28,7 +28,9 @@ def complete(
     window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array],
     join: Callable[[wp.array, wp.array], None] | None = None,
 ) -> None:  # fmt: skip
-    """Continue the particles' velocity to faces near them that none of them gave weight: cells may be full or dense beyond those.
+    """Extrapolate the particles' velocity to nearby faces without weight.
+
+    Cells beyond those may be full or dense.
 
     Args:
         window: faces to consider.
@@ -49,7 +51,9 @@ def extrapolate(
     window: Window, known: wp.array, field: wp.array, layers: int, *, start: int = 1, fill: int = UNKNOWN,
     join: Callable[[wp.array, wp.array], None] | None = None,
 ) -> None:  # fmt: skip
-    """Give unknown faces the mean of their known neighbors, layer after layer.
+    """Extrapolate a field: unknown faces get the mean of their known neighbors.
+
+    One layer after the other.
 
     Args:
         window: faces to consider; `known` must not be positive outside it.

@@ -1,4 +1,4 @@
-"""The liquid's surface: a level set from the density of its particles."""
+"""Level set of the liquid's surface from the density of its particles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PARTS = {2: 4, 3: 2}  # points an axis that a cell on the surface is sampled at
 
 
 class LevelSet:
-    """Measure how far each cell's center is from the liquid's surface.
+    """Level set: signed distance of cell centers to the liquid's surface.
 
     The density is the sum of the particles' quadratic B-splines at the cell's center, in units of the density at rest. Divided by the
     capacity, what the cell's kernel can hold beside solids, it is the filled share of the kernel, and phi is the distance at which a half
@@ -63,7 +63,7 @@ class LevelSet:
         self._filled: Window | None = None
 
     def update(self, particles: Particles, window: Window, capacity: wp.array | None, base: wp.array, *, fill: Fill | None = None) -> None:
-        """Take the particles where they are now.
+        """Compute the level set of the particles.
 
         Args:
             particles: the liquid. If it is indexed it must not have moved since it was sorted: each cell then gathers from the particles
@@ -72,7 +72,7 @@ class LevelSet:
                 then stays out of reach of the density.
             capacity: share of each cell's kernel that is open, float32; None: 1 everywhere.
             base: int8, SOLID in cells that hold no liquid.
-            fill: adds to the density in a window what no particle stands for.
+            fill: adds the density of liquid without particles in a window.
         """
         grid = self.grid
         particle_density(grid, particles, window, self.particles_a_cell, self.density)
@@ -99,7 +99,9 @@ class LevelSet:
         extrapolate(window, self._known, self.phi, kernels.EXTENDED)
 
     def volume(self, distance: wp.array | None, window: Window) -> float:
-        """Return the volume [m^3] (2-D: the area [m^2]) of phi < 0 outside the solids, phi multilinear between the cells' centers.
+        """Return the volume of phi < 0 outside the solids [m^3; m^2 in 2-D].
+
+        phi is multilinear between the cells' centers.
 
         Args:
             distance: signed distance to the solids at the cells' low corners [cells], > 0 in the open, float32; None: solids are the
@@ -110,7 +112,10 @@ class LevelSet:
         return self.measured
 
     def measure(self, distance: wp.array | None, window: Window | None) -> None:
-        """Find the volume that `volume` returns, without waiting for it; None: of no cells."""
+        """Launch the computation of `volume` without waiting.
+
+        None: of no cells.
+        """
         grid = self.grid
         box = window.common(grid.domain) if window is not None else None
         self._measured = box is not None
@@ -123,7 +128,7 @@ class LevelSet:
 
     @property
     def measured(self) -> float:
-        """The volume that was measured [m^3; m^2 in 2-D]."""
+        """Measured volume [m^3; m^2 in 2-D]."""
         return self._volume.read()[0] * self.grid.cell_volume if self._volume is not None and self._measured else 0.0
 
     def _smoothed(self, window: Window, source: wp.array, first: wp.array, second: wp.array) -> wp.array:
@@ -135,7 +140,9 @@ class LevelSet:
 
 
 def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, particles_a_cell: int, density: wp.array) -> None:
-    """Add up the particles' quadratic B-splines at the cells' centers, in units of the density at rest.
+    """Compute the density of particles at cell centers, relative to rest.
+
+    By quadratic B-splines.
 
     Args:
         grid: the grid.
@@ -153,7 +160,9 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
 
 
 def whole_cell_capacity(grid: StaggeredGrid, base: wp.array, capacity: wp.array) -> None:
-    """Find how much of each cell's kernel is open where solids are whole cells: exactly 1/6, 2/3, 1/6 of it along each axis.
+    """Compute the open fraction of each cell's kernel for whole-cell solids.
+
+    Exact: 1/6, 2/3, 1/6 of the kernel along each axis.
 
     Args:
         grid: the grid.

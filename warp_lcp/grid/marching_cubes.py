@@ -1,4 +1,6 @@
-"""Marching cubes on a device: the surface phi = 0 as triangles, in 2-D as segments, closed and without duplicate points.
+"""Marching cubes on a device: the surface phi = 0 as triangles or segments.
+
+Closed, without duplicate points; segments in 2-D.
 
 One thread takes a row of cells, and knows from a scan where its points and triangles go. A point belongs to the node at the low end of its
 edge; a node's points are numbered x, y, z from the number that the node keeps.
@@ -106,7 +108,10 @@ def _cut(loop: Loop) -> Cut | None:
 
 @functools.cache
 def triangle_table() -> np.ndarray:
-    """Return the triangles of each case as edges, int8, shape (256, 1 + 3 MOST): their number, then three edges each."""
+    """Return the triangles of each case as edges, int8, shape (256, 1 + 3 MOST).
+
+    The number of triangles, then three edges each.
+    """
     table = np.full((256, 1 + 3 * MOST), -1, dtype=np.int8)
     for case in range(256):
         triangles: list[Edge] = []
@@ -121,7 +126,10 @@ def triangle_table() -> np.ndarray:
 
 @functools.cache
 def segment_table() -> np.ndarray:
-    """Return the segments of a square's cases as edges, int8, shape (16, 5): their number, then two edges each, the inside on the left."""
+    """Return the segments of each square's case as edges, int8, shape (16, 5).
+
+    The number of segments, then two edges each, the inside on the left.
+    """
     table = np.full((16, 5), -1, dtype=np.int8)
     low = _faces()[4]  # z = 0, seen from below
     for case in range(16):
@@ -150,7 +158,7 @@ CORNERS = _made("corners", {"number": _I32}, {}, _ROWS, table=wp.int8, into=_I32
 
 @dataclass(frozen=True)
 class DeviceMesh:
-    """A surface on a device.
+    """Surface mesh on a device.
 
     Attributes:
         points: [m], wp.vec3, shape (n,).
@@ -162,7 +170,7 @@ class DeviceMesh:
 
 
 class MarchingCubes:
-    """Find surfaces in fields of a grid.
+    """Marching cubes on fields of a grid.
 
     Args:
         grid: the grid.
@@ -173,7 +181,9 @@ class MarchingCubes:
         self._table = wp.array(triangle_table() if grid.dimension == 3 else segment_table(), dtype=wp.int8, device=grid.device)
 
     def contour(self, phi: wp.array, number: wp.array) -> DeviceMesh:
-        """Return the surface phi = 0, linear between the cells' centers, and flat on the domain's sides where it is cut off there.
+        """Return the surface phi = 0, linear between cell centers.
+
+        Flat on the domain's sides where it is cut off there.
 
         Where it meets a side at a right angle it ends there in an edge: what crosses it between centers beside a side is put on the side.
         The same points in the same order on every run.
@@ -194,7 +204,7 @@ class MarchingCubes:
         return DeviceMesh(points, self._corners(cells, phi, number, made))
 
     def corners(self, phi: wp.array, number: wp.array, cells: Window) -> wp.array:
-        """Return those corners of the last surface that lie in some cells.
+        """Return the corners of the last surface that lie in given cells.
 
         Args:
             phi: as `contour` was given it.

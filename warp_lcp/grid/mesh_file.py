@@ -1,4 +1,7 @@
-"""Read the triangles of OBJ, STL and PLY files. Nothing is allocated for what a file only promises to hold."""
+"""Read the triangles of OBJ, STL and PLY files.
+
+No memory is allocated for data that a file only declares.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,9 @@ Corners = list[np.ndarray]  # of polygons, each of shape (count, corners)
 
 
 def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the polygons of a file as triangles; texture coordinates, normals, colors, points and lines are ignored.
+    """Read the polygons of a file as triangles.
+
+    Texture coordinates, normals, colors, points and lines are ignored.
 
     Polygons become fans about their first corner. (Where a polygon is not convex, triangles then overlap with opposite orientation: the
     inside stays right.)
@@ -105,9 +110,9 @@ def _parse_binary_stl(data: bytes) -> tuple[np.ndarray, Corners]:
     """Read the corners of a binary STL, three for each triangle; bytes behind the last one, which some programs write, are passed over."""
     count, held = _stl_count(data), (len(data) - STL_HEADER) // STL_TRIANGLE.itemsize
     if held < count:
-        raise ValueError(f"neither text nor of the length that its number of triangles asks for: it says {count} and holds {held}")
+        raise ValueError(f"neither text nor a binary file of the right length: it declares {count} triangles and holds {held}")
     if not count:
-        raise ValueError(f"it says that it has no triangles, and {len(data) - STL_HEADER} bytes follow")
+        raise ValueError(f"it declares no triangles, but {len(data) - STL_HEADER} bytes follow")
     points = np.frombuffer(data, STL_TRIANGLE, count, STL_HEADER)["corners"].reshape(-1, 3).astype(np.float64)
     return points, [np.arange(len(points)).reshape(-1, 3)]
 
@@ -116,7 +121,7 @@ def _parse_text_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Read the corners of a text STL; blank lines and words in capitals do not matter."""
     data = data.removeprefix(MARK).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if not data.lstrip()[:5].lower() == b"solid":
-        raise ValueError(f"{path}: not a readable STL file (neither text nor of the length that its number of triangles asks for)")
+        raise ValueError(f"{path}: not a readable STL file (neither text nor a binary file of the right length)")
     corners = re.findall(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", data, flags=re.MULTILINE | re.IGNORECASE)
     facets = len(re.findall(rb"^\s*endfacet\b", data, flags=re.MULTILINE | re.IGNORECASE))
     if len(corners) != 3 * facets:
@@ -157,7 +162,7 @@ def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
         if any(length for _, _, length in element.properties):
             corners = next((names.index(name) for name in PLY_CORNERS if name in names), -1) if element.name == "face" else -1
             if corners >= 0 and element.properties[corners][1][0] == "f":
-                raise ValueError("its faces name vertices by numbers that are not whole")
+                raise ValueError("vertex indices of its faces are not integers")
             polygons += source.lists(element, corners)
         else:
             table = source.table(element)
@@ -185,9 +190,9 @@ def _ply_header(text: str) -> tuple[str | None, list[_Element]]:
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise ValueError(f"its header says {line[:80]!r}")
+                raise ValueError(f"unknown line in its header: {line[:80]!r}")
     if order == "":
-        raise ValueError("its header names no format")
+        raise ValueError("its header has no format line")
     return order, elements
 
 

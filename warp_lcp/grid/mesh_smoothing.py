@@ -1,4 +1,7 @@
-"""Smooth a closed surface without shrinking it, as Taubin does: a step of Laplacian smoothing, then a slightly longer one back."""
+"""Taubin smoothing of a closed surface: no shrinking.
+
+A step of Laplacian smoothing, then a slightly longer one back.
+"""
 
 import typing
 
@@ -58,13 +61,16 @@ MOST = 0.3  # lattice cells that a point may move: facets are shallower, drops o
 
 
 def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, rounds: int) -> wp.array:
-    """Move the points of a surface but for those on the domain's sides and on solids; return marks of these, uint8, a point each.
+    """Smooth a surface; points on the domain's sides and on solids are fixed.
 
     Args:
         mesh: a closed surface from `warp_lcp.grid.marching_cubes` (updated).
         lattice: the grid that it was found on.
         room: distance to solids at the lattice's cell centers [lattice cells], float32; None: there are no solids.
         rounds: steps forth and back; each lets a point look two points farther.
+
+    Returns:
+        Marks of the points that are fixed, uint8, shape (points,).
     """
     device, count = lattice.device, len(mesh.points)
     held = wp.zeros(count, dtype=wp.uint8, device=device)

@@ -1,4 +1,6 @@
-"""Prescribed motions of solids: where a solid is at a time, relative to where its scene places it.
+"""Prescribed motions of solids.
+
+A motion is a pose over time, relative to the placement in the scene.
 
 All motions are functions of time alone, in float64: a solid that turns for a million steps has not drifted, and a run that is resumed sees
 the same poses. Points and directions are those of the domain [m]; two coordinates mean z = 0, and a 2-D scene turns about z.
@@ -26,7 +28,7 @@ SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
 
 
 def keep_checked(frozen: Any, error: float) -> None:
-    """Check the `rotation` and `translation` of a frozen dataclass, and store them as float64.
+    """Check `rotation` and `translation` of a frozen dataclass; store them as float64.
 
     Args:
         frozen: the dataclass.
@@ -49,7 +51,7 @@ def keep_checked(frozen: Any, error: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A rigid change of place: p becomes rotation @ p + translation.
+    """Rigid transformation: p becomes rotation @ p + translation.
 
     Args:
         rotation: proper rotation matrix, shape (3, 3).
@@ -68,12 +70,15 @@ class Pose:
 
     @classmethod
     def identity(cls) -> Pose:
-        """Return the pose that changes nothing."""
+        """Return the identity."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
     def about(cls, center: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> Pose:
-        """Return a turn about a center [m], shape (3,), followed by a shift [m], shape (3,)."""
+        """Return a rotation about a center [m], shape (3,), followed by a shift [m].
+
+        The shift has shape (3,).
+        """
         return cls(rotation, center - rotation @ center + shift)
 
     @classmethod
@@ -86,37 +91,40 @@ class Pose:
         return made
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Return `points` [m], shape (..., 3), after the change of place."""
+        """Return transformed points [m], shape (..., 3)."""
         return cast(np.ndarray, np.asarray(points) @ self.rotation.T + self.translation)
 
     def after(self, other: Pose) -> Pose:
-        """Return the pose that does `other` first and then this one: (a.after(b)).apply(p) = a.apply(b.apply(p))."""
+        """Return the composition: (a.after(b)).apply(p) = a.apply(b.apply(p))."""
         return Pose._of(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def inverse(self) -> Pose:
-        """Return the pose that undoes this one."""
+        """Return the inverse transformation."""
         return Pose._of(np.array(self.rotation.T), -self.rotation.T @ self.translation)
 
 
 @runtime_checkable
 class Motion(Protocol):
-    """Where a solid is over time."""
+    """Motion of a solid: pose over time."""
 
     def pose(self, time: float) -> Pose:
-        """Return the change of place at `time` [s] that takes the solid as its scene places it to where it is."""
+        """Return the pose at `time` [s], relative to the placement in the scene."""
 
 
 @runtime_checkable
 class RigidMotion(Motion, Protocol):
-    """A motion that forces change: its velocities are a state."""
+    """Motion of a body moved by forces: its velocity is part of a state."""
 
     def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s]: a point x of the solid moves at turn x + shift."""
+        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s].
+
+        A point x of the solid moves at turn x + shift.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Translation:
-    """Move at a constant velocity between two times, and rest before and after.
+    """Constant velocity between two times, at rest before and after.
 
     Args:
         velocity: [m/s], 2 or 3 numbers.
@@ -137,13 +145,13 @@ class Translation:
         _check_interval(self.start, self.stop)
 
     def pose(self, time: float) -> Pose:
-        """Return the shift at `time` [s]."""
+        """Return the pose at `time` [s]."""
         return Pose(np.eye(3), _elapsed(time, self.start, self.stop) * np.asarray(self.velocity))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rotation:
-    """Turn at a constant rate about a fixed axis between two times, and rest before and after.
+    """Constant rotation about a fixed axis between two times, else at rest.
 
     Args:
         rate: [degrees/s], counterclockwise seen from the axis's tip.
@@ -170,14 +178,16 @@ class Rotation:
         _check_interval(self.start, self.stop)
 
     def pose(self, time: float) -> Pose:
-        """Return the turn at `time` [s]."""
+        """Return the pose at `time` [s]."""
         degrees = self.rate * _elapsed(time, self.start, self.stop)
         return Pose.about(np.asarray(self.center), _turn(np.asarray(self.axis), degrees), np.zeros(3))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sinusoid:
-    """Swing about the place that the scene gives: sin(2 pi time / period + phase) times an amplitude, of a shift, an angle or both.
+    """Oscillation about the placement in the scene.
+
+    sin(2 pi time / period + phase) times an amplitude, of a shift, an angle or both.
 
     With phase 0 the solid passes its middle at time 0, at full speed; with -90 degrees it starts at rest at the far end.
 
@@ -211,7 +221,7 @@ class Sinusoid:
         object.__setattr__(self, "axis", unit("axis", _in_space("axis", self.axis)))
 
     def pose(self, time: float) -> Pose:
-        """Return shift and turn at `time` [s]."""
+        """Return the pose at `time` [s]."""
         swing = math.sin(2.0 * math.pi * time / self.period + math.radians(self.phase))
         rotation = _turn(np.asarray(self.axis), self.angle * swing)
         return Pose.about(np.asarray(self.center), rotation, swing * np.asarray(self.amplitude))
@@ -219,7 +229,7 @@ class Sinusoid:
 
 @dataclass(frozen=True, kw_only=True)
 class Keyframes:
-    """Pass given places at given times, and rest before the first and after the last.
+    """Poses at given times; at rest before the first and after the last.
 
     Between them shifts and angles are linear in time, or smooth: monotone cubics (Fritsch & Carlson 1980) that begin and end at rest and do
     not overshoot. In 3-D the turn from one keyframe to the next is the one about a fixed axis (slerp); when smooth, it comes to rest
@@ -266,7 +276,7 @@ class Keyframes:
         object.__setattr__(self, "_turns", turns)
 
     def pose(self, time: float) -> Pose:
-        """Return shift and turn at `time` [s]."""
+        """Return the pose at `time` [s]."""
         shift = np.zeros(3)
         if self._shift:
             value = self._shift.at(time)
@@ -276,7 +286,7 @@ class Keyframes:
 
 
 def top_speed(motion: Motion, bounds: np.ndarray | None, size: np.ndarray, time: float, span: float) -> float:
-    """Return how fast a solid in the domain will be at most in the time to come [m/s].
+    """Return the largest future speed of a point of a solid in the domain [m/s].
 
     A rigid body is fastest at a corner of a box around it; velocities are means over a few parts of the span.
 
@@ -285,7 +295,7 @@ def top_speed(motion: Motion, bounds: np.ndarray | None, size: np.ndarray, time:
         bounds: low and high corner [m] of a box around the solid as it is placed, shape (2, 3); None: it has no limits.
         size: of the domain [m], shape (3,), z = 0 in 2-D.
         time: [s].
-        span: what is looked ahead [s], > 0.
+        span: time to look ahead [s], > 0.
     """
     domain = np.stack([np.zeros(3), size])
     poses = [motion.pose(moment) for moment in np.linspace(time, time + span, SPEED_SAMPLES + 1)]
@@ -305,7 +315,10 @@ def top_speed(motion: Motion, bounds: np.ndarray | None, size: np.ndarray, time:
 
 
 def kinks(motion: Motion) -> tuple[float, ...]:
-    """Return the times [s] at which a motion's velocity jumps, as far as it is one of this module."""
+    """Return the times [s] at which a motion's velocity jumps.
+
+    Only for the motions of this module.
+    """
     if isinstance(motion, Keyframes):
         return () if motion.smooth else tuple(float(time) for time in motion.times)
     return (motion.start, motion.stop) if isinstance(motion, Translation | Rotation) else ()
@@ -401,7 +414,7 @@ def _elapsed(time: float, start: float, stop: float) -> float:
 
 
 def checked_vector(name: str, value: Vector) -> tuple[float, ...]:
-    """Return two or three finite numbers.
+    """Return two or three finite numbers as an array.
 
     Raises:
         ValueError: there are more or fewer, or one is not finite.
@@ -415,7 +428,7 @@ def checked_vector(name: str, value: Vector) -> tuple[float, ...]:
 
 
 def in_space(vector: Vector) -> np.ndarray:
-    """Return a point or direction of two or three coordinates in space, z = 0 in 2-D."""
+    """Return a point or direction in space; z = 0 in 2-D."""
     return np.array([*vector, 0.0][:3])
 
 
@@ -424,7 +437,7 @@ def _in_space(name: str, value: Vector) -> tuple[float, ...]:
 
 
 def unit(name: str, value: Vector) -> tuple[float, ...]:
-    """Return a direction of unit length, as many numbers.
+    """Return a direction scaled to unit length.
 
     Raises:
         ValueError: it is zero.

@@ -1,4 +1,4 @@
-"""Particles in about the order of their cells: positions, velocities and the gradients that APIC carries."""
+"""Particles in approximate cell order: position, velocity, APIC gradients."""
 
 import typing
 from dataclasses import dataclass, field
@@ -72,7 +72,7 @@ class ParticleTotals:
 
 
 class Column:
-    """A vector for each particle, in storage that may have room for more.
+    """Array of one vector per particle, with spare capacity.
 
     Attributes:
         store: wp.vec3, shape (capacity,).
@@ -88,7 +88,7 @@ class Column:
 
 
 class Particles:
-    """Hold particles in arrays that are sorted by cell in place.
+    """Particles, sorted by cell in place.
 
     Args:
         grid: the grid whose cells order the particles.
@@ -133,7 +133,7 @@ class Particles:
 
     @property
     def capacity(self) -> int:
-        """Particles that fit before the storage grows."""
+        """Number of particles that fit before the storage grows."""
         return self._capacity
 
     @property
@@ -148,16 +148,24 @@ class Particles:
 
     @property
     def affine(self) -> list[wp.array]:
-        """Gradient of each component [1/s], wp.vec3, shape (count,) each; empty without `affine`."""
+        """Gradient of each velocity component [1/s], wp.vec3, shape (count,) each.
+
+        Empty without `affine`.
+        """
         return [self._columns[name].view for name in self._names if name.startswith("affine")]
 
     @property
     def kept(self) -> wp.array | None:
-        """The number that each takes along, three times like a velocity: wp.vec3, shape (count,); None: they have none."""
+        """Number carried by each particle, or None.
+
+        Stored three times, like a velocity: wp.vec3, shape (count,).
+        """
         return self._columns["kept"].view if "kept" in self._columns else None
 
     def append(self, position: np.ndarray, velocity: np.ndarray, kept: np.ndarray | float | None = None) -> None:
-        """Add particles behind the others, without a gradient; they are out of order until the next sort.
+        """Add particles at the end, with zero gradient.
+
+        They are out of order until the next sort.
 
         Args:
             position: [m], shape (n, 3).
@@ -181,7 +189,10 @@ class Particles:
             gradient[before:].zero_()  # sorting may have left anything behind the particles in use
 
     def make_room(self, count: int) -> int:
-        """Add particles behind the others and return the number of the first; the caller gives them position, velocity and gradient."""
+        """Add particles at the end and return the index of the first.
+
+        The caller sets their position, velocity and gradient.
+        """
         before = self.count
         self._resize(before + count)
         return before
@@ -192,7 +203,9 @@ class Particles:
         return self._order[self._capacity : self._capacity + self.count]
 
     def remove(self, marks: wp.array) -> int:
-        """Remove particles in place; the others keep their order. Without a particle to remove nothing is copied.
+        """Remove particles in place; the others keep their order.
+
+        Nothing is copied if none is removed.
 
         Args:
             marks: int32, shape (count,): not 0 where a particle is to go; may be `marks`.
@@ -215,13 +228,13 @@ class Particles:
         return removed
 
     def move_to(self, grid: StaggeredGrid) -> None:
-        """Order the particles by another grid's cells from the next sort on."""
+        """Sort the particles by the cells of another grid from now on."""
         self.grid = grid
         if self.offsets is not None:
             self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
 
     def assign(self, arrays: typing.Mapping[str, np.ndarray]) -> None:
-        """Take other particles, as many as there are in the arrays.
+        """Replace the particles by given arrays.
 
         Args:
             arrays: float32 of shape (n, 3) for every name of `arrays`.
@@ -252,7 +265,9 @@ class Particles:
         self._order = zeros(2 * self._capacity, wp.int32, device)
 
     def arrange(self, step: int) -> None:
-        """Number the particles by cell, and sort them in every SORT_EVERY-th step, or in each where the order is needed.
+        """Number the particles by cell; sort every SORT_EVERY-th step if order allows.
+
+        Sorts in each step where the order is needed.
 
         It depends on nothing but the step, so that a run that was interrupted does the same.
 
@@ -271,7 +286,7 @@ class Particles:
         launch(kernels.NUMBER, self.count, grid, position=self.position, key=self.key, **counts)
 
     def sort(self) -> None:
-        """Bring the particles into the order of their cells; equal cells keep their order, so that a run is repeatable."""
+        """Sort the particles by cell (stable, so that runs are repeatable)."""
         grid = self.grid
         if self.count == 0:
             if self.offsets is not None:
@@ -287,7 +302,7 @@ class Particles:
             wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)
 
     def totals(self) -> ParticleTotals:
-        """Return sums over the particles as they are now; the same bits on every run. Without particles all are 0."""
+        """Return sums over the particles; bitwise reproducible, 0 without particles."""
         if self._known is not None:
             return self._known
         if self.count == 0:
@@ -312,25 +327,33 @@ class Particles:
         return found
 
     def totals_stay(self, stay: bool) -> None:
-        """Say whether positions and velocities stay as they were when `totals` last found them: a GPU then is not waited for again.
+        """Declare that positions and velocities are unchanged since `totals`.
 
-        On a GPU those who write to them between steps say that they do not stay.
+        The next `totals` then does not wait for a GPU.
+
+        On a GPU, code that changes them between steps must reset this.
         """
         self._known = self._last if stay and self.count and self.grid.device.is_cuda else None
 
     def cells_of(self, positions: np.ndarray) -> np.ndarray:
-        """Return the interior cell (x, y, z), counted from 0, of positions [m], shape (n, 3); in a part of a grid it may lie outside."""
+        """Return the interior cells (x, y, z), counted from 0, of positions [m].
+
+        Shape (n, 3); they may lie outside of a part of a grid.
+        """
         grid = self.grid
         cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / grid.spacing)
         return np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin)
 
     def arrays(self) -> dict[str, wp.array]:
-        """Return the particles' arrays by name."""
+        """Return the arrays of the particles by name."""
         return {name: column.view for name, column in self._columns.items()}
 
 
 def in_order(parts: np.ndarray) -> np.ndarray:
-    """Return what threads have found of particles, shape (columns, threads), added up one after another, shape (columns, 1)."""
+    """Return the sums over threads in order, shape (columns, 1).
+
+    From partial sums of shape (columns, threads).
+    """
     sums = len(kernels.TOTAL.sums)
     return np.append(np.ascontiguousarray(parts[:sums].T).sum(axis=0), parts[sums:].max(axis=1))[:, None]
 
@@ -341,7 +364,9 @@ def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:
 
 
 def lattice(grid: StaggeredGrid, per_axis: int, jitter: float, random_seed: int, plane: int) -> np.ndarray:
-    """Return per_axis^dimension points a cell of one plane of cells, each moved at random: in a part of a grid as in all of it.
+    """Return jittered lattice points in one plane of cells.
+
+    per_axis^dimension points per cell; the same in a part of a grid as in the whole.
 
     Args:
         grid: the grid; of a part one cell more on each side, from which points may be moved into it.
@@ -375,12 +400,14 @@ def seed(
     grid: StaggeredGrid, regions: typing.Sequence[typing.Callable[[np.ndarray], np.ndarray]], open_cells: np.ndarray, *, per_axis: int,
     jitter: float, random_seed: int,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Fill regions with particles on a jittered lattice; a point in several regions belongs to the first.
+    """Fill regions with particles on a jittered lattice.
+
+    A point in several regions belongs to the first.
 
     Args:
         grid: the grid.
-        regions: functions that tell for points [m], shape (n, 3), which lie in the region, shape (n,).
-        open_cells: which cells may hold particles, shape (nz, ny, nx). A part of a grid is given what all of it would be given there.
+        regions: functions of points [m], shape (n, 3), that return which lie in the region, shape (n,).
+        open_cells: mask of the cells that may hold particles, shape (nz, ny, nx).
         per_axis: points along an edge of a cell, >= 1.
         jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter <= 1.
         random_seed: of the displacements; they do not depend on the regions.

@@ -30,7 +30,7 @@ def side_bits(names: Iterable[str]) -> int:
     bits = 0
     for name in names:
         if name not in SIDES:
-            raise ValueError(f"{name!r} is no side: choose from {', '.join(SIDES)}")
+            raise ValueError(f"{name!r} is not a side: choose from {', '.join(SIDES)}")
         bits |= 1 << SIDES.index(name)
     return bits
 

@@ -1,4 +1,6 @@
-"""Solids and regions of material as signed distances on the device: box, sphere, capsule, plane, triangle mesh and unions.
+"""Shapes as signed distances on the device.
+
+Box, sphere, capsule, plane, triangle mesh and unions, for solids and regions of material.
 
 A 2-D scene is the plane z = 0 of these shapes: its callers pass points with z = 0. Boxes given with two coordinates extend without limit in
 z, spheres and capsules lie at z = 0 (discs and stadiums there), and a mesh is cut by the plane z = 0: the sign is that of the cut, the
@@ -33,16 +35,19 @@ from warp_lcp.settings import Positive, checked
 
 @runtime_checkable
 class Geometry(Protocol):
-    """A region of space with a signed distance, negative inside."""
+    """Region of space with a signed distance, negative inside."""
 
     def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
-        """Write the distance [m] of `points` [m], shape (m,), to the surface into `out`, shape (m,); 2-D callers pass z = 0."""
+        """Write the signed distance [m] of points [m], shape (m,), into `out`.
+
+        2-D callers pass z = 0.
+        """
 
     def bounds(self) -> np.ndarray | None:
-        """Return the low and the high corner [m] of a box around the region, shape (2, 3), or None when the region has no limits."""
+        """Return the bounding box [m], shape (2, 3); None if the region is unbounded."""
 
     def moved(self, pose: Pose) -> Geometry:
-        """Return the region after a change of place; surface data is shared with this one."""
+        """Return the region moved by a pose; surface data is shared."""
 
 
 def _rotation_about(axis: int, degrees: float) -> np.ndarray:
@@ -61,7 +66,9 @@ def _rotation_about(axis: int, degrees: float) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Placement:
-    """Map a shape's own coordinates q to the domain's: p = scale * rotation @ q + translation.
+    """Placement of a shape: p = scale * rotation @ q + translation.
+
+    q are the shape's own coordinates, p those of the domain.
 
     Args:
         scale: uniform factor, > 0.
@@ -83,7 +90,7 @@ class Placement:
 
     @classmethod
     def from_degrees(cls, scale: float, rotate: float | Vector, translate: Vector, dimension: int) -> Placement:
-        """Build the placement that a scene describes.
+        """Return the placement described by a scene.
 
         Args:
             scale: uniform factor, > 0.
@@ -109,16 +116,19 @@ class Placement:
         return cls(scale=scale, rotation=z @ y @ x, translation=in_space(checked_vector("translate", translate)))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Return `points`, shape (m, 3), of the shape's coordinates in the domain's [m]."""
+        """Return points, shape (m, 3), transformed from the shape to the domain [m]."""
         return self.scale * np.asarray(points) @ self.rotation.T + self.translation
 
     def about(self, point: Vector) -> Placement:
-        """Return this placement with scale and rotation about a point [m], of two or three coordinates, instead of the origin."""
+        """Return this placement with scale and rotation about a point [m].
+
+        Instead of the origin; two or three coordinates.
+        """
         center = in_space(checked_vector("about", point))
         return replace(self, translation=self.translation + center - self.scale * self.rotation @ center)
 
     def moved(self, pose: Pose) -> Placement:
-        """Return this placement followed by a change of place."""
+        """Return this placement followed by a pose."""
         rotation, translation = pose.rotation @ self.rotation, pose.apply(self.translation)
         return Placement(scale=self.scale, rotation=rotation, translation=translation)
 
@@ -189,7 +199,7 @@ class _Shape(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Box(_Shape):
-    """A box between two corners; without limit in z when they have two coordinates.
+    """Box between two corners; infinite in z if they have two coordinates.
 
     Args:
         lower: low corner [m], 2 or 3 numbers.
@@ -227,7 +237,10 @@ class Box(_Shape):
         return [wp.vec3(*self._half())]
 
     def bounds(self) -> np.ndarray | None:
-        """Return the low and the high corner [m] of a box around it, shape (2, 3): infinite in z in 2-D; None when inverted."""
+        """Return the bounding box [m], shape (2, 3); None if inverted.
+
+        Infinite in z in 2-D.
+        """
         result = super().bounds()
         if result is not None and len(self.lower) == 2:
             result[:, 2] = -np.inf, np.inf
@@ -241,7 +254,7 @@ class Box(_Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Sphere(_Shape):
-    """A sphere, in 2-D a disc.
+    """Sphere; in 2-D a disc.
 
     Args:
         center: [m], 2 or 3 numbers.
@@ -275,7 +288,7 @@ class Sphere(_Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Capsule(_Shape):
-    """All points within a radius of a segment.
+    """Capsule: all points within a radius of a segment.
 
     Args:
         start: one end of the segment [m], 2 or 3 numbers.
@@ -317,7 +330,7 @@ class Capsule(_Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Plane(_Shape):
-    """The half-space on the side of a plane opposite its normal.
+    """Half space on the side of a plane opposite its normal.
 
     Args:
         point: a point of the plane [m], 2 or 3 numbers.
@@ -354,7 +367,7 @@ class Plane(_Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class TriangleMesh(_Shape):
-    """The inside of a closed triangle surface.
+    """Interior of a closed triangle surface.
 
     The distance is the one to the closest triangle; the sign comes from the winding number, summed over the triangles.
 
@@ -371,7 +384,9 @@ class TriangleMesh(_Shape):
 
     @classmethod
     def from_file(cls, file: str, *, folder: Path | None = None, placement: Placement | None = None, invert: bool = False) -> TriangleMesh:
-        """Read an OBJ, STL or PLY file, or take a surface that the project generates (`builtin:torus`, `builtin:knot`).
+        """Read an OBJ, STL or PLY file, or a built-in mesh.
+
+        Built-in: `builtin:torus`, `builtin:knot`.
 
         Args:
             file: path, relative to `folder`, or `builtin:` and a name.
@@ -390,7 +405,9 @@ class TriangleMesh(_Shape):
         return self.surface.volume * self.placement.scale**3
 
     def distance_to_surface(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
-        """Write the distance to the closest triangle, >= 0: a fifth of the work of `signed_distance`, for points whose sign is known.
+        """Write the unsigned distance to the closest triangle.
+
+        For points whose sign is known: a fifth of the work of `signed_distance`.
 
         Args:
             points: [m], shape (m,), on any device.
@@ -399,7 +416,10 @@ class TriangleMesh(_Shape):
         self._measure(mesh_surface_distance, points, out)
 
     def thin_fraction(self, thickness: float, device: wp.Device) -> float:
-        """Return the share of the surface's area behind which the solid is thinner than `thickness` [m]."""
+        """Return the fraction of the surface where the solid is thin.
+
+        Thinner than `thickness` [m], by area.
+        """
         return self.surface.thin_fraction(thickness / self.placement.scale, device)
 
     def _origin(self) -> np.ndarray:
@@ -417,7 +437,9 @@ class TriangleMesh(_Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Union:
-    """What lies in one of several regions; the distance is exact outside, and inside no more than the true one where they overlap.
+    """Union of regions.
+
+    The distance is exact outside, and inside a lower bound where regions overlap.
 
     Args:
         parts: the regions, at least one.
@@ -426,7 +448,7 @@ class Union:
     parts: tuple[Geometry, ...]
 
     def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
-        """Write the least distance [m] to the parts, as of `Geometry`."""
+        """Write the smallest signed distance [m] to the parts, as for `Geometry`."""
         self.parts[0].signed_distance(points, out)
         other = wp.empty_like(out) if len(self.parts) > 1 else out
         for part in self.parts[1:]:
@@ -434,10 +456,10 @@ class Union:
             launch_list(least_distance, points.shape[0], [other, out], device=points.device)
 
     def bounds(self) -> np.ndarray | None:
-        """Return the low and the high corner [m] of a box around all parts, shape (2, 3); None when one has no limits."""
+        """Return the bounding box [m], shape (2, 3); None if a part is unbounded."""
         boxes = [box for part in self.parts if (box := part.bounds()) is not None]
         return np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]) if len(boxes) == len(self.parts) else None
 
     def moved(self, pose: Pose) -> Union:
-        """Return the union after a change of place [m]."""
+        """Return the union moved by a pose."""
         return Union(parts=tuple(part.moved(pose) for part in self.parts))

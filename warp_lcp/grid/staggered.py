@@ -1,4 +1,4 @@
-"""The staggered grid: where cells and faces lie, their fields, and launches over a part of them.
+"""Staggered grid: layout of cells, faces and fields; windows for launches.
 
 A grid of nx x ny x nz cells is stored with one ring of ghost cells, shape (nz + 2, ny + 2, nx + 2), x fastest; a 2-D grid is nz = 1 and
 only its plane k = 1 is used. Face fields have the shape of the cells: element (k, j, i) of component 0 (x), 1 (y) or 2 (z) lies on the
@@ -19,6 +19,7 @@ from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
 from warp_lcp.rows.layout import grain
 from warp_lcp.rows.program import Launch, launch_ranges
+from warp_lcp.settings import renamed_names
 
 CLEAR: dict[typing.Any, RowPass] = {
     dtype: RowPass(
@@ -66,13 +67,13 @@ def cell_index(coordinate: float, count: int):
 
 @dataclass(frozen=True)
 class Window:
-    """A box of stored cells, low <= (k, j, i) < high, over which kernels are launched.
+    """Box of stored cells, low <= (k, j, i) < high, over which kernels run.
 
     Args:
         low: first (k, j, i), ring included.
         high: one past the last (k, j, i).
         device: where kernels run.
-        near: where the rest of the box need not be visited, which segments of rows must be, see `warp_lcp.grid.vicinity`; None: all. Sums
+        near: active segments of rows, see `warp_lcp.grid.vicinity`; the rest of the box need not be visited; None: all. Sums
             over rows visit what lies between the first and the last of a row.
     """
 
@@ -83,12 +84,12 @@ class Window:
 
     @classmethod
     def of(cls, low: typing.Sequence[int], high: typing.Sequence[int], device: wp.Device) -> "Window":
-        """Return the box between two corners (k, j, i) of any sequence type."""
+        """Return the box between two corners (k, j, i) given as any sequences."""
         (k, j, i), (c, b, a) = low, high
         return cls((k, j, i), (c, b, a), device)
 
     def common(self, other: "Window") -> "Window | None":
-        """Return the cells that are in both windows; None: there are none."""
+        """Return the intersection with another window; None if it is empty."""
         low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
         if not (low < high).all():
             return None
@@ -123,11 +124,14 @@ class Window:
 
     @property
     def rows(self) -> tuple[int, int]:
-        """Planes and rows of the box."""
+        """Number of planes and rows of the box."""
         return self.high[0] - self.low[0], self.high[1] - self.low[1]
 
     def rows_of(self, sums: wp.array) -> np.ndarray:
-        """Return what rows of the box have in a field of sums, one entry or several a row of the grid."""
+        """Return the rows of the box in a field of row sums.
+
+        The field has one or several entries per row of the grid.
+        """
         rows = np.asarray(sums.numpy()[self.low[0] : self.high[0], self.low[1] : self.high[1]])
         if self.near is None:
             return rows
@@ -146,14 +150,17 @@ class Window:
         passed.bind(self._whole if whole else self._shared, **given).launch(launch)
 
     def rows_of_sums(self, planes: int) -> Rows:
-        """Return the rows for a pass that sums, of which a GPU's thread takes a column of so many `planes`, and a CPU's whole ones."""
+        """Return the rows of a pass that sums.
+
+        On a GPU a thread sums a column of `planes` planes, on a CPU whole rows.
+        """
         if self.near is None and self.device.is_cuda:
             return Rows.box(self.low, self.high, self.device, slab=planes)
         return self._whole
 
     @property
     def rows_visited(self) -> np.ndarray:
-        """(k, j) of the rows that are visited, where only a part of the box is, shape (n, 2)."""
+        """Active rows (k, j), shape (n, 2), if only a part of the box is visited."""
         return self._hulls.numpy()[:, 0]
 
     @cached_property
@@ -174,7 +181,10 @@ class Window:
         return Rows.in_part(self._hulls, self._visited, self.high)
 
     def clear(self, *given: wp.array) -> None:
-        """Put 0 into fields that every step clears; of a box in part into what is visited, so that no memory is taken for the rest."""
+        """Set fields to 0 in the box, or in its active part.
+
+        No memory is allocated for the rest.
+        """
         for array in given:
             if self.near is None:
                 array.zero_()
@@ -182,11 +192,17 @@ class Window:
                 self.run(CLEAR[array.dtype], field=array)
 
     def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
-        """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row), or record it with `Program.launch`."""
+        """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row).
+
+        Or record it with `Program.launch`.
+        """
         self._launch(kernel, self.cells, inputs, launch)
 
     def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
-        """Launch kernel(cells, *inputs) with one thread a row (plane, row, 0), for sums that are the same on every run."""
+        """Launch kernel(cells, *inputs) with one thread per row (plane, row, 0).
+
+        For sums that are the same on every run.
+        """
         cells = self._cells(self.high[2] - self.low[2]) if self.near is None else _in_part(self._hulls)
         self._launch(kernel, cells, inputs, None)
 
@@ -198,8 +214,11 @@ class Window:
         launch_ranges(kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
 
 
-class Trail:
-    """Where a pass must run to leave fields as if it had run everywhere: outside its windows it writes what never changes.
+class DirtyRegion:
+    """Dirty region: union of the current window and the last one.
+
+    A pass over it leaves fields as if it had run everywhere, if outside of its window it writes a
+    constant.
 
     Args:
         all: the cells of all windows.
@@ -210,11 +229,14 @@ class Trail:
         self.forget()
 
     def forget(self) -> None:
-        """Know no more what the last run left."""
+        """Forget the last window."""
         self._last = self.all
 
     def through(self, window: Window | None) -> Window:
-        """Return a box around the last window and this one, which becomes the last, or their parts; None: all cells."""
+        """Return the union of the last window and this one, or their parts.
+
+        This one becomes the last. None: all cells.
+        """
         now, last = (window and window.common(self.all)) or self.all, self._last
         low, high = np.minimum(now.low, last.low), np.maximum(now.high, last.high)
         self._last = now
@@ -230,7 +252,9 @@ def _in_part(pieces: wp.array) -> typing.Any:
 
 
 def pieces_of(near: np.ndarray, low: typing.Sequence[int], high: typing.Sequence[int]) -> np.ndarray:
-    """Return the runs of marked segments in a box of cells, in order: (k, j) and (first, one past the last i), int32, shape (n, 2, 2).
+    """Return the runs of marked segments in a box of cells, in order.
+
+    (k, j) and (first, one past the last i), int32, shape (n, 2, 2).
 
     Args:
         near: not 0 where a segment counts, shape (planes, rows, segments of a row) of the grid.
@@ -251,7 +275,7 @@ def pieces_of(near: np.ndarray, low: typing.Sequence[int], high: typing.Sequence
 
 @dataclass(frozen=True)
 class StaggeredGrid:
-    """Say how many cells of which size there are, and make fields for them.
+    """Staggered grid: number and size of cells, and fields on it.
 
     Args:
         counts: cells (nx, ny, nz); nz = 1 in 2-D.
@@ -292,12 +316,12 @@ class StaggeredGrid:
 
     @property
     def size(self) -> int:
-        """Elements of a field, ring included."""
+        """Number of elements of a field, ring included."""
         return int(np.prod(self.shape))
 
     @property
     def domain_counts(self) -> tuple[int, int, int]:
-        """Cells of the domain (nx, ny, nz): the larger grid's if this is a part of one."""
+        """Cells of the domain (nx, ny, nz): of the larger grid if this is a part of one."""
         return self.whole or self.counts
 
     @property
@@ -312,16 +336,19 @@ class StaggeredGrid:
 
     @property
     def cell_volume(self) -> float:
-        """Volume of a cell [m^3]; in 2-D the area [m^2], the volume per meter of depth."""
+        """Volume of a cell [m^3]; in 2-D its area [m^2] (per meter of depth)."""
         return self.spacing**self.dimension
 
     def covers(self, low: typing.Sequence[int], high: typing.Sequence[int]) -> bool:
-        """Return whether all cells from low to high (x, y, z, of the domain, counted from 0, both included) are among this grid's."""
+        """Return whether the grid contains all cells from low to high.
+
+        Cells (x, y, z) of the domain, counted from 0, both included.
+        """
         begin, end = np.array(self.origin), np.array(self.origin) + self.counts
         return bool((begin <= low).all() and (np.asarray(high) < end).all())
 
     def refined(self, parts: int) -> "StaggeredGrid":
-        """Return the grid of the same cells cut into so many along each axis; in 2-D not along z."""
+        """Return the grid with each cell split along each axis; in 2-D not along z."""
         counts, origin, whole = (
             None if n is None else (n[0] * parts, n[1] * parts, n[2] * (parts if self.dimension == 3 else 1))
             for n in (self.counts, self.origin, self.whole)
@@ -330,7 +357,7 @@ class StaggeredGrid:
         return StaggeredGrid(counts, self.spacing / parts, self.dimension, self.device, origin, whole)
 
     def field(self, dtype: typing.Any = wp.float32) -> wp.array:
-        """Return a field of zeros, one value a stored cell."""
+        """Return a field of zeros with one value per stored cell."""
         return zeros(self.size, dtype, self.device, small_pages=self.sparse).reshape(self.shape)
 
     def faces(self, dtype: typing.Any = wp.float32) -> list[wp.array]:
@@ -360,7 +387,9 @@ class StaggeredGrid:
         return self.window((1, 1, 1), self.counts)
 
     def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0) -> Window:
-        """Return the box of cells from low to high (x, y, z, both included), grown by some cells and clipped to what is stored.
+        """Return the window of cells from low to high, grown and clipped.
+
+        (x, y, z), both included.
 
         Of a box beyond what is stored a layer of what is nearest is left.
         """
@@ -373,3 +402,6 @@ class StaggeredGrid:
             first.append(min(max(int(low[axis]) - grow, 0), self.counts[axis] + 1))
             last.append(max(min(int(high[axis]) + grow + 1, self.counts[axis] + 2), first[-1] + 1))
         return Window.of(first, last, self.device)
+
+
+__getattr__ = renamed_names(__name__, Trail="DirtyRegion")

@@ -1,4 +1,7 @@
-"""The surface that pictures show: closed, smooth over the particles, flat along walls, with single drops and thin sheets kept."""
+"""Surface mesh of particles for pictures.
+
+Closed, smooth over the particles, flat along walls; single drops and thin sheets are kept.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,7 @@ class Obstacles:
 
 @dataclass(frozen=True)
 class Interior:
-    """Where material is full though no particle stands for it.
+    """Full region without particles (inside a narrow band).
 
     Attributes:
         depth: below the surface [cells], float32, one value a cell.
@@ -64,7 +67,7 @@ class Interior:
 
 
 class SurfaceMesh:
-    """Wrap particles in a surface.
+    """Surface mesh around particles.
 
     On a lattice, finer than the grid, the particles' density is smoothed over `smoothing` particle distances and divided by what solids and
     walls leave of the kernel: the filled share. Where it is 1/2 there is the surface: unbiased for a plane and flat at walls that the
@@ -76,7 +79,7 @@ class SurfaceMesh:
     Args:
         grid: the grid.
         per_axis: particles along the edge of a full cell at rest.
-        resolution: lattice cells along the edge of a cell; as many as particles unless given, which is as fine as particles can tell.
+        resolution: lattice cells along the edge of a cell; default: as many as particles, the finest useful resolution.
         smoothing: standard deviation of the kernel [particle distances], at least that of the narrow one, 1/2.
         obstacles: solids; None: there are none but the domain's walls.
 
@@ -111,11 +114,13 @@ class SurfaceMesh:
         self._placed = False
 
     def find(self, position: wp.array, interior: Interior | None = None) -> DeviceMesh:
-        """Return the surface around particles; on CUDA sums over particles, and so the last bits, may differ from run to run.
+        """Return the surface around particles.
+
+        On CUDA the last bits may differ between runs, as do sums over particles.
 
         Args:
             position: [m], shape (n,), vectors; z = 0 in 2-D.
-            interior: what there is besides the particles.
+            interior: full region without particles.
         """
         lattice = self.lattice
         if self.obstacles is not None and (self.obstacles.moves or not self._placed):
@@ -200,7 +205,9 @@ def faces_from_particles(
     grid: StaggeredGrid, position: wp.array, velocity: wp.array, fields: list[wp.array], weights: list[wp.array],
     join: Callable[..., None] | None = None,
 ) -> None:  # fmt: skip
-    """Bring the particles' velocity to the faces around them, and `EXTENDED` layers farther.
+    """Transfer velocity from particles to the faces, and extrapolate.
+
+    By `EXTENDED` layers.
 
     Args:
         grid: the grid.
@@ -208,7 +215,7 @@ def faces_from_particles(
         velocity: [m/s], shape (n,), vectors.
         fields: velocity of each component on the faces [m/s] (written).
         weights: a field a component (written), scratch memory.
-        join: fills fields where others know them; None: nobody does.
+        join: halo exchange of fields; None if serial.
     """
     particles_to_faces(grid, position, velocity, [], fields, weights)
     if join is not None:
@@ -220,7 +227,7 @@ def faces_from_particles(
 
 
 def sample(grid: StaggeredGrid, fields: list[wp.array], points: wp.array) -> wp.array:
-    """Return the velocity [m/s] at points, wp.vec3, shape (m,).
+    """Return the velocity at points [m/s], wp.vec3, shape (m,).
 
     Args:
         grid: the grid.

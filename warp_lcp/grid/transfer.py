@@ -1,4 +1,4 @@
-"""Velocity from particles to faces and back: PIC, FLIP and APIC with tent weights.
+"""Particles to grid and grid to particles: PIC, FLIP and APIC, tent weights.
 
 APIC [Jiang et al. 2015] carries the gradient of each component. With multilinear weights on faces its momentum a node is
 m_i v_i = sum_p w_ip m_p (v_p + c_p . (x_i - x_p)) and the gradient on the way back is that of the interpolated field, c_p = sum_i
@@ -34,7 +34,10 @@ VECTORS = {wp.float32: wp.vec3, wp.float64: wp.vec3d}
 
 @functools.cache
 def transfer_passes(real: Any) -> SimpleNamespace:
-    """Return the passes for float32 or float64: two forms of one sum, `interpolate`, which is its adjoint, and what makes means of sums."""
+    """Return the transfer kernels for float32 or float64.
+
+    Two forms of the sum over particles, its adjoint `interpolate`, and the division by the weights.
+    """
     name, vector = f"warp_lcp.grid.transfer_{real.__name__}", VECTORS[real]
     constants, particles = {"EDGE": EDGE[real], "TINY_WEIGHT": TINY_WEIGHT}, dict.fromkeys(("position", "velocity", "gradient"), vector)
 
@@ -72,7 +75,9 @@ def particles_to_faces(
     grid: StaggeredGrid, position: wp.array, velocity: wp.array, affine: list[wp.array], fields: list[wp.array], weights: list[wp.array], *,
     window: Window | None = None, offsets: wp.array | None = None, runs: wp.array | None = None,
 ) -> None:  # fmt: skip
-    """Average the particles' velocities on the faces, all particles alike.
+    """Particles to grid: average the particles' velocities on the faces.
+
+    All particles have the same weight.
 
     Args:
         grid: the grid; every particle lies in its domain.
@@ -104,7 +109,7 @@ def faces_to_particles(
     grid: StaggeredGrid, fields: list[wp.array], position: wp.array, velocity: wp.array, affine: list[wp.array], *,
     saved: list[wp.array] | None = None, flip: float = 0.0,
 ) -> None:  # fmt: skip
-    """Interpolate the faces' velocities at the particles.
+    """Grid to particles: interpolate the faces' velocities at the particles.
 
     Args:
         grid: the grid; every particle lies in its domain.
@@ -132,7 +137,9 @@ def accelerate_kernel(k, j, i, change: float, weight: F32, field: F32):
 
 
 def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], change: np.ndarray) -> None:
-    """Change the velocity of every face that particles gave weight, closed faces included: they pass it on to the material beside them.
+    """Change the velocity of every face with particle weight.
+
+    Closed faces included: they pass it on to the material beside them.
 
     Args:
         window: faces that particles can reach.

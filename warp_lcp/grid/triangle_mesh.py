@@ -1,4 +1,4 @@
-"""Closed triangle surfaces: read or generated, checked and repaired until inside and outside are defined."""
+"""Closed triangle surfaces: read or generated, checked and repaired."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Triangles = tuple[np.ndarray, np.ndarray]  # vertices, and triangles of them
 
 
 def tube(curve: np.ndarray, normals: np.ndarray, binormals: np.ndarray, radius: float, sides: int) -> Triangles:
-    """Build the closed tube around a closed curve, oriented outward.
+    """Return the closed tube around a closed curve, oriented outward.
 
     Args:
         curve: points along the curve, shape (n, 3); the last is joined to the first.
@@ -46,7 +46,10 @@ def tube(curve: np.ndarray, normals: np.ndarray, binormals: np.ndarray, radius: 
 
 
 def torus() -> Triangles:
-    """Build a torus about the z axis: radius 0.35 around, 0.15 of the tube; it fills [-0.5, 0.5] x [-0.5, 0.5] x [-0.15, 0.15]."""
+    """Return a torus about the z axis: radius 0.35, tube radius 0.15.
+
+    It fills [-0.5, 0.5] x [-0.5, 0.5] x [-0.15, 0.15].
+    """
     t = 2.0 * np.pi * np.arange(96) / 96
     zero = np.zeros_like(t)
     normals = np.stack([np.cos(t), np.sin(t), zero], axis=-1)
@@ -55,7 +58,10 @@ def torus() -> Triangles:
 
 
 def knot() -> Triangles:
-    """Build a trefoil knot of round tube: the curve (sin t + 2 sin 2t, cos t - 2 cos 2t, -sin 3t), scaled to a largest extent of 1."""
+    """Return a trefoil knot of round tube with a largest extent of 1.
+
+    The curve is (sin t + 2 sin 2t, cos t - 2 cos 2t, -sin 3t), scaled.
+    """
     t = 2.0 * np.pi * np.arange(240) / 240
     curve = np.stack([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], axis=-1)
     first = np.stack([np.cos(t) + 4 * np.cos(2 * t), -np.sin(t) + 4 * np.sin(2 * t), -3 * np.cos(3 * t)], axis=-1)
@@ -83,7 +89,9 @@ CLOSE_VERTICES = 64  # to merge with each, on the average, at most: more are a m
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClosedSurface:
-    """A triangle surface whose every edge is used as often in one direction as in the other, oriented outward.
+    """Closed, consistently oriented triangle surface.
+
+    Every edge is used as often in one direction as in the other; normals point outward.
 
     Build one with `read_mesh`, `builtin_mesh` or `close_surface`, which check that.
 
@@ -116,7 +124,10 @@ class ClosedSurface:
         return 0.5 * _diagonal(self.vertices)
 
     def on_device(self, device: wp.Device) -> wp.Mesh:
-        """Return the mesh as Warp queries it, in coordinates (vertex - center) / size; made once a device."""
+        """Return the mesh for Warp queries, built once per device.
+
+        In coordinates (vertex - center) / size.
+        """
         mesh = self._meshes.get(str(device))
         if mesh is None:
             points = wp.array((self.vertices - self.center) / self.size, dtype=wp.vec3, device=device)
@@ -127,13 +138,16 @@ class ClosedSurface:
 
     @cached_property
     def crossings(self) -> Crossings:
-        """Return where the surface crosses itself or lies inside itself; found on the CPU."""
+        """Self-intersections of the surface and parts inside itself; found on the CPU."""
         mesh = self.on_device(wp.get_device("cpu"))
         found = find_self_crossings(mesh, (self.vertices - self.center) / self.size, self.triangles)
         return found if found.place is None else replace(found, place=self.center + self.size * found.place)
 
     def thin_fraction(self, thickness: float, device: wp.Device) -> float:
-        """Return the share of the surface's area behind which the solid is thinner than `thickness` (in the mesh's units)."""
+        """Return the fraction of the surface where the solid is thin.
+
+        Thinner than `thickness`, by area, in the mesh's units.
+        """
         faces = len(self.triangles)
         out = wp.empty(faces, dtype=wp.float32, device=device)
         reach = thickness / self.size
@@ -143,7 +157,9 @@ class ClosedSurface:
 
 
 def load_surface(file: str, folder: Path | None = None) -> ClosedSurface:
-    """Return the surface that a scene names: a path relative to `folder`, or `builtin:` and a name.
+    """Return the surface named by a scene: a path or `builtin:` and a name.
+
+    Paths are relative to `folder`.
 
     Raises:
         ValueError: there is no such file or builtin mesh, or it is not a closed surface.
@@ -154,7 +170,9 @@ def load_surface(file: str, folder: Path | None = None) -> ClosedSurface:
 
 
 def builtin_mesh(name: str) -> ClosedSurface:
-    """Generate a closed surface around the origin, of extent 1: `torus` (axis z) or `knot` (a trefoil).
+    """Return a built-in mesh of extent 1 around the origin.
+
+    `torus` (axis z) or `knot` (a trefoil).
 
     Raises:
         ValueError: the name is unknown; the message lists those there are.
@@ -168,7 +186,9 @@ def builtin_mesh(name: str) -> ClosedSurface:
 
 
 def read_mesh(path: str | Path) -> ClosedSurface:
-    """Read a closed surface from an OBJ, STL or PLY file; polygons are cut into triangles, equal vertices merged.
+    """Read a closed surface from an OBJ, STL or PLY file.
+
+    Polygons are triangulated, equal vertices merged.
 
     Raises:
         ValueError: the file is missing, unreadable, empty or not a closed surface; the message names it and says what to do.
@@ -178,7 +198,9 @@ def read_mesh(path: str | Path) -> ClosedSurface:
 
 
 def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> ClosedSurface:
-    """Check that triangles enclose a volume; repair orientation, duplicates and degenerate triangles.
+    """Check that triangles enclose a volume; repair orientation and duplicates.
+
+    Degenerate triangles are removed.
 
     Args:
         vertices: shape (n, 3), in any unit.
@@ -228,11 +250,13 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
     surface = ClosedSurface(name=name, vertices=vertices, triangles=triangles[~flat].astype(np.int32), warnings=tuple(warnings))
     if not flat.all() and surface.volume > NO_VOLUME * _diagonal(vertices) ** 3:
         return surface
-    raise ValueError(f"{name}: the surface encloses no volume (is it flat, or every triangle there twice, once in each orientation?)")
+    raise ValueError(f"{name}: the surface encloses no volume (is it flat, or is every triangle there twice, in both orientations?)")
 
 
 def weld(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices closer than 1e-6 of the mesh's diagonal, and leave out those that no triangle uses.
+    """Merge vertices closer than 1e-6 of the mesh's diagonal.
+
+    Unused vertices are removed.
 
     Raises:
         ValueError: nearly all are that close together.
@@ -243,7 +267,7 @@ def weld(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
     if len(exact) > CLOSE_VERTICES and tree.count_neighbors(tree, near) > (1 + CLOSE_VERTICES) * len(exact):
         low, high = exact.min(axis=0), exact.max(axis=0)
         spans = f"the mesh spans {_point(low)} to {_point(high)}"
-        raise ValueError(f"most vertices lie within {near:.3g} of others, where {spans}: is one astray?")
+        raise ValueError(f"most vertices lie within {near:.3g} of others, where {spans}: is there an outlier?")
     pairs = tree.query_pairs(near, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(exact), len(exact)))
     count, label = connected_components(links, directed=False)
@@ -395,7 +419,9 @@ def _disagreeing(triangles: np.ndarray, edge: np.ndarray, forward: np.ndarray, u
 
 
 def winding_number(point: np.ndarray, corners: np.ndarray) -> float:
-    """Return how often triangles, `corners` of shape (m, 3, 3), surround a point: the sum of their solid angles over 4 pi.
+    """Return the winding number of triangles about a point.
+
+    `corners` of shape (m, 3, 3); the sum of their solid angles over 4 pi.
 
     By van Oosterom and Strackee's formula, the tangent of half a solid angle is a.(b x c) / (|a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b|).
     """

@@ -1,4 +1,4 @@
-"""Which cells of the grid are solid, which points lie inside a region, and what to warn about before a run.
+"""Solids as whole cells, points inside regions, and warnings about solids.
 
 Warnings are of meshes that needed repair, that reach out of the domain or are thinner than a cell.
 """
@@ -27,7 +27,7 @@ INVERTED_SHARE = 0.01  # of a mesh's surface, from which what is inside out is n
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedSolid:
-    """A solid of a scene.
+    """Placed solid of a scene.
 
     Args:
         geometry: the region it fills.
@@ -67,14 +67,14 @@ class VoxelSolids:
 def voxelize(
     grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, open_sides: int = 0, remarks: bool = True
 ) -> VoxelSolids:
-    """Give every cell whose center lies inside a solid to the first such solid.
+    """Assign every cell whose center lies inside a solid to the first such solid.
 
     Args:
         grid: the grid.
         solids: in the order of their claims.
         wall_separating: whether liquid may leave the domain's wall.
         open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
-        remarks: make notes and refuse what makes no sense at the start of a run; False: solids are where they have moved to.
+        remarks: make notes and refuse errors at the start of a run; False: solids have moved since.
 
     Raises:
         ValueError: with `remarks`, a solid lies wholly outside the domain, or the solids leave no open cell.
@@ -105,7 +105,7 @@ def voxelize(
 
 
 def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Device | str) -> np.ndarray:
-    """Tell which points lie inside at least one of the geometries.
+    """Return which points lie inside any of the geometries.
 
     Args:
         geometries: the regions; none contain nothing.
@@ -138,7 +138,9 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
 
 
 def start_notes(solids: Sequence[PlacedSolid], grid: StaggeredGrid) -> list[str]:
-    """Return what is to be said about solids before they are measured: of those that move, which may come in later, less.
+    """Return warnings about solids at the start of a run.
+
+    Solids that move may enter later and are checked less.
 
     Raises:
         ValueError: a solid that stands still lies wholly outside the domain, or a part of a mesh is turned inside out.
@@ -164,13 +166,16 @@ def check_open(any_open: bool) -> None:
 
 
 def small_notes(names: Iterable[str], covered: Iterable[int], spacing: float) -> list[str]:
-    """Return warnings about solids that cover no center of a cell of `spacing` [m]."""
+    """Return warnings about solids that contain no cell center.
+
+    For cells of `spacing` [m].
+    """
     note = f"is too small for the grid: no center of a cell of {spacing:.4g} m lies inside it"
     return [f"{name} {note}" for name, cells in zip(names, covered, strict=False) if not cells]
 
 
 def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[str]:
-    """Return warnings about a region: what its mesh needed repaired, and that a mesh sticks out of the domain.
+    """Return warnings about a region: repaired meshes, meshes outside the domain.
 
     Args:
         geometry: a solid, or the liquid's start.
@@ -188,7 +193,7 @@ def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[
     dimension, spacing = grid.dimension, grid.spacing
     if dimension == 2 and (low[2] > 0.0 or high[2] < 0.0):
         raise ValueError(
-            f"{name} spans z = [{low[2]:.4g}, {high[2]:.4g}] m and misses the plane z = 0, which is a 2-D scene's; check its translation"
+            f"{name} spans z = [{low[2]:.4g}, {high[2]:.4g}] m and misses z = 0, the plane of a 2-D scene; check its translation"
         )
     low, high = low[:dimension], high[:dimension]
     size = spacing * np.array(grid.domain_counts[:dimension])
@@ -200,12 +205,12 @@ def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[
         )
     stray = max(float((-low).max()), float((high - size).max()))
     if isinstance(geometry, TriangleMesh) and stray > STRAY * spacing:
-        notes.append(f"{name} reaches {stray:.4g} m out of the domain; what is out there has no effect")
+        notes.append(f"{name} reaches {stray:.4g} m out of the domain; the part outside has no effect")
     return notes
 
 
 def repair_notes(geometry: Geometry, name: str) -> list[str]:
-    """Return what a mesh needed repaired and where it crosses itself, a line each.
+    """Return the repairs and self-intersections of a mesh, a line each.
 
     Raises:
         ValueError: a part of the mesh is turned inside out, so that its inside would count as outside.
@@ -223,7 +228,7 @@ def repair_notes(geometry: Geometry, name: str) -> list[str]:
             f"{name}: {surface.name}: {what}, and about {found.inverted:.0%} of its surface is inside out there: what that surrounds would "
             "count as outside. Repair the mesh (in Blender: a Remesh modifier; in MeshLab: Remove Self Intersecting Faces, Close Holes)"
         )
-    return [*notes, f"{name}: {surface.name}: {what}; what is surrounded twice counts as inside, once"]
+    return [*notes, f"{name}: {surface.name}: {what}; overlapping parts count as inside, once"]
 
 
 def _thin_notes(solid: PlacedSolid, grid: StaggeredGrid) -> list[str]:

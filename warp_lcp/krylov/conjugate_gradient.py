@@ -97,7 +97,7 @@ class Preconditioner(Protocol):
 
 
 class ConjugateGradient:
-    """Solve A x = r for a symmetric positive (semi-)definite A.
+    """Preconditioned conjugate gradients for symmetric positive semi-definite A.
 
     The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution is `x`. The device decides after each
     iteration whether another one follows. Where graphs have loops the host waits once a solve, else it reads that decision every time.
@@ -108,7 +108,7 @@ class ConjugateGradient:
         weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1. Rows that a large shift makes stiff would
             else decide when to stop.
         rows: of the unknowns, where fields hold others, such as ghost cells; None: all of a field.
-        across: who has the other unknowns; None: nobody.
+        across: communicator; None if serial.
     """
 
     def __init__(
@@ -126,13 +126,15 @@ class ConjugateGradient:
         self._update = UPDATE.bind(rows, q=self._q, w=weight, x=self.x, r=r, out=self._reduction.partials, **given)
 
     def solve(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> tuple[int, float]:
-        """Iterate from x = 0 until ||r|| <= tolerance, ||r|| is no number, or it has grown by GROWTH over its least.
+        """Iterate from x = 0 until the residual norm is at most the tolerance.
+
+        Also ends if the norm is not a number, or has grown by GROWTH over its least.
 
         Args:
             tolerance: of the norm.
-            max_iterations: the most.
+            max_iterations: maximum number of iterations.
             by_error: whether (r'M r)^(1/2) decides, the error's energy norm as M sees it, a step late, by a tolerance relative to that of
-                the start. Where a system is stiff a small residual may leave much of the error in what A hardly sees.
+                the start. In a stiff system a small residual may leave a large error in modes with small eigenvalues.
 
         Returns:
             The iterations done and the norm of the carried residual, an estimate that rounding bounds from below.

@@ -31,7 +31,7 @@ STALLED = 0.99  # a restart that leaves more than this share of the residual gai
 
 
 class GMRES:
-    """Solve A x = r for any A.
+    """Restarted, right-preconditioned GMRES for any A.
 
     The right-hand side is the preconditioner's field `r`, which is overwritten; the solution is `x`. Preconditioned from the right, the
     residual that is minimized is the true one; it is computed from x after every restart, and only that one is ever reported.
@@ -60,7 +60,9 @@ class GMRES:
         self._H, self._rotations, self._g = np.zeros((restart + 1, restart)), np.zeros((restart, 2)), np.zeros(restart + 1)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate from x = 0 until the residual, computed from x, is at most the tolerance, is no number, or has stalled.
+        """Iterate from x = 0 until the residual norm is at most the tolerance.
+
+        The norm is computed from x. Also ends if it is not a number, or stagnates.
 
         Returns:
             The iterations done, products with A that restarts cost not counted, and the norm of the residual.

@@ -1,4 +1,4 @@
-"""Solids as the material meets them: what of a face is open, how fast the rest moves, and where particles may go.
+"""Walls and solids: open fractions and velocity of faces, admitted positions.
 
 Two forms with one face: `WholeCells`, whose cells are solid or open, and `CutBoundary`, whose faces are open in part, whose particles keep
 their distance, and whose solids may move.
@@ -54,34 +54,52 @@ class Boundary(Protocol):
     kinks: tuple[float, ...]
 
     def top_speed(self, time: float, span: float) -> float:
-        """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
+        """Return the largest speed of the solids [m/s] in a time span.
+
+        From `time` to `time` + `span` [s].
+        """
 
     def begin_step(self, time: float, dt: float) -> None:
-        """Find how fast the solids move from `time` on [s]."""
+        """Compute the velocity of the solids from `time` on [s]."""
 
-    def extend(
+    def extrapolate_velocity(
         self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
         join: Join | None = None,
     ) -> None:  # fmt: skip
-        """Continue the projected velocity into air and walls, see `warp_lcp.material.wall`; `join` as there."""
+        """Extrapolate the projected velocity into air and walls.
+
+        See `warp_lcp.material.wall`, also for `join`.
+        """
 
     def placed(self) -> list[wp.array]:
-        """Return the fields of solids where they are: beyond its cuts a part of a grid takes them from the other parts."""
+        """Return the fields of the placed solids.
+
+        On ranks, values beyond the box come from other ranks.
+        """
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
-        """Move particles, then the solids to `time`."""
+        """Advect particles, then move the solids to `time`."""
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many met a wall, were pushed by a solid, and are stuck inside one when they were last moved."""
+        """Return numbers of particles that met a wall, were pushed, and are stuck.
+
+        During the last advection; stuck inside a solid.
+        """
 
     def displace(self, fields: Faces, position: wp.array) -> None:
-        """Move particles by the displacement [m] on the faces of each axis; walls stop them, solids stay where they are."""
+        """Move particles by a displacement [m] on the faces.
+
+        Walls stop them; solids do not move.
+        """
 
     def place(self, time: float) -> None:
-        """Put the solids where they are at `time` [s]."""
+        """Place the solids at `time` [s]."""
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points [m], shape (n, 3), a particle may start at, as far as cells do not say it already."""
+        """Return at which points [m], shape (n, 3), a particle may start.
+
+        Beyond what open cells imply.
+        """
 
     def shapes(self) -> Sequence[Geometry]:
         """Return the solids' shapes where they are, if walls are where these have them."""
@@ -138,32 +156,32 @@ class WholeCells:
         self._stopped = Reading(grid.device, dtype=wp.int32)
 
     def top_speed(self, time: float, span: float) -> float:
-        """Return 0: cells stay where they are."""
+        """Return 0: the solids do not move."""
         return 0.0
 
     def begin_step(self, time: float, dt: float) -> None:
         """Do nothing: velocities are constant."""
 
-    def extend(
+    def extrapolate_velocity(
         self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
         join: Join | None = None,
     ) -> None:  # fmt: skip
-        """Continue the projected velocity into air and walls."""
+        """Extrapolate the projected velocity into air and walls."""
         s = self.solids
         extend_velocity(window, velocity, weights, known, kind, contact, s.index, s.separating, self.velocity, layers, join=join)
 
     def placed(self) -> list[wp.array]:
-        """Return the fields of solids where they are."""
+        """Return the fields of the solids."""
         return [self.base, self.touch, self.capacity, self._room]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
-        """Move particles, never into a SOLID cell."""
+        """Advect particles, never into a SOLID cell."""
         self._stopped.array.zero_()
         advect(self.grid, fields, self._room, dt, position, self._stopped.array, self._endless)
         self._stopped.changed()
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many met a wall."""
+        """Return the number of particles that met a wall."""
         return int(self._stopped.numpy()[0]), 0, 0
 
     def displace(self, fields: Faces, position: wp.array) -> None:
@@ -171,10 +189,10 @@ class WholeCells:
         advect(self.grid, fields, self._room, 1.0, position, self._stopped.array, self._endless)
 
     def place(self, time: float) -> None:
-        """Do nothing: the cells stay."""
+        """Do nothing: the solids do not move."""
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Return True for all points: open cells say where particles may start."""
+        """Return True for all points: particles may start in open cells."""
         return np.ones(len(points), dtype=bool)
 
     def shapes(self) -> Sequence[Geometry]:
@@ -187,7 +205,7 @@ ALIKE = 1e-2  # cells
 
 
 class CutBoundary:
-    """Solids as fractions of faces and a distance; implements `warp_lcp.material.boundary.Boundary`.
+    """Solids as cut cells with a distance; implements `Boundary`.
 
     In a step that starts at time t the pressure meets the solids where they are at t, moving as they will until t + dt. Then they move,
     and the particles with them: a particle may go where it is open before or after, and what is then inside a solid is pushed out. So a
@@ -218,30 +236,33 @@ class CutBoundary:
         self._join_sides()
 
     def top_speed(self, time: float, span: float) -> float:
-        """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
+        """Return the largest speed of the solids [m/s] in a time span.
+
+        From `time` to `time` + `span` [s].
+        """
         size = self.grid.extent
         size[self.grid.dimension :] = 0.0
         return max((top_speed(motion, bounds, size, time, span) for motion, bounds in self._moving), default=0.0)
 
     def begin_step(self, time: float, dt: float) -> None:
-        """Find how fast the solids move from `time` on [s]."""
+        """Compute the velocity of the solids from `time` on [s]."""
         if self.moves:
             self.cut.set_velocity(time, dt)
 
-    def extend(
+    def extrapolate_velocity(
         self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
         join: Join | None = None,
     ) -> None:  # fmt: skip
-        """Continue the projected velocity into air and walls."""
+        """Extrapolate the projected velocity into air and walls."""
         extend_velocity_cut(window, velocity, weights, known, kind, contact, self.cut, self._scratch, layers, join=join)
 
     def placed(self) -> list[wp.array]:
-        """Return the fields of solids where they are."""
+        """Return the fields of the placed solids."""
         capacity = [] if self.capacity is None else [self.capacity]
         return [self.base, self.touch, self.cut.distance, *self.cut.nearest, *self.open, *self.cut.wall, *capacity]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
-        """Move particles, then the solids to `time`."""
+        """Advect particles, then move the solids to `time`."""
         counts = self._counts.array
         counts.zero_()
         if self.moves:
@@ -257,17 +278,17 @@ class CutBoundary:
         self._counts.changed()
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many met a wall, were pushed by a solid, and are stuck inside one."""
+        """Return numbers of particles that met a wall, were pushed, and are stuck."""
         met, pushed, stuck = (int(n) for n in self._counts.numpy())
         return met, pushed, stuck
 
     def displace(self, fields: Faces, position: wp.array) -> None:
-        """Move particles by a displacement [m] among the solids where they are now."""
+        """Move particles by a displacement [m] among the solids at rest."""
         ways = {"open_sides": self.open_sides, "endless": self._endless}
         advect_with_distance(self.grid, fields, self.cut.distance, 1.0, position, self._counts.array[0:1], **ways)
 
     def place(self, time: float) -> None:
-        """Put the solids where they are at `time` [s]."""
+        """Place the solids at `time` [s]."""
         if self.moves:
             self._time = time
             self.cut.place(time)
@@ -279,7 +300,7 @@ class CutBoundary:
         return [s.geometry if s.motion is None else s.geometry.moved(s.motion.pose(self._time)) for s in self.cut.solids]
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points [m] of the domain, shape (n, 3), keep the distance that particles keep from walls."""
+        """Return which points [m], shape (n, 3), keep the distance from walls."""
         coordinates = self.grid.to_grid(points)
         if self.grid.dimension == 2:
             coordinates[:, 2] = 1.0
@@ -306,7 +327,7 @@ class CutBoundary:
         for axis in self.sides.endless:
             if self._unlikeness(axis) > ALIKE:
                 raise ValueError(
-                    f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: what reaches one must go on at the other"
+                    f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: a solid at one side must continue at the other"
                 )
 
     def _unlikeness(self, axis: int) -> float:

@@ -86,8 +86,8 @@ class Coverage:
         if not axes:
             return ""
         return (
-            f"the material comes to {most} cells along {names}, and no domain reaches farther; use larger cells (domain.spacing), let a "
-            "drain or an open side take it away, or give the domain a size"
+            f"the material extends to {most} cells along {names}, the largest possible domain; use larger cells (domain.spacing), let a "
+            "drain or an open side remove it, or give the domain a size"
         )
 
     def at(self, box: np.ndarray | None) -> StaggeredGrid:

@@ -1,4 +1,7 @@
-"""Particles that have come too close to each other, measured, and moved apart: an LCP for the displacement ([Book] 1.3.3)."""
+"""Density correction: LCP for a displacement that removes overfull cells.
+
+Also a monitor of the density ([Book] 1.3.3).
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,14 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import StaggeredGrid, Trail, Window
+from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import convert
+from warp_lcp.settings import renamed_names
 
 HEADERS = Path(__file__).parent / "headers"
 F32, F64, U8 = wp.float32, wp.float64, wp.uint8
@@ -48,7 +52,7 @@ CROWD = _made("crowd", FILLED | {"base": wp.int8}, {"most": F32}, "crowding", su
 
 @functools.cache
 def displacement_pass(cut: bool) -> RowPass:
-    """Return the pass of the displacement; `cut`: faces have open fractions."""
+    """Return the kernel of the displacement; `cut`: faces have open fractions."""
     fields, numbers = {"x": F64, "kind": wp.int8, "open": F32, "d": F32} | FILLED, {"axis": int, "most": F32, "dx": F32}
     return _made("displace", fields, numbers, "density_correction" + "_cut" * cut, cut)
 
@@ -58,8 +62,8 @@ EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is n
 SHIFT = 1e-5  # of the diagonal: gives closed pockets a solution, and leaves 0.5 % of what is too much 45 cells deep
 
 
-class Crowding:
-    """Measure how much of a material is in over-full cells, from a density that is known.
+class DensityMonitor:
+    """Density monitor: fraction of the material in overfull cells.
 
     Args:
         grid: the grid.
@@ -72,10 +76,10 @@ class Crowding:
         self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
         self._crowd = WindowTally(CROWD, grid)
         self._density: wp.array | None = None
-        self._trail, self._counted = Trail(grid.domain), grid.domain
+        self._trail, self._counted = DirtyRegion(grid.domain), grid.domain
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:
-        """Look at the material as it is; `found` then tells.
+        """Measure the density; `found` then returns the result.
 
         Args:
             density: of the particles, in units of that at rest, float32; None: it is found here.
@@ -98,17 +102,20 @@ class Crowding:
         return self._crowd.read(self._counted)
 
     def found(self) -> tuple[float, float]:
-        """Return which share of the material is beyond what cells may hold, and the largest density, that at rest being 1."""
+        """Return the fraction of material above the limit, and the largest density.
+
+        The density at rest is 1.
+        """
         above, held, densest = self._read()
         return above / held if held > 0.0 else 0.0, densest
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What a correction found.
+    """Result of a density correction.
 
     Attributes:
-        result: of the solve; None: every cell held what it should, nothing has moved.
+        result: of the solve; None: no cell was overfull, and nothing has moved.
         over_full: cells above the largest density, and cells deep inside below the least.
         max_density: before the correction, in units of the density at rest: 1 and the most by which a cell exceeds what fits beside walls.
     """
@@ -119,7 +126,7 @@ class Correction:
 
 
 class DensityCorrection:
-    """Move particles from over-full cells outward.
+    """Density correction: moves particles out of overfull cells.
 
     With rho the particles' density on the grid, in units of that at rest, a displacement d = -grad x / rho makes it
 
@@ -189,7 +196,7 @@ class DensityCorrection:
         Args:
             particles: the material (moved). If they are indexed they are sorted first.
             window: cells that hold all particles, with two to spare on each side.
-            fill: adds to the density in a window what no particle stands for.
+            fill: adds the density of liquid without particles in a window.
             contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`; None: they do not.
             share: of the displacement that particles go.
         """
@@ -265,3 +272,6 @@ class DensityCorrection:
         self._cells, self._guess = self._kind, self.x
         self._operator = wl.GridPoisson(self.grid.interior(self._kind.numpy()), shift=self._shift, device=self.grid.device, **faces)
         return wl.LCP(self._operator, self._b, 0.0 if self._lower is None else self._lower, np.inf)
+
+
+__getattr__ = renamed_names(__name__, Crowding="DensityMonitor")

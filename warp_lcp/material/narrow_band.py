@@ -1,13 +1,13 @@
-"""Particles near the surface only: deeper down the grid's velocity and a depth carry the liquid.
+"""Narrow band: particles near the surface only, grid velocity below.
 
-The idea is that of narrow band FLIP [Ferstl et al. 2016]; the scheme is derived here. In a liquid that fills its space nothing is told
-by particles deep inside: their density is that at rest, and their velocity is the flow's, which the grid holds. Let d(x) be the depth,
+After narrow band FLIP [Ferstl et al. 2016]; the scheme is derived here. Deep inside a liquid the particles carry
+no information: their density is that at rest, and their velocity is that of the grid. Let d(x) be the depth,
 the distance to the surface [cells], and W the band's width.
 
 1. Where. A step starts with the depth d* that the last one has carried along, so {d* > W} is where no particle is: it is liquid that
    was deeper than W and moved with the flow. Cells with d* >= D = min(2, W / 2) count as full, all others as full as their particles
    say, which reach beyond any kernel around these. So the surface is the particles' alone, and no error of d* builds up: after the
-   solve d is measured anew as a chamfer distance from the cells of air, whose level set gives the part of a cell; solids are no shore.
+   solve d is measured again as a chamfer distance from air cells, with the fraction of a cell from their level set; solids do not count.
 2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a semi-Lagrangian step of third order
    (`warp_lcp.grid.advection`); on those above W - 2 it is the particles' mean, in between it goes over linearly. Gravity and
    pressure act on both alike.
@@ -49,7 +49,7 @@ UNEVEN = 0.1  # how far the interior's density may differ from that at rest
 
 
 class NarrowBand:
-    """Carry the liquid deeper than a band without particles.
+    """Narrow band of particles; the grid carries the liquid below it.
 
     A step calls `blend` when the particles' velocity is on the faces, `fill` where their density is taken, `exchange` between the solve and
     the way back to the particles, and `carry` when they have moved.
@@ -100,17 +100,20 @@ class NarrowBand:
 
     @property
     def mean_density(self) -> float | None:
-        """H by what the interior would hold at rest; None: there is no interior."""
+        """H relative to the interior at rest; None without interior."""
         return self.held / (self.particles_a_cell * self.interior.count) if self.interior.count else None
 
     @property
     def density(self) -> float:
-        """Of fresh particles and of the interior as the density correction sees it, in units of that at rest."""
+        """Density of fresh particles and of the interior, relative to rest.
+
+        As the density correction uses it.
+        """
         mean = self.mean_density
         return min(max(mean, 1.0 - UNEVEN), 1.0 + UNEVEN) if mean is not None else 1.0
 
     def start(self, owner: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-        """Begin with the liquid's cells and return those without particles.
+        """Initialize the band from the liquid's cells; return cells without particles.
 
         Args:
             owner: number of the liquid in each cell, -1: none, shape (nz, ny, nx).
@@ -138,7 +141,7 @@ class NarrowBand:
         return np.asarray(grid.interior(deep))
 
     def blend(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array]) -> None:
-        """Put the carried velocity on deep faces.
+        """Blend the carried velocity into the faces deep inside.
 
         Args:
             window: faces that material can reach.
@@ -150,7 +153,7 @@ class NarrowBand:
             window.launch(kernels.blend_kernel, [axis, start, full, self.depth, self.boundary.base, carried, field, weight])
 
     def fill(self, window: Window, density: wp.array) -> None:
-        """Make deep cells as full as at rest, as a surface sees them.
+        """Set deep cells to the density at rest, for the surface.
 
         Args:
             window: cells that material can reach.
@@ -159,7 +162,7 @@ class NarrowBand:
         window.launch(kernels.fill_kernel, [self.full, 1.0, self.depth, self.boundary.capacity, density])
 
     def fill_interior(self, window: Window, density: wp.array) -> None:
-        """Give cells whose kernels particles do not fill the interior's density.
+        """Set the interior's density where particles do not fill the kernel.
 
         Args:
             window: cells that material can reach.
@@ -172,7 +175,7 @@ class NarrowBand:
         self, particles: Particles, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array, step: int,
         saved: Sequence[wp.array] = (),
     ) -> None:  # fmt: skip
-        """Measure the depth, remove particles deeper than the band and renew those at its inner edge.
+        """Measure the depth; remove deep particles and renew the band's inner layer.
 
         The new ones have no velocity yet but for FLIP; `warp_lcp.grid.transfer.faces_to_particles` gives it to them.
 
@@ -217,7 +220,9 @@ class NarrowBand:
         self.held -= self._of_all(self.fresh)
 
     def carry(self, velocity: list[wp.array], dt: float) -> None:
-        """Carry depth and velocity along for a time step, in the window of the last exchange.
+        """Advect depth and velocity for a time step.
+
+        In the window of the last exchange.
 
         Args:
             velocity: of each component on the faces [m/s].
@@ -234,7 +239,7 @@ class NarrowBand:
         self.interior = self._summed(window)
 
     def with_interior(self, totals: ParticleTotals) -> ParticleTotals:
-        """Return sums over the particles and those that the interior stands for.
+        """Return sums over the particles and the interior.
 
         They are counted as H, and weighted as at rest: what H differs by is spread over all the liquid. Its center would otherwise move
         with every particle that the band has more or less than its share.
@@ -256,7 +261,7 @@ class NarrowBand:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what the next step starts from; zeros where nobody looks, so that it packs well."""
+        """Return the state of the band; unused values are 0, for compression."""
         depth = self.depth.numpy()
         wanted = depth > min(self.width - BEYOND, self.full - 1.0)
         faces = {}
@@ -268,7 +273,7 @@ class NarrowBand:
         return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": sums} | faces
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from `state`.
+        """Restore `state`.
 
         Raises:
             ValueError: the band had another width.
@@ -284,7 +289,7 @@ class NarrowBand:
         self.interior = ParticleTotals(int(cells), squares, velocity, center, low, high, fastest)
 
     def forget(self) -> None:
-        """Begin with particles everywhere; the next exchange removes those deeper than the band."""
+        """Start with particles everywhere; the next exchange removes deep ones."""
         for field in (self.depth, *self.velocity):
             field.zero_()
         self.held = 0
@@ -347,7 +352,9 @@ class NarrowBand:
 
 
 def without_band(state: Mapping[str, np.ndarray], spacing: float, random_seed: int) -> Mapping[str, np.ndarray]:
-    """Return a simulation's state with particles where its band had none, as many as the interior stands for; any other as it is.
+    """Return a state with the interior of its narrow band filled with particles.
+
+    A state without a band is returned unchanged.
 
     Args:
         state: arrays of the particles and, if there was a band, of `NarrowBand.state`.

@@ -20,7 +20,7 @@ from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.coverage import Coverage
-from warp_lcp.material.density_correction import Crowding, DensityCorrection
+from warp_lcp.material.density_correction import DensityCorrection, DensityMonitor
 from warp_lcp.material.flight import Flights
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_scene import ParticleScene
@@ -107,7 +107,7 @@ def make_boundary(
     shapes: list[Geometry] = []
     if scene.domain.solids == "cut-cell":
         if wall_velocity is not None:
-            raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')
+            raise ValueError('wall_velocity: only for solids = "voxel"; with cut cells, give the solid a motion')
         cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not part)
         if not cut.whole_cells or (part and placed):  # solids may cut cells elsewhere
             return CutBoundary(grid, cut, sides=around), cut.notes
@@ -345,16 +345,16 @@ def make_density_correction(
     )  # fmt: skip
 
 
-def make_crowding(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., Crowding] = Crowding
-) -> Crowding | None:
+def make_density_monitor(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., DensityMonitor] = DensityMonitor
+) -> DensityMonitor | None:
     """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are.
 
     Args:
         scene: the scene.
         grid: its grid.
         boundary: its solids.
-        make: takes the arguments of `Crowding`.
+        make: takes the arguments of `DensityMonitor`.
     """
     settings = scene.correction
     if scene.density_correction is not None or settings is None:

@@ -39,7 +39,7 @@ class ParticleCheckpoints(ParticleFrames):
         """Find the material's cells from the sorted particles, as frames show them before the first step."""
 
     @abstractmethod
-    def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
+    def regrid(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
         """Go on on another grid of the same domain."""
 
     @abstractmethod
@@ -112,7 +112,7 @@ class ParticleCheckpoints(ParticleFrames):
             ValueError: the pieces do not belong to this scene.
         """
         if self.grid.whole is not None and self._coverage is not None:
-            self.cover(self._coverage.domain)
+            self.regrid(self._coverage.domain)
         self.restore(state_of(pieces, self.state()))
 
     def _on_this_grid(self, state: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
@@ -124,7 +124,7 @@ class ParticleCheckpoints(ParticleFrames):
         same = np.array_equal(state.get("signature", ()), signature(self.scene, self.grid))
         grid = self._coverage.at(state.get("box")) if self._coverage is not None and same else self.grid
         if grid != self.grid and self.scene.domain.follow:
-            self.cover(grid, state)
+            self.regrid(grid, state)
         if grid == self.grid:
             return state
         self.rearrangement.expect(state)

@@ -68,8 +68,8 @@ class ParticleFrames(ABC):
         return self.band.fill if self.band is not None else None
 
     def _fill(self, *fields: wp.array) -> None:
-        """Give fields what others who have parts of the grid know of them."""
-        assert not self.shared, "nobody has"
+        """Fill ghost cells of fields; a serial grid has none."""
+        assert not self.shared, "only on ranks"
 
     def body_surfaces(self) -> list[Surface]:
         """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""

@@ -65,5 +65,5 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
             z, y, x = (slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
             whole[name][..., z, y, x] = piece[name]
     if covered != np.prod(pieces[0]["counts"]):
-        raise ValueError("the pieces do not cover the domain: some are missing, or twice there")
+        raise ValueError("the pieces do not cover the domain: some are missing or duplicated")
     return whole

@@ -12,8 +12,8 @@ from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.density_correction import Crowding, DensityCorrection
-from warp_lcp.material.particle_assembly import make_crowding, make_density_correction, make_reseeding
+from warp_lcp.material.density_correction import DensityCorrection, DensityMonitor
+from warp_lcp.material.particle_assembly import make_density_correction, make_density_monitor, make_reseeding
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.reseeding import Reseeding
 from warp_lcp.simulation import Stopwatch
@@ -24,36 +24,37 @@ PACE = 2.0  # of sqrt(dx / g), in which a correction that acts by itself takes o
 
 
 class Rearrangement:
-    """Even out a material's particles and move them apart, when it is time.
+    """Particle redistribution: density correction and reseeding, when they are due.
 
-    Without the table [density_correction] a correction acts in the steps that begin with a share of the material beyond what cells may
-    hold that is larger than `ParticleScene.most_crowded`, and in `PACE` sqrt(dx / g) takes out what crowds: what it lifts in a step is as
-    little as the step is short. Crowding is told from the particles' density at the start of the step, which liquid's surface and sand's
-    packing have found for themselves: whether a step acts depends on where particles are, and on nothing that a checkpoint would have to
-    keep. The correction's fields are made when it acts first.
+    Without the table [density_correction] a correction acts in steps that begin with more than the fraction `ParticleScene.most_crowded`
+    of the material in excess of what cells may hold. It removes the excess over a time `PACE` sqrt(dx / g), so that a short step lifts
+    little material. The density is that at the start of the step, which the liquid's surface and the sand's
+    packing have computed already: whether a step acts depends on the particles' positions only, so that a checkpoint needs no more
+    state. The fields of the correction are allocated when it first acts.
 
     Args:
         scene: what asks for it.
         grid: its grid.
         boundary: its solids.
-        crowding: makes what tells when to act.
-        correction: makes what moves apart.
-        reseeding: makes what evens out.
+        density_monitor: makes the density monitor.
+        correction: makes the density correction.
+        reseeding: makes the reseeding.
 
     Attributes:
-        reseeding: what evens out; None: the scene does not ask for it.
-        crowding: what tells when to act; None: the scene says it, or particles are never moved apart.
-        correction: what moves apart; None: it has not acted yet, or never does.
+        reseeding: the reseeding; None: the scene does not ask for it.
+        density_monitor: decides when to correct; None: the scene decides, or there is no correction.
+        correction: the density correction; None: it has not acted yet, or never does.
     """
 
     def __init__(
-        self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, crowding: Callable[..., Crowding] = Crowding,
+        self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *,
+        density_monitor: Callable[..., DensityMonitor] = DensityMonitor,
         correction: Callable[..., DensityCorrection] = DensityCorrection, reseeding: Callable[..., Reseeding] = Reseeding,
     ) -> None:  # fmt: skip
         """Make what the scene asks for."""
         self._scene, self._grid, self._boundary, self._make = scene, grid, boundary, correction
         self.reseeding = make_reseeding(scene, grid, boundary, reseeding)
-        self.crowding = make_crowding(scene, grid, boundary, crowding)
+        self.density_monitor = make_density_monitor(scene, grid, boundary, density_monitor)
         self.correction: DensityCorrection | None = None
         settings = scene.correction
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
@@ -61,10 +62,10 @@ class Rearrangement:
             self.correction = self._made()
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
-        self._looked = False  # whether this step has measured the crowding
+        self._looked = False  # whether this step has measured the density_monitor
 
     def look(self, step: int, density: wp.array | None, particles: Particles, window: Window) -> None:
-        """Measure the crowding at the start of a step, before anything moves, if that is what decides.
+        """Measure the density_monitor at the start of a step, before anything moves, if that is what decides.
 
         Args:
             step: its number.
@@ -72,14 +73,14 @@ class Rearrangement:
             particles: the material.
             window: cells that hold all of it, with two to spare on each side.
         """
-        self._looked = self.crowding is not None and step % self._every == 0
-        if self.crowding is not None and self._looked:
-            self.crowding.measure(density, particles, window)
+        self._looked = self.density_monitor is not None and step % self._every == 0
+        if self.density_monitor is not None and self._looked:
+            self.density_monitor.measure(density, particles, window)
 
     @property
     def max_density(self) -> float | None:
         """Return the largest density at the start of the step, if it was measured."""
-        return self.crowding.found()[1] if self.crowding is not None and self._looked else None
+        return self.density_monitor.found()[1] if self.density_monitor is not None and self._looked else None
 
     def due(self, step: int) -> bool:
         """Return whether a step moves anything."""
@@ -119,13 +120,13 @@ class Rearrangement:
         return self.reseeding is not None and step % self.reseeding.every == 0
 
     def _parts(self, step: int) -> bool:
-        if self.crowding is not None:
-            return self._looked and self.crowding.found()[0] > self._most
+        if self.density_monitor is not None:
+            return self._looked and self.density_monitor.found()[0] > self._most
         return self.correction is not None and step % self.correction.every == 0
 
     def _share(self, dt: float) -> float:
         """Return how much of what crowds a step moves apart: all where the scene says when, else at a rate that knows of no steps."""
-        return min(1.0, dt / self._pace) if self.crowding is not None and self._pace > 0.0 else 1.0
+        return min(1.0, dt / self._pace) if self.density_monitor is not None and self._pace > 0.0 else 1.0
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns that `apply` fills."""
@@ -134,9 +135,9 @@ class Rearrangement:
 
     def notes(self) -> list[str]:
         """Return why nothing keeps the particles apart where the scene leaves that to the program."""
-        if self._scene.density_correction is not None or self.crowding is not None:
+        if self._scene.density_correction is not None or self.density_monitor is not None:
             return []
-        none = "particles that crowd are not moved apart on a periodic axis: there is no density correction"
+        none = "density correction is off: it is not available with periodic axes"
         return [none] if self._scene.endless else []
 
     def state(self) -> dict[str, np.ndarray]:
@@ -145,7 +146,7 @@ class Rearrangement:
 
     def expect(self, state: Mapping[str, np.ndarray]) -> None:
         """Get ready for a state of this scene, which may be from before or after the first correction."""
-        if self.crowding is not None:
+        if self.density_monitor is not None:
             self.correction = (self.correction or self._made()) if STATE in state else None
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

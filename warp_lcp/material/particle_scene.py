@@ -117,12 +117,12 @@ class ParticleScene(Scene):
         settings, output = self.particles, self.output
         automatic = self.density_correction is None and self.correction is not None
         used = {
-            "cut cells": _solids(range(len(self.solid)), "reaches through cells") if self.cuts_cells else "",
-            "moving solids": _solids(moving, "moves") if moving else "",
-            "rigid bodies": _solids(bodies, "has a mass") if bodies else "",
+            "cut cells": _solids(range(len(self.solid))) if self.cuts_cells else "",
+            "moving solids": _solids(moving) if moving else "",
+            "rigid bodies": _solids(bodies) if bodies else "",
             "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
             "density correction": "[density_correction]" if self.density_correction is not None and self.correction is not None else "",
-            "automatic density correction": "crowded particles are moved apart" if automatic else "",
+            "automatic density correction": "particles are moved out of overfull cells" if automatic else "",
             "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
             "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
             "sources": "[[source]]" if self.source else "",
@@ -185,7 +185,7 @@ class ParticleScene(Scene):
         found += self.shape_complaints(key, materials, inside=True)
         found += self.shape_complaints("source", self.source, inside=True) + self.shape_complaints("drain", self.drain, inside=True)
         if self.particles.narrow_band is not None and not self.carried_by_grid:
-            message = "is for liquids only: sand deep inside has a state that its particles alone know"
+            message = "is for liquids only: the state of sand is stored on its particles"
             found.append(Complaint(("particles", "narrow_band"), None, message))
         if self.output.forces and not self.carried_by_grid:
             found.append(Complaint(("output", "forces"), True, "is for liquids only"))
@@ -269,7 +269,7 @@ class ParticleScene(Scene):
         settings = self.particles
         at_first = f"{self.particle_estimate(later=False):,} at the start, " if self.source else ""
         most = "about" if settings.narrow_band is not None else "at most"
-        covered = f"{' x '.join(map(str, self.covered_counts[: self.dimension]))} cells at the start, then what the material reaches"
+        covered = f"{' x '.join(map(str, self.covered_counts[: self.dimension]))} cells at the start; the grid follows the material"
         part = [("covered", covered)] if self.covered_counts != self.cell_counts else []
         return [
             *super().plan(),
@@ -296,12 +296,12 @@ class ParticleScene(Scene):
         lines, correction, reseed = [], self.correction, self.particles.reseed
         band = self.particles.narrow_band
         if band is not None:
-            lines.append(("narrow band", f"particles within {band.width:g} cells of the surface, the grid carries the rest"))
+            lines.append(("narrow band", f"particles within {band.width:g} cells of the surface, the grid stores the rest"))
         if correction is not None:
             most, when = correction.largest(self.particles.per_axis), _steps(correction.every)
             if self.density_correction is None:
-                when += f" if more than {100.0 * self.most_crowded:.2g} % is beyond it"
-            lines.append(("density", f"at most {most:.4g} of that at rest, corrected {when}"))
+                when += f" if more than {100.0 * self.most_crowded:.2g} % of the material exceeds it"
+            lines.append(("density", f"at most {most:.4g} times the density at rest, corrected {when}"))
         if reseed is not None:
             least, many = self.particles.reseed_range(self.dimension)
             lines.append(("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}"))
@@ -372,6 +372,6 @@ def _steps(every: int) -> str:
     return "every step" if every == 1 else f"every {every} steps"
 
 
-def _solids(numbers: Iterable[int], what: str) -> str:
-    """Return that some solids do something, in words."""
-    return ", ".join(f"solid {number}" for number in numbers) + f" {what}"
+def _solids(numbers: Iterable[int]) -> str:
+    """Return the names of solids in a line."""
+    return ", ".join(f"solid {number}" for number in numbers)

@@ -39,9 +39,9 @@ class ParticleSimulation(ParticleCheckpoints):
     the last step and half of this one, and then particles move for all of it (the leapfrog of Verlet). One solve a step so makes a scheme
     that is its own inverse in time, whatever the steps' lengths: what flies goes along its parabola.
 
-    A step calls `begin_step`, `window` and `bring_to_faces`; changes `velocity` as its material's laws ask; then calls `extend`,
-    `bring_to_particles` and `move`, and returns `logged` of what the log gets. Nothing before `move` changes the state but for the
-    particles' order, so that a solve may fail.
+    A step calls `begin_step`, `window` and `particles_to_grid`; changes `velocity` by the laws of its material; then calls
+    `extrapolate_velocity`, `grid_to_particles` and `move`, and returns the log columns of `logged`. Until `move` the state is
+    unchanged except for the order of the particles, so that a solve may fail.
 
     Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
     of its solve and calls `solve_contacts`, or calls `restore_bodies` if it fails.
@@ -104,14 +104,14 @@ class ParticleSimulation(ParticleCheckpoints):
         self.layers = self.reach = math.ceil(scene.time.cfl) + 2
         self._coverage, self.spray = coverage, spray or Spray(grid, (), 0, active=False)
         others = set(vars(self))
-        self.lay(grid, parts)
+        self.allocate(grid, parts)
         self._laid = vars(self).keys() - others  # attributes that belong to a grid
         self._notes = [*notes, *self.rearrangement.notes()]
         if self.sources is not None:
             self.sources.emit(particles, None, self.time)
         particles.sort()
 
-    def lay(self, grid: StaggeredGrid, parts: Parts) -> None:
+    def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate what belongs to a grid. Subclasses add theirs."""
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
@@ -146,7 +146,7 @@ class ParticleSimulation(ParticleCheckpoints):
     def own_columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns that the material's own models fill."""
 
-    def cover(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
+    def regrid(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
         """Go on on another grid of the same domain.
 
         Args:
@@ -168,7 +168,7 @@ class ParticleSimulation(ParticleCheckpoints):
         now = [body.state() for body in bodies]
         for body, state in zip(bodies, self._bodies_at_start, strict=True):
             body.restore(state)  # the cells of a source are those that are open at the start
-        self.lay(grid, make_parts(grid))
+        self.allocate(grid, make_parts(grid))
         for body, state in zip(bodies, now, strict=True):
             body.restore(state)
         self.particles.move_to(grid)
@@ -186,8 +186,8 @@ class ParticleSimulation(ParticleCheckpoints):
         filled = totals.count / self.scene.particles.per_axis**self.grid.dimension
         grid = self._coverage.around(low, high, self.grid, pace_of(totals, dt, self.grid.spacing), filled=filled)
         if grid != self.grid:
-            with self.watch.stage("laying the grid", *self.velocity):
-                self.cover(grid)
+            with self.watch.stage("regridding", *self.velocity):
+                self.regrid(grid)
 
     def stable_dt(self) -> float:
         """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material, and of solids and sources in the time to come."""
@@ -266,10 +266,10 @@ class ParticleSimulation(ParticleCheckpoints):
         return box if self.vicinity is None else self.vicinity.window(box, self.particles, self.reach + 2, self.step_count)
 
     def top_speed(self, totals: ParticleTotals) -> float:
-        """Return the scale of the velocities that `bring_to_faces` leaves [m/s]."""
+        """Return the scale of the velocities that `particles_to_grid` leaves [m/s]."""
         return totals.max_speed + self.kick_dt * float(np.linalg.norm(self.gravity))
 
-    def bring_to_faces(self, window: Window) -> None:
+    def particles_to_grid(self, window: Window) -> None:
         """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
         p = self.particles
         with self.watch.stage("particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights):
@@ -281,7 +281,7 @@ class ParticleSimulation(ParticleCheckpoints):
                 wp.copy(saved, field)
             accelerate(window, self.velocity, self.weights, self.gravity * self.kick_dt)
 
-    def extend(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
+    def extrapolate_velocity(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
         """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
 
         Args:
@@ -297,7 +297,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
     def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
         """Continue the velocity among the boundary's walls; `join` is called after each layer."""
-        self.boundary.extend(window, self.velocity, self.weights, known, kind, contact, self.layers, join)
+        self.boundary.extrapolate_velocity(window, self.velocity, self.weights, known, kind, contact, self.layers, join)
 
     def _layer_filled(self) -> Join | None:
         """Return what is called with marks and field of a component when a layer of faces is filled."""
@@ -309,7 +309,7 @@ class ParticleSimulation(ParticleCheckpoints):
             with self.watch.stage("narrow band", *self.particles.arrays().values(), self.band.depth):
                 self.band.exchange(self.particles, window, kind, phi, contact, self.step_count, self._saved or ())
 
-    def bring_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
+    def grid_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
         """Find the bodies in flight, and give the particles the velocity of the faces.
 
         Args:

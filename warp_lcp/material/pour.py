@@ -26,7 +26,7 @@ def pour(simulation: ParticleSimulation, shape: MaterialProperties, name: str) -
     """
     grid, settings, boundary = simulation.grid, simulation.scene.particles, simulation.boundary
     if grid.whole is not None:
-        raise ValueError(f"{name}: the grid follows the material and need not reach there; give the scene domain.follow = false")
+        raise ValueError(f"{name}: the grid follows the material and may not cover this place; set domain.follow = false")
     cells = grid.interior(simulation.own_state()["cells"])
     free = (cells == wl.AIR) & (grid.interior(boundary.base.numpy()) != wl.SOLID)
     i, j, k = simulation.particles.cells_of(simulation.particles.position.numpy()).T

@@ -78,8 +78,8 @@ def resampling_notes(before: int, after: int, moved: int, spacing: float, grid: 
     """
     change = after * grid.cell_volume / (before * spacing**grid.dimension) - 1.0 if before else 0.0
     notes = [
-        f"resampled from cells of {spacing:.4g} m to {grid.spacing:.4g} m: {after} particles for {before}, each with the mass of its share "
-        f"of a cell as before (mass {change:+.2e} relative); pressure and grid fields begin anew; what follows is another run's"
+        f"resampled from cells of {spacing:.4g} m to {grid.spacing:.4g} m: {after} particles replace {before}, {change:+.1e} of the mass; "
+        "pressure and grid fields start from zero; later steps differ from those of the original run"
     ]
     return [*notes, f"{moved} resampled particles were moved out of solids"] if moved else notes
 

@@ -1,4 +1,4 @@
-"""Particles that are spread unevenly are evened out deep in the material, as many as there are."""
+"""Reseeding: evens out the particles deep inside the material."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from warp_lcp.material.boundary import Boundary
 
 
 class Reseeding:
-    """Let cells deep in the material with few particles take some from their neighbors with many.
+    """Reseeding: sparse cells deep inside take particles from dense neighbors.
 
     A flow draws particles together along some streamlines and apart along others. A density correction cures the first, but voids between
     particles remain: they count as material as long as the surface does not see them, and the volume grows. A cell that no wall touches,
@@ -53,7 +53,7 @@ class Reseeding:
         self._directions = sorted((d for d in itertools.product(*steps) if any(d)), key=lambda d: sum(map(abs, d)))
 
     def apply(self, particles: Particles, window: Window, step: int) -> int:
-        """Move particles; return how many.
+        """Move particles; return their number.
 
         Args:
             particles: the material (sorted, moved).

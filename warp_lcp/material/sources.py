@@ -1,4 +1,4 @@
-"""Where material comes in at a given velocity, and where it leaves: sources, drains and open sides of the domain."""
+"""Sources, drains and open sides: inflow at a given velocity, and outflow."""
 
 import itertools
 import math
@@ -25,15 +25,15 @@ JAMMED = 2.0  # cells that hold more than this share get no more
 
 @dataclass(frozen=True)
 class Source:
-    """Where material comes from.
+    """Inflow region.
 
     Args:
         name: what messages call it.
-        contains: tells which points [m], shape (n, 3), lie in it, shape (n,).
+        contains: returns which points [m], shape (n, 3), lie in it, shape (n,).
         velocity: of its material [m/s], shape (3,), not 0.
         start: when it starts to run [s].
         stop: when it no longer does [s].
-        kept: what its particles take along; None: nothing.
+        kept: number carried by its particles; None: none.
     """
 
     name: str
@@ -44,17 +44,19 @@ class Source:
     kept: float | None = None
 
     def runs(self, time: float) -> bool:
-        """Tell whether it runs from `time` [s] on."""
+        """Return whether the source runs from `time` [s] on."""
         return self.start <= time + NOW < self.stop
 
 
 class Sources:
-    """Let material in through the cells whose centers lie in a source; so its area is that of their faces.
+    """Inflow through the cells whose centers lie in a source.
+
+    The area of the inflow is that of the cells' faces.
 
     While a source runs, the faces of its cells have its velocity, and the pressure sees the cells as a solid that moves at it: what leaves
     them is area times velocity, whatever is in the way. Material behind a source is not drawn in. Particles lie on a jittered lattice that
     moves with the source; those that the lattice brings into the cells in a step are new. It is a function of time alone, so that an
-    interrupted run goes on as if it had not been. A source that starts fills its cells, as far as they are not full already.
+    resumed run is bitwise identical. A source that starts fills its cells, unless they are full already.
 
     A step need not end where a source starts or stops. What comes in is what the lattice brings in from start to stop, to the particle,
     however the time is cut into steps; the flow has the source's velocity in the steps in whose middle it runs.
@@ -99,11 +101,16 @@ class Sources:
         self._moving_walls = boundary.velocity if not boundary.open else []
 
     def top_speed(self, time: float, span: float) -> float:
-        """Return how fast the sources are at most [m/s] that run at a time from `time` to `time` + `span` [s]."""
+        """Return the largest speed of sources that run in a time span [m/s].
+
+        From `time` to `time` + `span` [s].
+        """
         return max((float(np.linalg.norm(s.velocity)) for s in self.sources if s.start <= time + span and s.stop > time), default=0.0)
 
     def supply(self, time: float, velocity: Faces, kind: wp.array) -> None:
-        """Give the faces of running sources their velocity and close their cells to the pressure, before it is solved for.
+        """Set the velocity of running sources on faces; close their cells to the pressure.
+
+        Before the pressure solve.
 
         Args:
             time: in the middle of the step [s].
@@ -116,7 +123,9 @@ class Sources:
             self._window.launch(kernels.occupy_kernel, [*self._fields, 0, kind])
 
     def hold(self, velocity: Faces, known: Faces, shown: wp.array | None = None) -> None:
-        """Give the faces of the sources that `supply` found running their velocity again.
+        """Set the velocity of the running sources again.
+
+        Of those that `supply` found.
 
         Args:
             velocity: of each component [m/s] (updated).
@@ -128,7 +137,7 @@ class Sources:
             self._window.launch(kernels.occupy_kernel, [*self._fields, 1, shown])
 
     def emit(self, particles: Particles, before: float | None, now: float) -> int:
-        """Add the particles that have come in and return how many.
+        """Add the incoming particles and return their number.
 
         Args:
             particles: the material (updated).
@@ -301,7 +310,7 @@ def mark_inside_kernel(distance: wp.array(dtype=wp.float32), marks: wp.array(dty
 
 @dataclass(frozen=True)
 class Drain:
-    """A region that swallows material.
+    """Region that removes material.
 
     Args:
         geometry: the region.
@@ -314,12 +323,12 @@ class Drain:
     stop: float = np.inf
 
     def opens(self, before: float, now: float) -> bool:
-        """Tell whether it is open at a time after `before` and up to `now` [s]."""
+        """Return whether the drain is open after `before` and up to `now` [s]."""
         return self.start <= now + NOW and before + NOW < self.stop
 
 
 class Outlets:
-    """Remove the particles that are in a drain or have crossed an open side.
+    """Drains and open sides, which remove particles.
 
     A drain acts at the end of each step in part of which it is open, however small that part is.
 
@@ -359,7 +368,7 @@ class Outlets:
         return drained, departed
 
     def remove_departed(self, particles: Particles) -> int:
-        """Remove the particles that have crossed an open side, and return how many."""
+        """Remove particles beyond open sides; return their number."""
         if not (self.open_sides and particles.count):
             return 0
         marks = particles.marks

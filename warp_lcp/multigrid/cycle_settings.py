@@ -41,7 +41,7 @@ class CycleSettings(Smoothing):
             once.
         revisited_cuda: the same on a GPU, where small levels take as long as large ones: a W-cycle doubles their launches with each level.
         over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
-        dirichlet_scaling: factor on what AIR and unknowns at their bounds add to an aggregate's diagonal.
+        dirichlet_scaling: factor on the contributions of AIR and of unknowns at their bounds to an aggregate's diagonal.
             They are nearer than the next aggregate, so the over-correction applies to them in part only.
         interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most cells of the coarsest level, which is inverted densely.

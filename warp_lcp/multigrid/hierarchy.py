@@ -181,7 +181,7 @@ class Hierarchy:
         stencil: the operator on all unknowns.
         real: type of the corrections.
         bounded: whether projected cycles are wanted; they need bounds on every level.
-        settings: how cycles go.
+        settings: of the cycles.
         shifted: whether the finest diagonal is a number of type `real` even where the operator only counts faces, so that a shift fits.
         bounds: memory of the finest level's bounds, where the caller has fields that a projected cycle may overwrite; an empty upper one if
             corrections have no upper bounds.
@@ -227,16 +227,18 @@ class Hierarchy:
 
     @property
     def finest(self) -> Level:
-        """The level of the operator itself."""
+        """Finest level."""
         return self.levels[0]
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the levels hold, shared weights of the finest one not counted."""
+        """Memory of the levels [bytes], without shared weights of the finest one."""
         return sum(sum(a.capacity for a in {id(v): v for v in (lv.x, lv.b, lv.t, lv.lower, lv.upper)}.values()) for lv in self.levels)
 
     def refresh(self) -> None:
-        """Take the operator's rows and weights again after they changed in place, and clear what lies outside the new rows.
+        """Read rows and weights of the operator again after in-place changes.
+
+        Also clears what lies outside the new rows.
 
         Rows whose span or weights are not what they were are marked in the finest level's `changed`. Weights are compared by 64 bits a
         row that they hash to.
@@ -264,7 +266,10 @@ class Hierarchy:
         return program
 
     def hold(self, d: wp.array[Any], free: wp.array[Any]) -> None:
-        """Fill the finest diagonal: d where the stored uint8 field `free` is not 0, else 0; the rows that change are marked."""
+        """Set the finest diagonal for a free set: d where `free`, else 0.
+
+        `free` is a stored uint8 field; changed rows are marked.
+        """
         s = self.finest.stencil
         passes.HOLD.bind(s.rows, d=d, free=free, out_d=s.d, changed=self.finest.changed).launch()
 
@@ -274,15 +279,17 @@ class Hierarchy:
         self.rebuild_changed()
 
     def rebuild_changed(self) -> None:
-        """Do what `rebuild` does for the rows of the finest level that are marked in its `changed`, and those that depend on them.
+        """Rebuild the levels only for marked rows of the finest level.
 
-        Whoever writes the finest diagonal marks the rows: `hold` does. The result is that of a complete rebuild, to the last bit.
+        Those marked in its `changed`, and the coarse rows that depend on them.
+
+        Code that writes the finest diagonal must mark the rows, as `hold` does. The result is bitwise that of a complete rebuild.
         """
         self.rebuilding.run()
 
     @cached_property
     def rebuilding(self) -> Program:
-        """What `rebuild_changed` launches."""
+        """Launches of `rebuild_changed`."""
         program = Program(self.device)
         alone = len(self.levels) if self.device.is_cpu else self._first_small + 1
         for fine, coarse in zip(self.levels, self.levels[1:alone], strict=False):
@@ -315,12 +322,14 @@ class Hierarchy:
 
     @cached_property
     def cycle(self) -> Program:
-        """One linear cycle: a symmetric positive (semi-)definite approximation of the inverse."""
+        """Linear cycle: symmetric positive (semi-)definite approximate inverse."""
         return self._descent(0, projected=False, from_zero=True)
 
     @cached_property
     def monotone_cycle(self) -> Program:
-        """One projected cycle on all levels: every sweep is clipped, coarse bounds keep the finer iterate within its own.
+        """Projected cycle on all levels.
+
+        Every sweep is clipped, and coarse bounds keep the finer iterate within its own.
 
         It moves whole aggregates on and off their bounds, where an active-set method moves the boundary by about a layer of cells a step.
         """
@@ -328,14 +337,17 @@ class Hierarchy:
 
     @cached_property
     def projected_sweep(self) -> Program:
-        """One projected Jacobi sweep of the finest level: what no bounded problem can make worse."""
+        """Projected Jacobi sweep of the finest level; it never increases the energy."""
         program, L = Program(self.device), self.finest
         L.sweeping(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True).launch(program.launch)
         return program
 
     @cached_property
     def open_cycle(self) -> Program | None:
-        """The linear cycle without its last leg, for a caller who fuses that with what follows; None where it is no single launch."""
+        """Linear cycle without its last leg, for a caller who fuses that with more.
+
+        None if the last leg is not a single launch.
+        """
         if len(self.levels) == 1 or self._first_small == 0 or not self._fuses(self.finest):
             return None
         program = Program(self.device)
@@ -343,17 +355,17 @@ class Hierarchy:
         return program
 
     def begin_climb(self, level: int, launch: Launch) -> None:
-        """Do what a leg up that is one launch waits for: nothing, unless others have a part of the grid."""
+        """Prepare a leg up that is one launch: a halo exchange on ranks."""
 
     def end_climb(self, level: int, launch: Launch) -> None:
-        """Do what is left after it."""
+        """Complete a leg up that is one launch."""
 
     def last_leg(self) -> tuple[Bound, ...]:
-        """Return the passes of a linear cycle's last leg, as `ASCEND` takes them."""
+        """Return the passes of the last leg of a linear cycle, as `ASCEND` takes them."""
         return self._ascent(0, projected=False)
 
     def visits(self, count: int, *, projected: bool) -> Program:
-        """Return cycles one after another, the first from x = 0, as a finer level takes them that this hierarchy serves."""
+        """Return consecutive cycles for a finer level, the first from x = 0."""
         key = -count, projected, True
         if key not in self._descents:
             self._descents[key] = Program(self.device)

@@ -23,7 +23,7 @@ class SmallLevels:
 
     Args:
         levels: the levels, stored alike.
-        settings: how cycles go.
+        settings: of the cycles.
         solve: the pass that solves on the last level.
     """
 

@@ -100,7 +100,7 @@ def _geometry(row: Mapping[str, Any], source: Any, name: str) -> Geometry:
     if kind == kinds.CONVEX_MESH:
         vertices = np.asarray(source.vertices, dtype=np.float64) * row["scale"]
         return TriangleMesh(surface=close_surface(vertices, ConvexHull(vertices).simplices, name), placement=Placement())
-    raise ValueError(f"{name}: a shape of type {kinds(kind).name} has no inside that a liquid can tell")
+    raise ValueError(f"{name}: a shape of type {kinds(kind).name} encloses no volume, which a liquid needs")
 
 
 def _mesh(mesh: Any, name: str, scale: np.ndarray | float = 1.0) -> TriangleMesh:

@@ -60,7 +60,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
     ) -> None:
         super().__init__(model)
         if model.world_count > 1:
-            raise ValueError(f"the model has {model.world_count} worlds: a liquid is in one")
+            raise ValueError(f"the model has {model.world_count} worlds: expected one")
         gravity = f"physics.gravity={self._gravity().tolist()}"
         self.scene = load_scene({**DEFAULTS, **scene} if isinstance(scene, Mapping) else scene, [gravity])
         self._origin, self._chosen = np.asarray(origin, dtype=np.float64), bodies
@@ -114,7 +114,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
         if wp.get_device(str(self.model.device)).is_capturing:
-            raise RuntimeError("a step of liquid reads from its device: take it outside of captured graphs, `wp.ScopedCapture`")
+            raise RuntimeError("a step of liquid copies data from the device and cannot run inside a captured graph, `wp.ScopedCapture`")
         simulation, bodies = self.simulation, self.bodies
         for name in MOVES:
             here, there = getattr(state_in, name, None), getattr(state_out, name, None)
@@ -179,11 +179,11 @@ class SolverLiquid(SolverBase, CouplingInterface):
         """Build the liquid among the shapes of the model."""
         scene, model, origin = self.scene, self.model, self._origin
         if not isinstance(scene, LiquidScene) or scene.dimension != 3:
-            raise ValueError("scene: must be of a liquid in 3-D")
+            raise ValueError("scene: must be a 3-D scene of liquid")
         if scene.domain.solids != "cut-cell" or scene.solver.method not in COUPLED_METHODS:
             raise ValueError(f'scene: bodies need domain.solids = "cut-cell" and one of {", ".join(COUPLED_METHODS)} as solver.method')
         if any(solid.is_body for solid in scene.solid):
-            raise ValueError("scene.solid: rigid bodies are the model's; give its solids no mass and no density")
+            raise ValueError("scene.solid: rigid bodies come from the model; solids of the scene must have no mass or density")
         shapes = geometries(model, origin)
         standing = [shape for shape in shapes.pop(-1, []) if reaches_into(shape, np.array(scene.domain.size))]
         chosen = sorted(shapes) if self._chosen is None else [int(body) for body in self._chosen]

@@ -22,7 +22,7 @@ def matrix_rows(a_type: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class CompressedRows:
-    """The entries of a matrix by rows.
+    """Compressed sparse rows of a matrix.
 
     Attributes:
         indptr: where each row begins, shape (n + 1,), wp.int32.
@@ -36,13 +36,16 @@ class CompressedRows:
 
     @property
     def operand(self) -> Any:
-        """The struct of the rows that kernels take."""
+        """Struct of the rows for kernels."""
         made = matrix_rows(self.values.dtype)()
         made.ptr, made.col, made.a = self.indptr, self.indices, self.values
         return made
 
     def matrix(self) -> Any:
-        """Return the matrix on the host, float64: a scipy.sparse.csr_array, or where every row is full numpy, perhaps the same memory."""
+        """Return the matrix on the host, float64.
+
+        A scipy.sparse.csr_array, or numpy if every row is full, perhaps in the same memory.
+        """
         n, values = self.indptr.size - 1, self.values.numpy()
         if self.indices.size == 0 and values.size:
             return values.reshape(n, n).astype(np.float64, copy=False)

@@ -41,7 +41,7 @@ def is_rounding(difference: np.ndarray, one: np.ndarray, other: np.ndarray) -> b
 
 
 class DenseOperator(Pickled):
-    """A x with a dense square matrix A.
+    """Dense square matrix as an operator.
 
     Args:
         matrix: A, numpy array or wp.array (n, n), finite.
@@ -59,7 +59,7 @@ class DenseOperator(Pickled):
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         if scipy.sparse.issparse(matrix):
-            raise ValueError("matrix is a sparse one: SparseOperator takes it")
+            raise ValueError("matrix is sparse: use SparseOperator")
         host = np.asarray(real_array(matrix, "matrix"), dtype=np.float64)
         if host.ndim != 2 or host.shape[0] != host.shape[1] or host.size == 0:
             raise ValueError(f"matrix has shape {host.shape}: expected (n, n) with n >= 1")
@@ -107,7 +107,7 @@ class DenseOperator(Pickled):
         return wp.array(np.diag(self.matrix.numpy()).copy(), dtype=self.dtype, device=self.device)
 
     def rows(self) -> CompressedRows:
-        """Return the entries by rows, the operator's own."""
+        """Return the rows, the operator's own memory."""
         starts = wp.array(np.arange(self.unknowns + 1) * self.unknowns, dtype=wp.int32, device=self.device)
         return CompressedRows(starts, wp.empty(0, dtype=wp.int32, device=self.device), self.matrix.flatten())
 
@@ -116,7 +116,10 @@ class DenseOperator(Pickled):
         return scale_of_matrix(self.matrix.numpy().astype(np.float64))
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return mu_i x_j as `matrix`, shape (n, n), float64."""
+        """Return the derivatives of mu'A x by the entries, mu_i x_j as `matrix`.
+
+        Shape (n, n), float64.
+        """
         return {"matrix": wp.array(np.outer(multiplier.numpy(), x.numpy()), dtype=wp.float64, device=self.device)}
 
     def masked(self, free: Any, shift: Any = None) -> DenseOperator:

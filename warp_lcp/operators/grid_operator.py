@@ -195,7 +195,7 @@ class GridOperator(Pickled):
     def _check_own(self) -> None:
         """Refuse a principal system where coefficients are asked for."""
         if self._mask is not None:
-            raise ValueError("a masked operator has no coefficients of its own: take the one it was made from")
+            raise ValueError("a masked operator has no coefficients of its own: use the operator it was made from")
 
     def _pickled(self) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the cells and the options that every class has, as `__reduce__` needs them.
@@ -204,9 +204,11 @@ class GridOperator(Pickled):
             TypeError: it is a part of a grid that ranks share, or a principal system.
         """
         if self.layout.across is not None:
-            raise TypeError(f"{type(self).__name__} is a part of a grid that ranks share: pickle its cells and coefficients on each rank")
+            raise TypeError(
+                f"{type(self).__name__} is distributed over ranks and cannot be pickled: pickle its cells and coefficients on each rank"
+            )
         if self._mask is not None:
-            raise TypeError("a masked operator is not pickled: pickle the one it was made from, and mask that again")
+            raise TypeError("a masked operator cannot be pickled: pickle the operator it was made from, and mask it again")
         return self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape).copy(), {"periodic": self._wraps, "dtype": self.dtype}
 
     @property

@@ -103,7 +103,9 @@ class GridPoisson(GridOperator):
         self._check_sums()
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return (mu_i - mu_j) (x_i - x_j) of each face and mu_i x_i of the shift.
+        """Return the derivatives of mu'A x by face coefficients and shift.
+
+        (mu_i - mu_j) (x_i - x_j) of each face and mu_i x_i of the shift.
 
         0 on closed faces; x = mu = 0 in AIR. The first and the last faces of a periodic axis, which are one, have half of it each.
         """
@@ -184,7 +186,7 @@ class GridPoisson(GridOperator):
         check_coefficients(host, self.dtype, name)
         self._note_rounding(host)
         if self.periodic[axis] and not np.array_equal(host.take(0, -1 - axis), host.take(-1, -1 - axis)):
-            raise ValueError(f"{name}: the first and the last faces of a periodic axis are the same ones, but their coefficients differ")
+            raise ValueError(f"{name}: the first and the last faces of a periodic axis are the same faces, but their coefficients differ")
         counts = [*self.layout.padding.counts]
         counts[2 - axis] += 1
         padding = [(1, 0) if a == 2 - axis else (1, 1) for a in range(3)]

@@ -26,16 +26,16 @@ class LinearOperator(Pickled, Operator):
     A x comes from the function, or from `A @ x`; rows and entries are not available.
 
     Products are made on the host, from copies of x in float64, whatever the device. Every method that needs products only takes it
-    (docs "Operators of your own"); `MinimumMapNewton` is the default. Two products check what is given, two more that A is symmetric
+    (docs "Operators of your own"); `MinimumMapNewton` is the default. Two products check the arguments, two more that A is symmetric
     where it is said to be.
 
     Args:
-        A: function of a float64 array of shape `shape` that returns A x in that shape; or what has a shape (n, n) and products by `@`.
+        A: function of a float64 array of shape `shape` that returns A x in that shape; or an object of shape (n, n) with products by `@`.
         shape: of the fields; (n,) if None, which a function does not allow.
-        symmetric: whether A equals its transpose, which halves what Newton's systems cost (conjugate gradients, else GMRES) and some
+        symmetric: whether A equals its transpose, which halves the cost of Newton's systems (conjugate gradients, else GMRES) and some
             methods need. None: not, unless A is its own adjoint, `A.H is A`, as SciPy's special arrays are.
-        diagonal: of A, a number or a field. None: sizes of rows and columns, estimated by 16 products, stand for it; the natural
-            residual's scale does not rest on it alone in any case.
+        diagonal: of A, a number or a field. None: row and column norms, estimated from 16 products, are used instead; the natural
+            residual's scale never depends on it alone.
         transpose: function that returns A'x; None: `A.rmatvec` where that is defined. An unsymmetric A without it is refused by what
             needs A' (GradientDescent).
         device: Warp device of the fields; the CPU if None.
@@ -64,7 +64,7 @@ class LinearOperator(Pickled, Operator):
         probes = np.random.default_rng(20230817).standard_normal((2, *self.shape))
         images = [self._image(z, self._product) for z in probes]
         if not all(np.isfinite(image).all() for image in images):
-            raise ValueError("A gives a product that is not finite, of normally distributed numbers")
+            raise ValueError("the product of A with normally distributed numbers is not finite")
         self.symmetric = isinstance(A, scipy.sparse.linalg.LinearOperator) and A.H is A if symmetric is None else bool(symmetric)
         one, other = (float(np.vdot(z, image)) for z, image in zip(probes, images[::-1], strict=True))
         if symmetric and abs(one - other) > ASYMMETRY * math.sqrt(self.layout.size) * max(float(np.linalg.norm(v)) for v in images):
@@ -86,11 +86,13 @@ class LinearOperator(Pickled, Operator):
             NoTranspose: A has none.
         """
         if self._transpose is None and not self.symmetric:
-            raise NoTranspose("A has no products with its transpose: give wl.LinearOperator a transpose, or a method that needs none")
+            raise NoTranspose(
+                "A has no products with its transpose: give wl.LinearOperator a transpose, or choose a method that needs none"
+            )
         return self._applied(self._product if self.symmetric or self._transpose is None else self._transpose, x, out)
 
     def diagonal(self) -> wp.array[Any]:
-        """Return the diagonal of A, or sizes in its place, of `shape`."""
+        """Return the diagonal of A or its estimate, of `shape`."""
         d = self.scale() if self._diagonal is None else self._diagonal
         return wp.array(d.reshape(self.shape), dtype=wp.float64, device=self.device)
 
@@ -146,7 +148,7 @@ def _shape_of(A: Any, shape: Any) -> tuple[int, ...]:
     elif own is None or len(own) != 2 or own[0] != own[1] or own[0] == 0:
         raise ValueError(f"A has shape {own}: expected (n, n) with n >= 1")
     if own is None and shape is None:
-        raise ValueError("shape: say which fields A takes, a function has none")
+        raise ValueError("shape: must be given if A is a function")
     try:
         wanted = (int(own[0]),) if shape is None else tuple(int(n) for n in (shape if np.ndim(shape) else (shape,)))
     except (TypeError, ValueError):

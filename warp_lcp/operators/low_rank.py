@@ -181,7 +181,7 @@ class LowRankOperator(Pickled):
 
     @classmethod
     def of_blocks(cls, A: Any, columns: BlockColumns, weights: Any) -> LowRankOperator:
-        """Return the operator of columns that are stored as fields of A are.
+        """Return the operator of columns stored like the fields of A.
 
         Its entries may be rewritten in place; `update` says so.
 
@@ -209,7 +209,7 @@ class LowRankOperator(Pickled):
         return made_again(_of_entries, sizes, entries, self.weights.numpy(), device=self.device, dtype=self.dtype)
 
     def update(self, weights: Any = None) -> None:
-        """Take other weights, and what the columns have become in place.
+        """Replace the weights, and read columns that have changed in place.
 
         Args:
             weights: as of the constructor; None: they stay.
@@ -225,7 +225,7 @@ class LowRankOperator(Pickled):
         self.version += 1
 
     def stored_like(self, A: Any) -> LowRankOperator:
-        """Return the same operator for fields stored as A's are.
+        """Return the same operator for fields stored like those of A.
 
         It is the operator itself if its fields are stored so already.
 

@@ -58,7 +58,7 @@ GATHER = RowPass("sparse.gather", HEADERS / "gather.h", "S", whole={"source": "S
 
 
 class SparseOperator(Pickled):
-    """A x with a sparse square matrix A, from scipy.sparse.
+    """Sparse square matrix as an operator.
 
     Duplicate entries are summed and columns sorted, as `matrix.tocsr().sum_duplicates()` does; explicit zeros are kept, so that
     `update` may fill them.
@@ -126,7 +126,7 @@ class SparseOperator(Pickled):
 
     @cached_property
     def bandwidth(self) -> int:
-        """How far from the diagonal the farthest entry is."""
+        """Largest distance of an entry from the diagonal."""
         first, last = self._indptr[:-1], self._indptr[1:] - 1
         rows = np.flatnonzero(last >= first)  # columns ascend in each row
         ends = np.stack([self._indices[first[rows]], self._indices[last[rows]]])
@@ -137,7 +137,7 @@ class SparseOperator(Pickled):
         return self._matrix_of(self.values.numpy())
 
     def update(self, values: Any) -> None:
-        """Take other entries in the same places.
+        """Replace the entries; the sparsity pattern is fixed.
 
         Args:
             values: entries in the order of `indices`, shape (nnz,), numpy or wp.array; or a scipy.sparse matrix with the same pattern.
@@ -148,7 +148,7 @@ class SparseOperator(Pickled):
         if scipy.sparse.issparse(values):
             host = _checked(values)
             if not (np.array_equal(host.indptr, self._indptr) and np.array_equal(host.indices, self._indices)):
-                raise ValueError("values has another pattern than the operator: make a new SparseOperator")
+                raise ValueError("values has a different sparsity pattern: make a new SparseOperator")
         else:
             array = real_array(values, "values")
             if array.shape != (self.nnz,):
@@ -180,11 +180,11 @@ class SparseOperator(Pickled):
         return out
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """out = A x + b in one pass; fields of one type."""
+        """Evaluate out = A x + b in one pass; fields of one type."""
         self.product(x, out, plus=b)
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
-        """out = A x, or A x + plus; kernel launches only."""
+        """Evaluate out = A x, or A x + plus; launches kernels only."""
         PRODUCT.bind(Rows.flat(x.size, self.device), **self._rows, x=x, plus=plus, y=out).launch(launch)
 
     def diagonal(self) -> wp.array[Any]:
@@ -195,7 +195,7 @@ class SparseOperator(Pickled):
         return self._diagonal
 
     def rows(self) -> CompressedRows:
-        """Return the entries by rows, the operator's own."""
+        """Return the compressed rows, the operator's own memory."""
         return CompressedRows(self.indptr, self.indices, self.values)
 
     def scale(self) -> np.ndarray:
@@ -209,7 +209,7 @@ class SparseOperator(Pickled):
         return self._rounding
 
     def renumbered(self) -> tuple[Renumbering, SparseOperator] | None:
-        """Return A in a numbering whose neighbors lie together in memory, or None.
+        """Return A with unknowns renumbered for memory locality, or None.
 
         None where its own numbering is as good, and on CUDA.
         """
@@ -228,14 +228,16 @@ class SparseOperator(Pickled):
 
     @cached_property
     def block(self) -> int:
-        """Unknowns of a node."""
+        """Number of unknowns of a node."""
         if self.near_null_space is None:
             return 1
         pattern = _ones(self._indptr, self._indices)
         return next((size for size in BLOCKS if self.unknowns % size == 0 and pattern.tobsr((size, size)).data.size <= FILL * self.nnz), 1)
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return mu_i x_j as `matrix`, for the entries in the order of `indices`.
+        """Return the derivatives of mu'A x by the entries, mu_i x_j as `matrix`.
+
+        In the order of `indices`.
 
         Shape (nnz,), float64.
         """
@@ -283,7 +285,9 @@ class SparseOperator(Pickled):
 
     @cached_property
     def colors(self) -> tuple[wp.array[Any], list[int]]:
-        """Rows grouped by color (no row has an entry in a row of its color), on the device, and where each color begins, plus the end.
+        """Rows grouped by color, and the start of each color (and the end).
+
+        On the device. No row has an entry in another row of its color.
 
         Greedy in row order, so the same on every run: red-black on the 5- and the 7-point stencil.
         """
@@ -366,9 +370,9 @@ def _check_indices(matrix: Any) -> None:
         elif matrix.format == "coo":
             for name, index, n in zip(("row", "column"), (matrix.row, matrix.col), matrix.shape, strict=True):
                 if len(index) != matrix.nnz or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < n):
-                    raise ValueError(f"{name} indices must be from 0 to {n - 1}, one an entry")
+                    raise ValueError(f"{name} indices must be from 0 to {n - 1}, one for each entry")
     except ValueError as reason:
-        raise ValueError(f"matrix is no sparse matrix of shape {matrix.shape}: {reason}") from reason
+        raise ValueError(f"matrix is not a valid sparse matrix of shape {matrix.shape}: {reason}") from reason
 
 
 def _near_null_space(given: Any, n: int) -> np.ndarray:

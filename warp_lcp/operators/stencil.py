@@ -56,10 +56,10 @@ class Stencil(GridOperator):
             fields have the shape of `cells`.
         coefficients: a_o by offset, (dz, dy, dx) or (dy, dx), each -1, 0 or 1, the center included; absent ones are 0. Each is a number,
             an array of the shape of `cells`, or a Warp function of the cell's indices, (k, j, i) or (j, i), that returns a float; functions
-            and arrays do not mix. Or an array of numbers of shape (3, 3) or (3, 3, 3), the center in the middle.
+            and arrays cannot be combined. Or an array of numbers of shape (3, 3) or (3, 3, 3), the center in the middle.
         shift: None, a number or an array of the shape of `cells`, >= 0.
         periodic: whether x, y, z wrap around; the cells of an axis of one cell are then their own neighbors.
-        outside: what lies beyond the array where an axis is not periodic: SOLID, as for `wl.GridPoisson`, or AIR.
+        outside: kind of cells outside the array along axes that are not periodic: SOLID, as for `wl.GridPoisson`, or AIR.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 coefficients are rounded, so that the problem solved is another
             one by about 1e-7 of the diagonal, and tolerances below the rounding end with FLOOR.
@@ -102,7 +102,9 @@ class Stencil(GridOperator):
             if f.ndim:  # numbers are not stored, but added up
                 self._note_rounding(f)
         if functions and any(f.ndim for f in values.values()):
-            raise ValueError("coefficients: arrays and Warp functions do not mix, evaluate the functions or make the arrays functions")
+            raise ValueError(
+                "coefficients: arrays and Warp functions cannot be combined: evaluate the functions or make the arrays functions"
+            )
         fluid = cells.reshape(self.layout.padding.counts) == FLUID
         self._around_itself = [
             a for a in range(cells.ndim) if self._wraps[a] and fluid.shape[2 - a] == 1
@@ -129,7 +131,7 @@ class Stencil(GridOperator):
 
     @property
     def given(self) -> dict[tuple[int, ...], Any]:
-        """The coefficients by offset, as they were given."""
+        """Coefficients by offset, as given."""
         return {_named(offset, len(self.shape)): value for offset, value in self._given.items()}
 
     def _arguments(self) -> dict[str, Any]:
@@ -162,7 +164,7 @@ class Stencil(GridOperator):
     def transposed(self) -> Stencil:
         """Return A' as a stencil of arrays, without SOLID cells.
 
-        Its diagonal has what closed sides add.
+        Its diagonal includes the contributions of closed sides.
         """
         fluid = self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
         found: dict[tuple[int, ...], Any] = {(0,) * len(self.shape): np.where(fluid.reshape(self.shape), self.diagonal().numpy(), 1.0)}
@@ -280,13 +282,13 @@ class Stencil(GridOperator):
         TRANSPOSED.bind(self.stencil.rows, stencil=self.stencil, x=x, y=out).launch()
 
     def boundary_term(self, values: Any) -> wp.array[Any]:
-        """Return what given values in AIR cells, in place of 0, add to b.
+        """Return the contribution to b of given values in AIR cells, in place of 0.
 
         The sums of a_o(i) value_(i + o), float64, shape of `cells`.
 
         Args:
-            values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2, nx + 2), with what lies outside; what
-                FLUID and SOLID cells have does not matter, nor what the padding along a periodic axis has.
+            values: field of the shape of `cells`, or padded, (nz + 2, ny + 2, nx + 2) or (ny + 2, nx + 2), with the values outside; values
+                of FLUID and SOLID cells and of the padding along a periodic axis are ignored.
         """
         host = real_array(values, "values")
         padded = np.zeros(self.layout.stored_shape)
@@ -438,7 +440,7 @@ def _by_offset(coefficients: Any, dimension: int) -> dict[Offset, Any]:
         steps = tuple(offset) if isinstance(offset, tuple) else (offset,)
         if len(steps) != dimension or not all(isinstance(s, (int, np.integer)) and -1 <= s <= 1 for s in steps):
             form = ("(dy, dx)", "(dz, dy, dx)")[dimension - 2]
-            raise ValueError(f"coefficients: offset {offset}: expected {form}, each -1, 0 or 1: wider stencils are a wl.SparseOperator's")
+            raise ValueError(f"coefficients: offset {offset}: expected {form}, each -1, 0 or 1: wider stencils need a wl.SparseOperator")
         given[tuple(map(int, reversed((0,) * (3 - dimension) + steps)))] = value  # type: ignore[index]
     if CENTER not in given:
         raise ValueError(f"coefficients: the center, offset {(0,) * dimension}, is missing")

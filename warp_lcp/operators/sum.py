@@ -28,9 +28,9 @@ FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions a
 
 
 class SumOperator(Pickled):
-    """(A + B) x = A x + B x.
+    """Sum of two operators: (A + B) x = A x + B x.
 
-    It has no sweep: methods that need one refuse it, those that take products (Newton types, gradient methods) do not. With a grid
+    It has no sweep: use methods that need only products (Newton types, gradient methods). With a grid
     operator and a LowRankOperator as its terms, principal systems are preconditioned by the grid's multigrid.
 
     Args:
@@ -108,7 +108,7 @@ class SumOperator(Pickled):
         return None if grid_and_low_rank(self) is None else self.layout.load(self.diagonal(), self.dtype).numpy()
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """out = A x + B x + b; flat stored fields of one type."""
+        """Evaluate out = A x + B x + b; flat stored fields of one type."""
         plain, low = self._plain, self._low
         if isinstance(low, LowRankOperator) and has(plain, AppliesPlus):
             plain.apply_plus(x, b, out)
@@ -121,9 +121,9 @@ class SumOperator(Pickled):
     def floating_components(self, scratch: Any = None) -> Any:
         """Return the components on which the sum is singular, or None.
 
-        None too if a term does not know its own.
+        Also None if a term does not provide its own.
 
-        The constants of a component are a null space as long as no column of a LowRankOperator feels them: a body that closes off a
+        The constants of a component are a null space unless a column of a LowRankOperator acts on them: a body that closes off a
         chamber as a piston does is moved by the pressure in it.
         """
         plain, low = self._plain, self._low
@@ -137,7 +137,7 @@ class SumOperator(Pickled):
         )
 
     def storage_rounding(self) -> float:
-        """Return the larger one of the terms' relative roundings."""
+        """Return the larger relative rounding of the terms."""
         return max((A.storage_rounding() for A in (self.first, self.second) if has(A, StoresRounded)), default=0.0)
 
     def masked(self, free: Any, shift: Any = None) -> SumOperator:

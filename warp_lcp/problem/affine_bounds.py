@@ -171,7 +171,7 @@ class AffineFields:
         for x in (np.clip(0.0, low, high), low, high):
             at = [self._host(side, np.where(np.isfinite(x), x, np.clip(0.0, low, high))) for side in (0, 1)]
             if (at[0] > at[1]).any():
-                raise ValueError(f"lower > upper in {np.count_nonzero(at[0] > at[1])} unknowns at a bound of those they depend on")
+                raise ValueError(f"lower > upper in {np.count_nonzero(at[0] > at[1])} unknowns if those they depend on are at a bound")
         start = np.clip(0.0, low, high)
         for side in (0, 1):
             self.values[side].assign(self._host(side, start))

@@ -21,9 +21,9 @@ class FrictionalContact(VariationalInequality):
 
         K contains r, K* contains u^ = (u_n + mu |u_t|, u_t), and r'u^ = 0
 
-    [De Saxce & Feng 1998; Acary & Brogliato 2008, 3.9]: what does not touch has no impulse, what sticks does not slip, what slips is held
-    by mu r_n against the slip, and slipping lifts nothing. r solves it where it is its own projection P_K(r - u^ / d), whatever d > 0.
-    As u^ is no gradient there may be several solutions or, with mu > 0 and velocities b that no r can stop, none.
+    [De Saxce & Feng 1998; Acary & Brogliato 2008, 3.9]: an open contact has no impulse, a sticking one does not slip, a slipping one has
+    friction mu r_n against the slip, and slip causes no normal velocity. r is a solution if r = P_K(r - u^ / d), for any d > 0.
+    As u^ is not a gradient there may be several solutions or, with mu > 0 and velocities b that no r can stop, none.
 
     J is given by the bodies of each contact and its rows for either: velocities of bodies are M^-1 J' r where the rows have a factor of the
     inverse masses in them, J M^-1/2. A product then costs the entries of J, and J J' is never made.
@@ -76,9 +76,9 @@ class FrictionalContact(VariationalInequality):
         if ((self.first < 0) | (self.first >= self.bodies)).any() or ((self.second < 0) | (self.second > self.bodies)).any():
             raise ValueError(f"first, second: expected numbers of {self.bodies} bodies, in second {self.bodies} for none")
         if (same := self.first == self.second).any():
-            raise ValueError(f"contact {int(same.argmax())} is of a body with itself")
+            raise ValueError(f"contact {int(same.argmax())} joins a body to itself")
         if (still := ~(self.diagonal > 0)).any():
-            raise ValueError(f"contact {int(still.any(axis=1).argmax())} has a row that moves nothing")
+            raise ValueError(f"contact {int(still.any(axis=1).argmax())} has a zero row, which moves no body")
 
     @property
     def dim(self) -> int:

@@ -44,9 +44,9 @@ def as_operator(A: Any, device: Any = None, dtype: Any = wp.float64) -> Operator
         return as_operator(real_array(A, "A"), device, dtype)
     if hasattr(A, "apply"):
         without = f"A is a {type(A).__name__} without {', '.join(missing)}"
-        raise ValueError(f"{without}: an operator needs them; what inherits from wl.Operator has all but shape, device and apply")
+        raise ValueError(f"{without}: an operator needs them; a subclass of wl.Operator must define only shape, device and apply")
     if hasattr(A, "__matmul__") or callable(A):
-        raise ValueError(f"A is a {type(A).__name__}: wl.LinearOperator(A, ...) makes an operator of what has products")
+        raise ValueError(f"A is a {type(A).__name__}: pass wl.LinearOperator(A, ...), which needs only products")
     raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")
 
 
@@ -135,11 +135,11 @@ class LCP(Pickled):
         ADD.bind(rows_of(x), z=b, x=out).launch()
 
     def not_finite(self, field: wp.array[Any]) -> int:
-        """Return how many unknowns of a stored field are not finite."""
+        """Return the number of unknowns of a stored field that are not finite."""
         return self._faults(field, Bounds(self.layout, *INFINITE))[0]
 
     def look_at(self, field: wp.array[Any]) -> Callable[[], int]:
-        """Launch the check of `not_finite`; return a function that waits and reads it.
+        """Launch the check of `not_finite`; return a function that reads its result.
 
         For a problem in one process.
         """

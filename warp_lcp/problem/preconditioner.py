@@ -30,9 +30,9 @@ class Preconditioner:
         n, shape = layout.size, getattr(M, "shape", None)
         if not hasattr(M, "__matmul__"):
             hint = ": PyAMG's is ml.aspreconditioner()" if hasattr(M, "aspreconditioner") else ""
-            raise ValueError(f"preconditioner is a {type(M).__name__}: expected something with products by @{hint}")
+            raise ValueError(f"preconditioner is a {type(M).__name__}: expected an object with products M @ r{hint}")
         if layout.stored_shape != layout.shape:
-            raise ValueError("preconditioner: systems on grids have a multigrid method of their own, none can be given")
+            raise ValueError("preconditioner: cannot be given for systems on grids, which use multigrid")
         if shape != (n, n):
             raise ValueError(f"preconditioner has shape {shape}: expected {(n, n)}")
         self.given = M

@@ -27,11 +27,11 @@ Capability = TypeVar("Capability", bound="Operator")
 
 @runtime_checkable
 class Operator(Protocol):
-    """A square linear operator A on fields of shape `shape`: what each operator has.
+    """Protocol of square linear operators A on fields of shape `shape`.
 
-    Bring your own by inheriting from this protocol, which leaves `shape`, `device` and `apply` to write, or by having all its members; a
+    Define your own by inheriting from this protocol (write `shape`, `device` and `apply`), or by defining all its members; a
     product of NumPy arrays makes one by `wl.LinearOperator`. Docs "Operators of your own" shows both. Fields are plain contiguous arrays of
-    that shape. What more an operator can do are capabilities (`warp_lcp.problem.protocol`): it has one if it has its members.
+    that shape. Optional features are capabilities (`warp_lcp.problem.protocol`): an operator has one if it has its members.
 
     Attributes:
         shape: shape of the fields that A maps to each other.
@@ -47,23 +47,23 @@ class Operator(Protocol):
 
     @abstractmethod
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
-        """Return A x, written to `out` if that is given."""
+        """Return A x, in `out` if given."""
 
     def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
-        """Return A' x, written to `out` if that is given; by default A x of a symmetric A.
+        """Return A' x, in `out` if given; by default A x of a symmetric A.
 
         Raises:
             NoTranspose: A is not symmetric, and has no transpose of its own. It is a ValueError.
         """
         if not self.symmetric:
-            raise NoTranspose(f"{type(self).__name__} has no apply_transpose and is not symmetric: give it one, or take MinimumMapNewton")
+            raise NoTranspose(f"{type(self).__name__} has no apply_transpose and is not symmetric: define it, or use MinimumMapNewton")
         return self.apply(x, out)
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A as a field of type `dtype`.
 
-        By default sizes of rows and columns stand for it, which 16 products estimate each time that this is called: positive, and for a
-        diagonal that leads in its rows about as large. They make preconditioners and step lengths nearly as good as the diagonal's.
+        By default row and column norms, estimated from 16 products at each call, are used instead: positive, and for a
+        dominant diagonal of about the same size. Preconditioners and step lengths are then nearly as good as with the diagonal.
         """
         layout = layout_of(self)
         unknown = self.cells.numpy().ravel() == 1 if has(self, HasCells) else np.ones(layout.size, dtype=bool)
@@ -72,7 +72,9 @@ class Operator(Protocol):
 
 
 class HasRows(Operator, Protocol):
-    """The entries of A by rows: for sweeps in any order, blocks, and proofs that there is no solution.
+    """Access to the entries of A by rows.
+
+    For sweeps in any order, blocks, and proofs that there is no solution.
 
     Attributes:
         row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is empty. The unknown of an empty row goes
@@ -82,21 +84,23 @@ class HasRows(Operator, Protocol):
     row_sizes: wp.array[Any] | None
 
     def rows(self) -> CompressedRows:
-        """Return the rows of A between the elements of flat stored fields, in the operator's own memory."""
+        """Return the rows of A for flat stored fields, in the operator's own memory."""
 
 
 class Relaxes(Operator, Protocol):
-    """A sweep in an order of the operator's own."""
+    """Sweep in the operator's own order."""
 
     def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
-        """Set each x_i in turn to clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), or in the reverse order if not `forward`.
+        """Sweep once: x_i = clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i) in turn.
+
+        In the reverse order if not `forward`.
 
         All are flat stored fields of one type; x is moved in place. Rows with a zero diagonal are passed over.
         """
 
 
 class HasLayout(Operator, Protocol):
-    """Fields that are stored otherwise than as plain arrays.
+    """Storage layout of fields that are not plain arrays.
 
     Attributes:
         layout: loads and unloads them. `apply` and `apply_transpose` take stored fields too, flat or of `layout.stored_shape`.
@@ -106,17 +110,17 @@ class HasLayout(Operator, Protocol):
 
 
 class Versioned(Operator, Protocol):
-    """Entries that change in place.
+    """Counter of in-place changes of the entries.
 
     Attributes:
-        version: another number after each change; what methods have derived from A is derived again when the next solve starts.
+        version: another number after each change; methods update data derived from A when the next solve starts.
     """
 
     version: int
 
 
 class HasCells(Operator, Protocol):
-    """Elements of a field that are no unknowns.
+    """Mask of the elements of a field that are unknowns.
 
     Attributes:
         cells: wp.int8, one for each element of a stored field, 1 (FLUID) where it is an unknown; others stay 0.
@@ -126,7 +130,9 @@ class HasCells(Operator, Protocol):
 
 
 class HasStencil(HasCells, HasLayout, Versioned, Protocol):
-    """The stencil of a grid, of 5 or 7 points or a compact one: for multigrid and for passes that compute A x on the way.
+    """Compact stencil of a grid operator, of 5, 7 or more points.
+
+    For multigrid and for kernels that compute A x on the way.
 
     Attributes:
         stencil: the diagonal and the weights of neighbors; of 5 and 7 points A is symmetric with weights >= 0 and weakly dominant rows.
@@ -140,14 +146,17 @@ class HasStencil(HasCells, HasLayout, Versioned, Protocol):
 
 
 class HasBlocks(HasCells, HasLayout, Versioned, Protocol):
-    """Operators on some of the cells, the others taken as AIR: blocks of the unknowns."""
+    """Restriction to some of the cells, the others being AIR: blocks of unknowns."""
 
     def on_cells(self, cells: np.ndarray) -> Any:
-        """Return an operator with the same coefficients on other cells, padded as `cells` is; what it is of no cells changes nothing."""
+        """Return an operator with the same coefficients on other cells.
+
+        Padded as `cells` is. Coefficients elsewhere have no effect.
+        """
 
 
 class HasColumns(Operator, Protocol):
-    """A = G + U W U', with a stencil and a few columns.
+    """Sum A = G + U W U' of a stencil operator and a low-rank operator.
 
     Attributes:
         grid: G, an operator that has a stencil.
@@ -159,24 +168,35 @@ class HasColumns(Operator, Protocol):
 
 
 class AppliesPlus(Operator, Protocol):
-    """A x + b in one pass: saves each residual one over memory."""
+    """Fused A x + b, which saves one pass over memory per residual."""
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """out = A x + b; flat stored fields of one type."""
+        """Evaluate out = A x + b; flat stored fields of one type."""
 
 
 class HasScale(Operator, Protocol):
-    """The d of the natural residual, d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)); without it, d is estimated by 16 products."""
+    """Scale d of the natural residual d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)).
+
+    Without it, d is estimated by 16 products.
+    """
 
     def scale(self) -> np.ndarray | None:
-        """Return d > 0, units of y over those of x, as a flat stored field; None: it is to be estimated."""
+        """Return d > 0 as a flat stored field; None: d is to be estimated.
+
+        In units of y over those of x.
+        """
 
 
 class NamesComponents(Operator, Protocol):
-    """Sets of unknowns on which A is singular with the constants as null space: they are projected out, or b is INFEASIBLE there."""
+    """Components of unknowns on which A is singular (constants are its null space).
+
+    They are projected out, or b is INFEASIBLE there.
+    """
 
     def floating_components(self, scratch: Any = None) -> Any:
-        """Return them (`warp_lcp.operators.components.FloatingComponents`), None if there are none.
+        """Return the floating components, None if there are none.
+
+        See `warp_lcp.operators.components.FloatingComponents`.
 
         Args:
             scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten; None: there are none.
@@ -184,17 +204,23 @@ class NamesComponents(Operator, Protocol):
 
 
 class StoresRounded(Operator, Protocol):
-    """Entries that may be rounded where they are stored: a tolerance below that is the stored A's alone, and the status FLOOR."""
+    """Rounding of stored entries.
+
+    A tolerance below it applies only to the stored A, and the status is FLOOR.
+    """
 
     def storage_rounding(self) -> float:
-        """Return the largest relative rounding of what A is made of, as it was given in float64; 0: none."""
+        """Return the largest relative rounding of the data of A; 0: none.
+
+        Relative to the values given in float64.
+        """
 
 
 class HasCoefficients(Operator, Protocol):
-    """What A is made of, and how a scalar depends on it: for `wl.vjp`."""
+    """Derivatives of a scalar by the data of A, for `wl.vjp`."""
 
     def coefficient_gradient(self, multiplier: wp.array[Any], x: wp.array[Any]) -> dict[str, Any]:
-        """Return the derivatives of mu'A x with respect to what the constructor takes, by the names of its arguments.
+        """Return the derivatives of mu'A x by the constructor's arguments, by name.
 
         Each has the shape that was given, as a wp.float64 array on A's device, or is a number where a number was given; None where nothing
         was. Those of a matrix are on its pattern.
@@ -280,7 +306,7 @@ def check_taken(method: Any, A: Operator) -> None:
         ValueError: it does not; the message names what is missing, and methods that ask for nothing.
     """
     if not takes(method, A):
-        others = "take MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which need products only"
+        others = "use MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which need only products"
         raise ValueError(
             f"{type(method).__name__} needs an operator with {described(*method.supports)}; {type(A).__name__} has none: {others}"
         )

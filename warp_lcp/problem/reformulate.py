@@ -1,4 +1,6 @@
-"""One problem as another: LE, LCP, mixed LCP, boxed LCP, QP, VI, proximal and root-finding forms ([Book] 1.1-1.2, table 3.4).
+"""Reformulations: LE, LCP, mixed and boxed LCP, QP, VI, fixed point, root finding.
+
+[Book] 1.1-1.2, table 3.4.
 
 Problems are given and returned with matrices on the host (numpy or scipy.sparse); `LCP` holds the first four, which differ by their
 bounds alone: 0 and inf (LCP), -inf and inf on equations (mixed), any (boxed). Where the unknowns change, a `Reformulation` maps solutions
@@ -24,7 +26,7 @@ Map = Callable[[Vector], Vector]
 
 @dataclass(frozen=True, eq=False)
 class Reformulation:
-    """A problem that stands for another one.
+    """Equivalent problem, and the map back to the first one.
 
     Args:
         problem: the new problem.
@@ -45,7 +47,7 @@ class Reformulation:
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProgramData:
-    """Minimize 1/2 x'Qx + c'x subject to l <= x <= u, G x >= h, C x = d.
+    """Quadratic program: 1/2 x'Qx + c'x, l <= x <= u, G x >= h, C x = d.
 
     Args:
         Q: symmetric matrix (n, n).
@@ -74,7 +76,9 @@ class QuadraticProgramData:
 
 @dataclass(frozen=True, eq=False)
 class BoxVariationalInequality:
-    """Find x in K with F(x)'(z - x) >= 0 for all z in K ([Book] eq. 1.49); here F(x) = A x + b.
+    """Variational inequality over a box K ([Book] eq. 1.49), F(x) = A x + b.
+
+    Find x in K with F(x)'(z - x) >= 0 for all z in K.
 
     Args:
         F: the map.
@@ -87,17 +91,23 @@ class BoxVariationalInequality:
     upper: Vector
 
     def project(self, x: Vector) -> Vector:
-        """Return the point of K nearest to x."""
+        """Return the projection of x onto K."""
         return np.clip(x, self.lower, self.upper)
 
     def gap(self, x: Vector) -> float:
-        """Return max over z in K of F(x)'(x - z): 0 at solutions in K, positive at all other points of K, inf where K has no end."""
+        """Return the gap function max over z in K of F(x)'(x - z).
+
+        0 at solutions in K, positive at all other points of K, inf if K is unbounded there.
+        """
         y = self.F(x)
         farthest = np.where(y > 0, x - self.lower, np.where(y < 0, x - self.upper, 0.0))
         return float(np.sum(np.where(y == 0, 0.0, y * np.where(y == 0, 0.0, farthest))))
 
     def regularized_gap(self, x: Vector, alpha: float = 1.0) -> float:
-        """Return max over z in K of F(x)'(x - z) - alpha/2 |x - z|^2, finite everywhere (Fukushima 1992): 0 in K at solutions alone."""
+        """Return the regularized gap function (Fukushima 1992), finite everywhere.
+
+        max over z in K of F(x)'(x - z) - alpha/2 |x - z|^2; in K it is 0 only at solutions.
+        """
         y = self.F(x)
         z = self.project(x - y / alpha)
         return float(y @ (x - z) - 0.5 * alpha * (x - z) @ (x - z))
@@ -105,7 +115,9 @@ class BoxVariationalInequality:
 
 @dataclass(frozen=True, eq=False)
 class ProximalFixedPoint:
-    """Find x = prox_K(x - R y) ([Book] eq. 1.52), prox_K the projection onto K, R = diag(r) with any r > 0.
+    """Fixed-point problem x = prox_K(x - R y) ([Book] eq. 1.52).
+
+    prox_K is the projection onto K, R = diag(r) with any r > 0.
 
     Args:
         F: y = F(x).
@@ -131,12 +143,17 @@ def linear_equations_to_boxed(A: Any, b: Vector, *, device: Any = None) -> Refor
 
 
 def lcp_to_boxed(A: Any, b: Vector, *, device: Any = None) -> Reformulation:
-    """Return 0 <= x, A x + b >= 0, complementary, as a boxed LCP with l = 0, u = inf ([Book] eq. 1.72); a mixed one with no equations."""
+    """Return an LCP as a boxed LCP with l = 0, u = inf ([Book] eq. 1.72).
+
+    0 <= x, A x + b >= 0, complementary: a mixed LCP without equations.
+    """
     return mixed_to_boxed(A, b, np.zeros(len(b), dtype=bool), device=device)
 
 
 def mixed_to_boxed(A: Any, b: Vector, equations: Vector, *, device: Any = None) -> Reformulation:
-    """Return y_E = 0 and the LCP on the other rows as a boxed LCP: l = -inf on E, 0 elsewhere ([Book] eq. 1.76-1.77).
+    """Return a mixed LCP as a boxed LCP ([Book] eq. 1.76-1.77).
+
+    y_E = 0 on the equations E: l = -inf there, 0 elsewhere.
 
     Args:
         A: matrix (n, n).
@@ -151,7 +168,9 @@ def mixed_to_boxed(A: Any, b: Vector, equations: Vector, *, device: Any = None) 
 
 
 def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) -> Reformulation:
-    """Return the Schur complement on the unknowns N that are bounded: an LCP with A_NN - A_NE A_EE^-1 A_EN.
+    """Return a mixed LCP as an LCP by the Schur complement.
+
+    On the unknowns N with bounds: A_NN - A_NE A_EE^-1 A_EN.
 
     Fewer unknowns, but dense where A was sparse ([Book] 3.2.1).
 
@@ -167,12 +186,12 @@ def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) ->
     mask = _marked(equations, len(b))
     E, N = np.flatnonzero(mask), np.flatnonzero(~mask)
     if N.size == 0:
-        raise ValueError("equations holds every row: this is a linear system, see linear_equations_to_boxed")
+        raise ValueError("equations selects every row: this is a linear system, see linear_equations_to_boxed")
     M = A.toarray() if scipy.sparse.issparse(A) else np.asarray(A, dtype=np.float64)
     try:
         solved = np.linalg.solve(M[np.ix_(E, E)], np.column_stack([M[np.ix_(E, N)], b[E]]))
     except np.linalg.LinAlgError:
-        raise ValueError("A is singular on the equations: they cannot be eliminated; take mixed_to_boxed") from None
+        raise ValueError("A is singular on the equations: they cannot be eliminated; use mixed_to_boxed") from None
     schur, rest = M[np.ix_(N, N)] - M[np.ix_(N, E)] @ solved[:, :-1], b[N] - M[np.ix_(N, E)] @ solved[:, -1]
 
     def back(p: Vector) -> Vector:
@@ -184,7 +203,9 @@ def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) ->
 
 
 def boxed_to_lcp(A: Any, b: Vector, lower: Vector, upper: Vector, *, device: Any = None) -> Reformulation:
-    """Return a boxed LCP as an LCP in p >= 0 and one multiplier q >= 0 for each row with both bounds.
+    """Return a boxed LCP as an LCP in x - l (or u - x) and multipliers.
+
+    p >= 0, and one multiplier q >= 0 for each row with both bounds.
 
     The book's form with four unknowns a row (eq. 1.68) after elimination of beta and gamma: x = l + p where l is finite, x = u - p where
     only u is, y = y+ - q with 0 <= q complementary to u - l - p >= 0. It is not symmetric and has a zero block, so that no QP belongs to
@@ -216,7 +237,9 @@ def boxed_to_lcp(A: Any, b: Vector, lower: Vector, upper: Vector, *, device: Any
 
 
 def boxed_to_quadratic_program(A: Any, b: Vector, lower: Vector, upper: Vector) -> QuadraticProgramData:
-    """Return min 1/2 x'Ax + b'x on the box, whose first-order conditions are the boxed LCP ([Book] eq. 1.58, 1.78).
+    """Return the quadratic program of a boxed LCP ([Book] eq. 1.58, 1.78).
+
+    min 1/2 x'Ax + b'x on the box; its first-order conditions are the boxed LCP.
 
     Its minimizers are the solutions if A is positive semi-definite.
 
@@ -225,12 +248,14 @@ def boxed_to_quadratic_program(A: Any, b: Vector, lower: Vector, upper: Vector) 
     """
     difference = abs(A - A.T)
     if difference.max() > 1e-12 * abs(A).max():
-        raise ValueError("A is not symmetric: no quadratic program belongs to it")
+        raise ValueError("A is not symmetric: there is no equivalent quadratic program")
     return QuadraticProgramData(A, b, lower, upper)
 
 
 def quadratic_program_to_boxed(program: QuadraticProgramData, *, device: Any = None) -> Reformulation:
-    """Return the first-order (KKT) conditions of a quadratic program as a boxed LCP in (x, lambda, nu).
+    """Return the KKT conditions of a quadratic program as a boxed LCP.
+
+    In (x, lambda, nu).
 
     y_x = Q x + c - G' lambda - C' nu within x's box, 0 <= lambda complementary to G x - h >= 0, nu free with C x - d = 0. Without general
     constraints it is the program's own box. `back` returns x.
@@ -258,7 +283,10 @@ def quadratic_program_to_boxed(program: QuadraticProgramData, *, device: Any = N
 
 
 def boxed_to_variational_inequality(A: Any, b: Vector, lower: Vector, upper: Vector) -> BoxVariationalInequality:
-    """Return the variational inequality of a boxed LCP ([Book] 1.1.4): the two have the same solutions."""
+    """Return a boxed LCP as a variational inequality ([Book] 1.1.4).
+
+    The two have the same solutions.
+    """
     return BoxVariationalInequality(lambda x: A @ x + b, lower, upper)
 
 
@@ -283,12 +311,17 @@ def boxed_to_proximal(A: Any, b: Vector, lower: Vector, upper: Vector, *, r: flo
 
 
 def boxed_to_minimum_map(A: Any, b: Vector, lower: Vector, upper: Vector) -> Map:
-    """Return H(x) = max(min(x - l, y), x - u), whose roots are the solutions ([Book] 1.1.3, eq. 1.61)."""
+    """Return a boxed LCP as root finding of the minimum map ([Book] 1.1.3).
+
+    H(x) = max(min(x - l, y), x - u), eq. 1.61.
+    """
     return lambda x: np.maximum(np.minimum(x - lower, A @ x + b), x - upper)
 
 
 def boxed_to_fischer_burmeister(A: Any, b: Vector, lower: Vector, upper: Vector) -> Map:
-    """Return phi(x - l, phi(u - x, -y)) with phi(s, t) = sqrt(s^2 + t^2) - s - t; its roots are the solutions ([Book] eq. 1.48, 1.62).
+    """Return a boxed LCP as root finding of the Fischer-Burmeister map.
+
+    phi(x - l, phi(u - x, -y)) with phi(s, t) = sqrt(s^2 + t^2) - s - t ([Book] eq. 1.48, 1.62).
 
     phi(inf, t) = -t: an infinite upper bound leaves phi(x - l, y), an infinite lower one -phi(u - x, -y).
     """

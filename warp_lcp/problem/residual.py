@@ -40,7 +40,7 @@ SETTLE_ISOLATED = RowPass(
 
 
 class NaturalResidual:
-    """Evaluates y = A x + b and the norm of the natural residual, in float64.
+    """Evaluation of y = A x + b and the norm of the natural residual, in float64.
 
     Attributes:
         y: stored field, A x + b at the x of the last evaluation.
@@ -63,12 +63,12 @@ class NaturalResidual:
 
     @cached_property
     def y(self) -> wp.array[Any]:
-        """Memory of y, made when it is first asked for."""
+        """Field y, allocated at first access."""
         return self.problem.layout.zeros(wp.float64)
 
     @cached_property
     def known(self) -> Known:
-        """What passes take of y in place of a stencil."""
+        """Kernel argument with the precomputed y, in place of a stencil."""
         return Known(self.diagonal, self.unit, self.y)
 
     def evaluate(self, x: wp.array[Any]) -> float:
@@ -81,11 +81,14 @@ class NaturalResidual:
         return self.norm
 
     def affine(self, x: wp.array[Any]) -> None:
-        """Set y = A x + b."""
+        """Compute y = A x + b."""
         self.problem.apply_plus(x, self.problem.b, self.y)
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
-        """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
+        """Project x onto the bounds, or set it to clip(0, l, u).
+
+        0 where there is no unknown.
+        """
         p = self.problem
         if self._diagonal_of is not None and self._diagonal_of != version_of(p.A):
             self._diagonal_of = version_of(p.A)
@@ -96,7 +99,7 @@ class NaturalResidual:
         self.current = False
 
     def rescale(self) -> None:
-        """Take d again from an operator that has changed; grids share theirs."""
+        """Update d after the operator has changed; grids share theirs."""
         A = self.problem.A
         own = A.scale() if has(A, HasScale) else None
         d = self._estimated_scale() if own is None else own
@@ -109,11 +112,11 @@ class NaturalResidual:
 
     @property
     def row_sizes(self) -> wp.array[Any] | None:
-        """The largest magnitude of each row of a matrix with empty ones, None of others."""
+        """Largest magnitude of each row of a matrix with empty rows, else None."""
         return self.problem.A.row_sizes if has(self.problem.A, HasRows) else None
 
     def settle_isolated(self, x: wp.array[Any]) -> None:
-        """Set x where A's row is empty to the bound that the sign of b asks for.
+        """Set x at empty rows of A to the bound that the sign of b selects.
 
         There y = b. Methods move coupled unknowns only.
         """
@@ -141,7 +144,7 @@ class NaturalResidual:
 
     @property
     def square_of_b(self) -> Reading:
-        """||b||^2 over the unknowns as launched last, in the first place."""
+        """||b||^2 over the unknowns as last launched, in the first entry."""
         return self._sums.reading
 
     def launch_square_of_b(self) -> None:

@@ -17,35 +17,37 @@ if TYPE_CHECKING:
 class SolveStatus(Enum):
     """Exit status of a solve.
 
-    The value says what it means and what to try next.
+    The value is a message: the meaning, and a hint what to try next.
     """
 
     CONVERGED = "the recomputed residual meets the criteria"
     MAX_ITERATIONS = (
-        "the iteration limit came first: raise max_iterations, start warmer, or take a faster method; "
+        "the iteration limit was reached: raise max_iterations, start from a better x0, or use a faster method; "
         "where coefficients differ by more than 1e5, precision='double'"
     )
-    TIME_LIMIT = "`max_seconds` came first: raise it, start from this x, or take a faster method, that of wl.solve(problem) or wl.recommend"
-    STOPPED = "the callback raised StopIteration: go on from this x"
-    STAGNATED = "no smaller residual in the last `patience` steps: take another method or precision='double'"
+    TIME_LIMIT = (
+        "`max_seconds` was reached: raise it, start from this x, or use a faster method, as chosen by wl.solve(problem) or wl.recommend"
+    )
+    STOPPED = "the callback raised StopIteration: continue from this x"
+    STAGNATED = "no smaller residual in the last `patience` steps: use another method or precision='double'"
     FLOOR = (
         "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'; "
         "where A is stored in float32 and its entries are rounded, rtol below 1e-7 needs dtype=wp.float64"
     )
-    LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start elsewhere or take another method"
-    NON_DESCENT = "no step reduces the merit function: take another method, for example ProjectedSOR"
+    LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start from another x0 or use another method"
+    NON_DESCENT = "no step reduces the merit function: use another method, for example ProjectedSOR"
     DIVERGED = "the residual grew beyond `divergence` times the first one: the method's assumptions on A do not hold"
     NON_FINITE = (
         "a NaN or an infinity appeared: check b, the bounds and the coefficients; where these are beyond 1e36 or below 1e-36, "
-        "scale A and b, or take precision='double'"
+        "scale A and b, or use precision='double'"
     )
     INFEASIBLE = (
         "the problem has no solution: b is incompatible with a singular component, or the method has proved it; "
-        "if you expected one, check the signs: y = A x + b wants A, not -A"
+        "if you expected one, check the signs: y = A x + b needs A, not -A"
     )
     NEGATIVE_CURVATURE = (
         "A's diagonal entries are negative, or x'Ax < 0, where bounds are infinite: it is neither positive semi-definite nor a P-matrix; "
-        "check the sign of A: y = A x + b wants A, not -A; where the sign is right, try wl.Lemke()"
+        "check the sign of A: y = A x + b needs A, not -A; where the sign is right, try wl.Lemke()"
     )
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
@@ -55,16 +57,18 @@ class SolveStatus(Enum):
 
 @dataclass(frozen=True)
 class Record:
-    """One line of a history, taken before step `iteration` (the last one: at the end).
+    """Line of a solve's history, taken before step `iteration`.
+
+    The last line is taken at the end.
 
     Args:
         iteration: steps done.
         residual: norm of the natural residual, recomputed in float64, units of y.
         linear_iterations: iterations on the finest grid so far.
         active: unknowns held at a bound in the last step; None where the method has no active set.
-        step: what the last step was, a word of the method ("newton", "monotone cycle", "sweep", ...).
+        step: kind of the last step ("newton", "monotone cycle", "sweep", ...).
         seconds: wall time since the start of the solve.
-        merits: the book's merit functions, where `StoppingCriteria(merits=True)` asks for them.
+        merits: the book's merit functions, with `StoppingCriteria(merits=True)`.
     """
 
     iteration: int
@@ -88,10 +92,10 @@ class SolveResult(FieldsOnHost):
         residual: norm of the natural residual at x, recomputed in float64, units of y.
         relative_residual: residual over the one at clip(0, l, u); 0 where both vanish.
         history: a Record for the start and one for each step.
-        grid: cells (nz, ny, nx) or (ny, nx) of the grid whose compact stencil a sparse matrix was seen to be, and as which it was solved;
-            None of others.
+        grid: cells (nz, ny, nx) or (ny, nx), if a sparse matrix was recognized as a compact stencil and solved on its grid;
+            else None.
         method: name in `wl.METHODS` of the method that found x, where `wl.solve` has chosen it; None where one was given.
-        problem: what was solved, for `wl.vjp`; None where the result was pickled.
+        problem: the problem solved, for `wl.vjp`; None in a pickled result.
         version: of the problem's operator then, None where it has none.
     """
 

@@ -83,14 +83,14 @@ class Step:
 
 
 class VariationalInequality:
-    """Base of variational inequalities over a convex set K that is no box.
+    """Base class of variational inequalities over a convex set K other than a box.
 
     Find x in K with y(x)'(z - x) >= 0 for all z in K.
 
     Equivalently, x = P_K(x - y/d) for any d > 0, where P_K is the projection onto K. The natural residual is the
     distance from x to that projection. For a box K = [l, u] and y = A x + b use `LCP`. K may depend on x.
 
-    A subclass holds the data of y and K. `wl.solve` asks for the residual alone: a method and its workspace evaluate y
+    A subclass holds the data of y and K. `wl.solve` needs only the residual: a method and its workspace evaluate y
     and P_K, together in one kernel if they can. The stresses of sand (`granular.stress.Stress`) are such a problem.
 
     The workspace holds the iterate and a `Residual`. The iterate starts as it is unless `x0` is given, and the result's x
@@ -226,7 +226,7 @@ def solve(
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
     if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
         kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"
-        raise ValueError(f"solver is {kind}: expected a name in wl.METHODS or a method with its settings, say wl.MinimumMapNewton()")
+        raise ValueError(f"solver is {kind}: expected a name in wl.METHODS or a method with its settings, such as wl.MinimumMapNewton()")
     check_criteria(stopping)
     taken: type = getattr(solver, "problems", LCP)
     if not isinstance(problem, taken):
@@ -235,11 +235,11 @@ def solve(
     if isinstance(problem, LCP):
         across, loop = problem.layout.across, _LoopInBox
         if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
-            raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
+            raise ValueError(f"{type(solver).__name__} cannot use bounds that are affine in x: use ProjectedSOR or another sweeping method")
         if problem.preconditioner is not None and not getattr(solver, "preconditioned", False):
-            raise ValueError(f"preconditioner: {type(solver).__name__} makes no use of it: take MinimumMapNewton or PrimalDualActiveSet")
+            raise ValueError(f"preconditioner: {type(solver).__name__} does not use one: use MinimumMapNewton or PrimalDualActiveSet")
         if across is not None and not getattr(solver, "distributed", False):
-            raise ValueError(f"{type(solver).__name__} does not work on several ranks: take ProjectedMultigrid or MinimumMapNewton")
+            raise ValueError(f"{type(solver).__name__} does not work on several ranks: use ProjectedMultigrid or MinimumMapNewton")
     stopping = stopping or StoppingCriteria()
     deadline = Deadline(stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, across)
     work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
@@ -256,7 +256,7 @@ def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
     if made and type(work) not in made:
         raise ValueError(f"workspace is a {type(work).__name__}, made by another method: expected what {name}.init(problem) returned")
     if work.problem is not problem:
-        raise ValueError("workspace was made for another problem: problems that change in place keep theirs")
+        raise ValueError("workspace was made for another problem; it fits only the problem that it was made for, changed in place or not")
     return work
 
 
@@ -477,7 +477,7 @@ class _LoopInBox(_Loop):
         for name, side, sign in (("lower", p.lower, 1), ("upper", p.upper, -1)):
             least = float((sign * side.numpy()).max())  # x must be as large, in this direction
             if float(np.finfo(wp.dtype_to_numpy(iterate)).max) < least < math.inf:
-                raise ValueError(f"{name}: x must be {sign * least:.1e}, too large for precision='single': take 'mixed'")
+                raise ValueError(f"{name}: x must be {sign * least:.1e}, too large for precision='single': use 'mixed'")
 
     def _refuse_vanishing(self) -> None:
         """Refuse data so small that squares of residuals are 0: anything would look like a solution."""
@@ -489,7 +489,7 @@ class _LoopInBox(_Loop):
             largest = largest if across is None else across.max(largest)
             if 0.0 < largest < SMALLEST:
                 raise ValueError(
-                    f"{name}: values up to {largest:.1e} only, whose squares vanish in float64; multiply b and the bounds by one factor"
+                    f"{name}: largest value {largest:.1e}, whose square underflows in float64; scale b and the bounds by one factor"
                 )
 
     def _guess(self, x0: Array) -> wp.array[Any]:

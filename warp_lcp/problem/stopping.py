@@ -23,12 +23,12 @@ class StoppingCriteria(Settings):
     Args:
         rtol: relative tolerance, in [0, 1).
         atol: absolute tolerance >= 0, in the units of y.
-        max_iterations: the most steps of the method, >= 0; the limit is honored exactly, by sand's after the ten it takes at once.
+        max_iterations: maximum number of steps of the method, >= 0; the limit is honored exactly, by sand's after the ten it takes at once.
         patience: steps without a new smallest residual after which the solve has stagnated, >= 1.
         divergence: the solve has diverged when the residual exceeds this multiple of the first one, > 1.
-        max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A method's set-up counts. What cannot be cut
-            short is finished first: a pivot, a sweep, an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a
-            linear solve, whose loop the host does not see. On ranks time is up for all as soon as it is for one.
+        max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A method's set-up counts. What cannot be
+            interrupted is finished first: a pivot, a sweep, an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a
+            whole linear solve. On ranks all stop as soon as the time is up on one.
         merits: record the book's merit functions in the history as well (`Record.merits`), by one more product with A a step; no criteria.
 
     Example:
@@ -53,7 +53,7 @@ class StoppingCriteria(Settings):
         return max(self.atol, self.rtol * reference)
 
     def status(self, norm: float, tolerance: float, first: float, steps: int, idle: int, *, interim: bool = False) -> SolveStatus | None:
-        """Return how an iteration ends, None if it goes on.
+        """Return the status of an iteration, None while it continues.
 
         Args:
             norm: of the residual.

@@ -180,7 +180,7 @@ class Answers(BaseHTTPRequestHandler):
             asked = urlsplit(self.path)
             words = parse_qs(asked.query)
         except ValueError as error:
-            raise QueryError(f"no address: {error}") from error
+            raise QueryError(f"invalid address: {error}") from error
         live = self.server.live
         if asked.path == "/":
             return self.server.page, "text/html; charset=utf-8"
@@ -268,7 +268,7 @@ def live_server(folder: Path, *, port: int = PORT, show: Show | None = None) -> 
     try:
         return LiveServer(Live(folder, show), port)
     except OSError as error:
-        raise RenderError(f"--port {port}: cannot be served on: {error.strerror}; 0 takes a free one") from error
+        raise RenderError(f"--port {port}: cannot be used: {error.strerror}; 0: any free port") from error
 
 
 @contextmanager

@@ -152,7 +152,7 @@ class Recording:
         self.color = Color.PLAIN if self.show not in WITH_PARTICLES else color or Color.SPEED
         self.look_again()
         if self.color is Color.PRESSURE and not set(self.numbers) <= set(self._numbers("grid")):
-            raise RenderError(f"{folder}: --color pressure needs a frame of cells for each of particles; choose speed or plain")
+            raise RenderError(f"{folder}: --color pressure needs a frame of cells for each frame of particles; choose speed or plain")
 
     def chosen(self, frames: Sequence[int]) -> list[int]:
         """Return the numbers of the frames asked for, each once, in order; all if none is asked for. Negative ones count from the end.
@@ -310,7 +310,7 @@ class Recording:
 
     def _field(self, fields: dict[str, Any], name: str, components: int = 1) -> np.ndarray:
         if name not in fields or fields[name].shape[1:] != (components,)[: components - 1]:
-            raise RenderError(f"{self.folder}: the frames have no {name}, which --color {self.color} needs; plain needs nothing")
+            raise RenderError(f"{self.folder}: the frames have no {name}, which --color {self.color} needs; choose plain")
         return np.asarray(fields[name], dtype=np.float64)
 
     def _pressure(self, number: int, points: np.ndarray) -> np.ndarray:

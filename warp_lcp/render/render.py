@@ -161,7 +161,7 @@ def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, 
 
         return partial(Section, at=looks.at)
     if looks.at is not None:
-        raise RenderError("--at: says where --slice cuts; give both")
+        raise RenderError("--at: needs --slice")
     try:
         import pyvista
     except ImportError as error:

@@ -42,7 +42,7 @@ class Section:
         depth = 0.0 if flat else self.scene.domain.size[2]
         self.at = None if flat else depth / 2 if at is None else at
         if self.at is not None and not 0.0 <= self.at <= depth:
-            raise RenderError(f"--at {self.at:g}: must be in the domain, whose z reaches from 0 to {depth:g} m")
+            raise RenderError(f"--at {self.at:g}: must be inside the domain, from 0 to {depth:g} m")
         self._solids = []
         for solid in prescribed_solids(self.scene):
             motion = solid.motion.to_motion(self.scene.dimension) if solid.motion else None

@@ -1,4 +1,4 @@
-"""All rigid bodies of a scene: their time step, between the material's solve and the walls."""
+"""Rigid bodies of a scene: time step with contacts and joints."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ class _Begun:
 
 
 class RigidBodies:
-    """The bodies of a scene, which a material, walls and each other push.
+    """Rigid bodies of a scene, pushed by material, walls and each other.
 
     A step is `begin_step`, the material's solve with `RigidBody.apply_impulse`, and `end_step`; `restore_step` in its place if the solve
     fails. `begin_step` leaves the velocities V* that contacts allow before the material pushes. `end_step` starts again from gravity and
-    what the material gave and solves for the contacts once more: what a wall had to bear is not what it had to bear before.
+    the material's impulses and solves for the contacts once more, since the loads on walls have changed.
 
     Args:
         bodies: in the order of their solids.
         geometries: the shape of each as the scene places it.
         numbers: the wall number of each, 1 + the index of its solid.
-        obstacles: what else they may touch.
+        obstacles: walls and solids that they may touch.
         dimension: 2 or 3.
-        solver: of the impulses of contacts and joints; the default takes contacts alone.
+        solver: solves for the impulses of contacts and joints; the default handles only contacts.
         joints: between the bodies, numbered as in `bodies`; restitution must be 0 with them.
 
     Attributes:
@@ -71,7 +71,7 @@ class RigidBodies:
         contact_iterations: of its solve.
         exits: sides of the domain that bodies leave by: its size [m], and bits of `warp_lcp.grid.sides.side_bits`. A body whose center of
             mass has crossed one is out of the simulation for good: at rest outside, touched by nothing, in no frame.
-        material: whether one may push the bodies; else nothing asks what holds them.
+        material: whether a material may push the bodies; else contacts that hold them are not tracked.
 
     Raises:
         ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
@@ -107,7 +107,9 @@ class RigidBodies:
         return self.bodies[0].time
 
     def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float) -> None:
-        """Let gravity act, and contacts; hold bodies that rest against walls and solids that the scene moves or that stand.
+        """Apply gravity and contacts; hold bodies that rest against walls and solids.
+
+        Against the domain's walls, moving solids and fixed solids.
 
         Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it meets a body on the floor as it meets the
         floor. `solve_contacts` updates which contacts bear.
@@ -138,14 +140,14 @@ class RigidBodies:
         self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses), dt, kick_dt)
 
     def solve_contacts(self) -> None:
-        """Solve for the contacts with what the material gave.
+        """Solve the contacts with the impulses of the material.
 
         Raises:
             RuntimeError: there was no `begin_step`.
         """
         begun = self._begun
         if begun is None:
-            raise RuntimeError("solve_contacts: there was no begin_step")
+            raise RuntimeError("solve_contacts: call begin_step first")
         impulses = begun.impulses
         if any(body.given.any() for body in self.bodies):
             for body, momenta in zip(self.bodies, begun.free, strict=True):
@@ -155,7 +157,7 @@ class RigidBodies:
         self._begun = replace(begun, impulses=impulses, settled=True)
 
     def end_step(self, dt: float) -> None:
-        """Move and turn the bodies, after `solve_contacts` if that has not been called.
+        """Move the bodies; calls `solve_contacts` if it has not been called.
 
         Args:
             dt: of `begin_step` [s].
@@ -179,7 +181,7 @@ class RigidBodies:
         self._begun = None
 
     def gone(self) -> np.ndarray:
-        """Return which bodies have left the domain, shape (n,)."""
+        """Return which bodies have left the domain, bool, shape (n,)."""
         size, sides = self.exits
         beyond = np.zeros(len(self.bodies), dtype=bool)
         for axis, length in enumerate(size):
@@ -188,7 +190,7 @@ class RigidBodies:
         return beyond
 
     def leave(self) -> None:
-        """Put bodies that have crossed an open side out of the way, at rest."""
+        """Remove bodies that have crossed an open side; they rest outside."""
         size, sides = self.exits
         for number in np.flatnonzero(self.gone()):
             body, way = self.bodies[number], OUTSIDE * self.shapes[number].reach(self.bodies[number].properties.center)
@@ -207,7 +209,9 @@ class RigidBodies:
             self._begun = None
 
     def trouble(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
-        """Return what makes it impossible to go on, if something does: a body that is not finite, or one that meets its own image.
+        """Return why the simulation cannot continue, or "".
+
+        A body is not finite, or meets its own periodic image.
 
         Args:
             size: of the domain [m].
@@ -223,10 +227,10 @@ class RigidBodies:
         return None
 
     def top_speed(self, span: float, gravity: float = 0.0) -> float:
-        """Return how fast a point of a body may become [m/s] in the time to come.
+        """Return the largest future speed of a point of a body [m/s].
 
         Args:
-            span: what is looked ahead [s].
+            span: time to look ahead [s].
             gravity: its size [m/s^2].
         """
         gone = self.gone()
@@ -234,20 +238,20 @@ class RigidBodies:
         return max(speeds) + span * gravity if speeds else 0.0
 
     def kinetic_energy(self) -> float:
-        """Return the energy of motion and spin [J; J/m in 2-D]."""
+        """Return the kinetic energy [J; J/m in 2-D]."""
         return sum(body.kinetic_energy for body in self.bodies)
 
     def potential_energy(self, gravity: np.ndarray) -> float:
-        """Return the energy of height [J; J/m in 2-D], 0 at the origin."""
+        """Return the potential energy [J; J/m in 2-D], 0 at the origin."""
         return sum(body.potential_energy(gravity) for body in self.bodies)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what `restore` needs to continue bit for bit."""
+        """Return the state, for a bitwise identical continuation."""
         joints = {"joint_impulses": self._solve.joint_impulses} if self.joints else {}
         return {"bodies": self._states(), "body_contacts": self._solve.memory.state(), **joints}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from `state`.
+        """Restore `state`.
 
         Raises:
             ValueError: it is of other bodies.
@@ -265,7 +269,7 @@ class RigidBodies:
             body.restore(values)
 
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the log's columns: place, velocity and turn of each body, numbered from 0.
+        """Return the log columns: position, velocity and rotation of each body.
 
         x, y, z: the center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, how far it has turned [degrees] and how fast
         it turns [degrees/s]; 3-D: wx, wy, wz, the angular velocity [degrees/s]. contacts: points where bodies touch or nearly do;
@@ -299,7 +303,7 @@ class RigidBodies:
         return [max(errors), *(values[name](number) for number, name in self._joint_columns())]
 
     def row(self) -> dict[str, float | int]:
-        """Return the entries of the columns."""
+        """Return the values of the log columns."""
         values: list[float] = []
         for body in self.bodies:
             spin = np.degrees(body.angular_velocity)
@@ -312,7 +316,10 @@ class RigidBodies:
         return dict(zip(self.columns(), [*numbers, self.contacts, float(self.contact_residual), *gone, *self._joint_row()], strict=True))
 
     def surfaces(self) -> BodySurface:
-        """Return the surfaces of all bodies as they are, for a frame; fields: `body`, counted from 0, and `velocity` [m/s]."""
+        """Return the surfaces of all bodies for a frame.
+
+        Fields: `body`, counted from 0, and `velocity` [m/s].
+        """
         if self._surfaces is None:
             self._surfaces = [body_surface(geometry, self.dimension) for geometry in self._geometries]
         placed, gone = [], self.gone()
@@ -333,5 +340,5 @@ class RigidBodies:
 
 
 def body_speed(body: RigidBody, shape: ContactShape) -> float:
-    """Return the most that a point of a body may move at now [m/s]."""
+    """Return the largest current speed of a point of a body [m/s]."""
     return float(np.linalg.norm(body.velocity) + np.linalg.norm(body.angular_velocity) * shape.reach(body.properties.center))

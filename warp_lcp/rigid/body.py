@@ -1,4 +1,4 @@
-"""A rigid body: its state, its motion, and the poses that solids take from it."""
+"""Rigid body: state, time integration, and motion of its solid."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ MOST_ROUNDS = 60  # of the fixed point; a step turns a body by far less than a r
 
 
 class RigidBody:
-    """A body that forces move. Velocities follow from the momenta, which nothing but impulses changes.
+    """Rigid body moved by forces.
+
+    Velocities follow from the momenta, which only impulses change.
 
     Args:
         properties: mass, center and inertia as the scene places the body.
@@ -34,7 +36,7 @@ class RigidBody:
         angular_momentum: about the center of mass, in the world's axes [kg m^2/s], shape (3,).
         angle: by how much it has turned about z [rad], as many turns as they are; of meaning in 2-D.
         time: of the state [s].
-        hold: what contacts leave of an impulse, shape (k, k); None: all of it. See `RigidBodies.begin_step`.
+        hold: matrix from an impulse to the part left by contacts, shape (k, k); None: identity. See `RigidBodies.begin_step`.
         given: impulses since `hold` was set, as they were given, shape (6,): force and torque.
 
     Raises:
@@ -73,20 +75,29 @@ class RigidBody:
 
     @property
     def inertia(self) -> np.ndarray:
-        """Inertia about the center of mass as the body is turned [kg m^2], shape (3, 3)."""
+        """Inertia tensor about the center of mass, current orientation [kg m^2].
+
+        Shape (3, 3).
+        """
         return cast(np.ndarray, self.rotation @ self.properties.inertia @ self.rotation.T)
 
     @property
     def kinetic_energy(self) -> float:
-        """Energy of motion and spin [J]."""
+        """Kinetic energy of translation and rotation [J]."""
         return 0.5 * float(self.momentum @ self.velocity + self.angular_momentum @ self.angular_velocity)
 
     def potential_energy(self, gravity: np.ndarray) -> float:
-        """Return the energy of height [J], 0 at the origin; gravity [m/s^2], shape (3,)."""
+        """Return the potential energy [J], 0 at the origin.
+
+        Gravity [m/s^2] has shape (3,).
+        """
         return -self.properties.mass * float(self.position @ gravity)
 
     def free_inverse_mass(self, dimension: int) -> np.ndarray:
-        """Return block diag(1/m, I^-1), shape (k, k): k = 3 in 2-D (vx, vy, wz), 6 in 3-D (vx, vy, vz, wx, wy, wz)."""
+        """Return block diag(1/m, I^-1), shape (k, k).
+
+        k = 3 in 2-D (vx, vy, wz), 6 in 3-D (vx, vy, vz, wx, wy, wz).
+        """
         result, R = np.zeros((6, 6)), self.rotation
         result[AXES, AXES] = 1.0 / self.properties.mass
         turned = R @ self.properties.inverse_inertia @ R.T
@@ -94,7 +105,9 @@ class RigidBody:
         return result if dimension == 3 else result[PLANAR][:, PLANAR]
 
     def inverse_mass(self, dimension: int) -> np.ndarray:
-        """Return how velocities answer to impulses, shape (k, k), symmetric positive semi-definite.
+        """Return the velocity per impulse, shape (k, k), positive semi-definite.
+
+        Symmetric.
 
         That is block diag(1/m, I^-1), less what contacts with walls take while they hold the body (between `RigidBodies.begin_step` and
         `end_step`): 0 along directions in which it cannot move.
@@ -111,36 +124,42 @@ class RigidBody:
         return both if dimension == 3 else both[PLANAR]
 
     def accelerate(self, gravity: np.ndarray, dt: float) -> None:
-        """Let gravity [m/s^2], shape (3,), act for dt [s]."""
+        """Apply gravity [m/s^2], shape (3,), for dt [s]."""
         self.momentum = self.momentum + self.properties.mass * dt * np.asarray(gravity, dtype=np.float64)
 
     def apply_impulse(self, impulse: np.ndarray) -> None:
-        """Add an impulse on the center of mass and one of torque [N s, N m s], shape (k,), less what contacts with walls take."""
+        """Apply an impulse and an angular impulse, less the part that walls take.
+
+        Shape (k,) [N s, N m s].
+        """
         impulse = np.asarray(impulse, dtype=np.float64)
         self.given = self.given + in_space(impulse)
         self.push(impulse if self.hold is None else self.hold @ impulse)
 
     def push(self, impulse: np.ndarray) -> None:
-        """Add an impulse and one of torque [N s, N m s], shape (k,), whatever holds the body."""
+        """Apply an impulse and an angular impulse without regard to contacts.
+
+        Shape (k,) [N s, N m s].
+        """
         six = in_space(impulse)
         self.momentum = self.momentum + six[:3]
         self.angular_momentum = self.angular_momentum + six[3:]
 
     def advance(self, dt: float) -> None:
-        """Move along the velocities for dt [s]; momenta stay what they are."""
+        """Move along the velocities for dt [s]; momenta are constant."""
         self.position, self.rotation = self.after(dt)
         self.angle += dt * float(self.angular_velocity[2])
         self.time += dt
 
     def shift(self, way: np.ndarray) -> None:
-        """Move by a small way (m, rad), shape (k,), without a velocity."""
+        """Move by a small displacement (m, rad), shape (k,), without velocity."""
         six = in_space(way)
         self.position = self.position + six[:3]
         self.rotation = rotation_by(six[3:]) @ self.rotation
         self.angle += float(six[5])
 
     def after(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [m] and rotation that the present momenta lead to in dt [s].
+        """Return position [m] and rotation after dt [s] at the present momenta.
 
         The turn is about the angular velocity in the middle of the step, whose inertia is that of half the turn (the implicit midpoint
         rule on rotations): angular momentum is kept exactly, and the energy of a free rotation does not drift, as the rule is its own
@@ -156,28 +175,28 @@ class RigidBody:
         return self.position + dt * self.velocity, u @ vt
 
     def state(self) -> np.ndarray:
-        """Return everything that changes, shape (20,)."""
+        """Return the complete state, shape (20,)."""
         return np.concatenate(
             [self.position, self.rotation.ravel(), self.momentum, self.angular_momentum, [self.angle, self.time]]
         )  # fmt: skip
 
     def restore(self, state: np.ndarray) -> None:
-        """Continue from what `state` returned, held by nothing."""
+        """Restore `state`; no contact holds the body."""
         self.position, self.rotation = state[:3].copy(), state[3:12].reshape(3, 3).copy()
         self.momentum, self.angular_momentum = state[12:15].copy(), state[15:18].copy()
         self.angle, self.time = float(state[18]), float(state[19])
         self.release()
 
     def momenta(self) -> tuple[np.ndarray, ...]:
-        """Return what impulses change, for `restore_momenta`."""
+        """Return the momenta, for `restore_momenta`."""
         return self.momentum, self.angular_momentum, self.given
 
     def restore_momenta(self, kept: tuple[np.ndarray, ...]) -> None:
-        """Undo all impulses since `momenta` returned this."""
+        """Restore the momenta: undo all impulses since `momenta`."""
         self.momentum, self.angular_momentum, self.given = kept
 
     def release(self) -> None:
-        """Forget what holds the body and what it was given."""
+        """Reset contacts that hold the body and the impulses received."""
         self.hold, self.given = None, np.zeros(6)
 
     def _spin(self, rotation: np.ndarray) -> np.ndarray:
@@ -186,7 +205,7 @@ class RigidBody:
 
 
 class BodyMotion:
-    """The motion of a body as solids follow it; implements `warp_lcp.grid.motion.Motion`.
+    """Motion of a body's solid; implements `warp_lcp.grid.motion.Motion`.
 
     Args:
         body: which.
@@ -196,14 +215,20 @@ class BodyMotion:
         self.body = body
 
     def pose(self, time: float) -> Pose:
-        """Return the pose at a time [s]: the body's at the time of its state, later the one that its velocities lead to by then."""
+        """Return the pose at a time [s].
+
+        At the time of the body's state its pose, later the one after the present velocities.
+        """
         body = self.body
         position, rotation = (body.position, body.rotation) if time == body.time else body.after(time - body.time)
         center = body.properties.center
         return Pose.about(center, rotation, position - center)
 
     def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s]: the body's point x moves at turn x + shift now."""
+        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s].
+
+        The body's point x moves at turn x + shift now.
+        """
         turn = _cross(*self.body.angular_velocity)
         return turn, self.body.velocity - turn @ self.body.position
 
@@ -213,7 +238,7 @@ PLANAR = [0, 1, 5]  # vx, vy, wz among the six
 
 
 def in_space(values: np.ndarray) -> np.ndarray:
-    """Return a velocity, impulse or way of three (2-D) or six entries as one of six."""
+    """Return a vector of three (2-D) or six entries as one of six."""
     if len(values) == 6:
         return np.asarray(values, dtype=np.float64)
     six = np.zeros(6)
@@ -222,7 +247,10 @@ def in_space(values: np.ndarray) -> np.ndarray:
 
 
 def rotation_by(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix of a turn by |vector| [rad] about it: SciPy's `Rotation.from_rotvec`, whose last bits runs would show."""
+    """Return the matrix of a rotation by |vector| [rad] about a vector.
+
+    Not SciPy's `Rotation.from_rotvec`: the results of runs depend on the last bits.
+    """
     x, y, z = vector.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     K = _cross(x, y, z)

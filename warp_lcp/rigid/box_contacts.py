@@ -1,4 +1,7 @@
-"""Where two boxes touch: the axis of least overlap, and the points of the face or the pair of edges it belongs to."""
+"""Contact points of two boxes by the axis of least overlap.
+
+Points of a face or of a pair of edges.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ PARALLEL = 1e-6  # squared sine of two edges below which their cross product is 
 
 @dataclass(frozen=True, eq=False)
 class OrientedBox:
-    """A box in the world: center [m], rotation (its columns are the axes), half sides [m]."""
+    """Oriented box: center [m], rotation (columns are the axes), half sides [m]."""
 
     center: np.ndarray
     rotation: np.ndarray
@@ -24,12 +27,14 @@ class OrientedBox:
         return self.center + (signs * self.half) @ self.rotation.T
 
     def reach(self, axes: np.ndarray) -> np.ndarray:
-        """Return how far it reaches from its center along unit vectors [m], shape (m,)."""
+        """Return the support distance along unit vectors [m], shape (m,)."""
         return np.abs(axes @ self.rotation) @ self.half
 
 
 def box_box(a: OrientedBox, b: OrientedBox, margin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return points [m], shape (k, 3), the unit normal from b to a, and gaps [m], shape (k,), negative where they overlap.
+    """Return contact points, unit normal and gaps of two boxes.
+
+    Points [m], shape (k, 3); normal from b to a; gaps [m], shape (k,), negative where they overlap.
 
     Of 15 axes (3 face normals of each, 9 cross products of edges) the one along which the boxes are farthest apart, or overlap least, is
     the normal. For a face, the face of the other box that looks at it is clipped against its sides (Sutherland and Hodgman), and points

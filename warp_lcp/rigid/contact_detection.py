@@ -1,4 +1,4 @@
-"""Which bodies touch each other and what surrounds them, and where: points, normals and gaps, a few for each pair."""
+"""Contact detection: a few points, normals and gaps for each pair of bodies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LEVEL = 1e-4  # of the smaller shape's size: gaps that differ by less are of one
 
 @dataclass(frozen=True, eq=False)
 class ContactPoints:
-    """Points where one thing touches another.
+    """Contact points of a pair.
 
     Args:
         point: halfway between the surfaces [m], shape (k, 3).
@@ -43,11 +43,11 @@ class ContactPoints:
         return len(self.gap)
 
     def turned(self) -> ContactPoints:
-        """Return the same points as the other sees them."""
+        """Return the same points with first and second exchanged."""
         return ContactPoints(self.point, -self.normal, self.gap)
 
     def where(self, chosen: np.ndarray) -> ContactPoints:
-        """Return the points that are chosen, by a mask or their places."""
+        """Return selected points, by a mask or indices."""
         return ContactPoints(self.point[chosen], self.normal[chosen], self.gap[chosen])
 
     @classmethod
@@ -58,18 +58,21 @@ class ContactPoints:
 
 
 class Place(NamedTuple):
-    """Where a body is: p becomes rotation @ p + translation; a `Pose` that nobody gave, so that nobody checks it."""
+    """Pose of a body: p becomes rotation @ p + translation.
+
+    A `Pose` without checks.
+    """
 
     rotation: np.ndarray
     translation: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Return points [m], shape (n, 3), after the change of place."""
+        """Return transformed points [m], shape (n, 3)."""
         return np.asarray(points @ self.rotation.T + self.translation)
 
 
 def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal: np.ndarray, margin: float) -> ContactPoints:
-    """Return where a shape touches a plane.
+    """Return the contact points of a shape with a plane.
 
     Args:
         shape: of the body, as placed.
@@ -86,7 +89,7 @@ def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal:
 
 
 def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> ContactPoints:
-    """Return where two shapes touch, normals from the other to the one.
+    """Return the contact points of two shapes; normals point to the first.
 
     Boxes by the axis along which they overlap least; others by points of either surface, and in space those of either's edges that are
     nearest to the other, and the distance to the other one.
@@ -161,7 +164,7 @@ def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> Con
 
 
 def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
-    """Return the deepest of a pair's points and others that are low and far from each other, as many as hold a body.
+    """Return the deepest point and others far from it, enough to support a body.
 
     Where all have about one normal that is two points in 2-D and four in 3-D, and up to two more if some of these are higher than others.
 
@@ -190,7 +193,9 @@ def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
 
 
 def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs of boxes along the axes that overlap, i > j in their order: those beside each other along the longest way first.
+    """Return the pairs i > j of overlapping axis-aligned boxes, in order.
+
+    Sorted by their neighborhood along the longest axis.
 
     Args:
         middle: of the boxes [m], shape (n, 3).
@@ -212,13 +217,13 @@ def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.nd
 
 @dataclass(frozen=True, eq=False)
 class ContactPair:
-    """Contacts of two.
+    """Contacts of a pair.
 
     Args:
         first: body that normals point into.
         second: body that they come from; the number of bodies where that is none.
         points: one at least.
-        obstacle: what they come from if it is no body.
+        obstacle: the second of the pair if it is not a body.
     """
 
     first: int
@@ -228,17 +233,17 @@ class ContactPair:
 
     @property
     def motion(self) -> Motion | None:
-        """How the obstacle moves, if there is one and it does."""
+        """Motion of the obstacle, or None."""
         return None if self.obstacle is None else self.obstacle.motion
 
 
 class ContactDetection:
-    """Finds contacts of bodies with each other and with their surroundings.
+    """Detection of contacts of bodies with each other and with obstacles.
 
     Args:
         bodies: all.
         shapes: of the bodies as placed.
-        obstacles: what else there is.
+        obstacles: walls and solids.
         dimension: 2 or 3.
         every: keep every point of a pair, not a few that hold a body.
     """
@@ -259,7 +264,7 @@ class ContactDetection:
         self._ball = np.array([shape.closed and len(shape.points) == 1 and not shape.boxes for shape in shapes])
 
     def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> list[ContactPair]:
-        """Return where bodies touch.
+        """Return the contacts of the bodies.
 
         Args:
             time: of the state [s].

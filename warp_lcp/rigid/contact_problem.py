@@ -1,9 +1,11 @@
-"""The complementarity problem of contacts: Coulomb friction in boxes, so that bounds are affine, on bodies that touch.
+"""Complementarity problem of contacts with boxed Coulomb friction.
+
+The bounds are affine in the normal impulses.
 
 It is solved by `warp_lcp.solvers.nncg` on B = J J' + diag(e), whose rows live at bodies: a sweep costs the entries of J, not those of B,
 and an island of bodies is solved by one thread in one launch. Contacts of a pile are so few that launches would take all of the time:
 0.2 ms an iteration where the arithmetic takes 0.002 ms. Sweeps need about as many iterations as the ratio of masses that touch, times the
-square of a stack's height; what they leave unsolved `contact_newton` solves by sparse systems.
+square of a stack's height; the rest is solved by sparse systems in `contact_newton`.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ NNCG = RowPass(
 
 
 class ContactImpulses(NamedTuple):
-    """What a solve of a `ContactProblem` has found.
+    """Result of a contact solve.
 
     Attributes:
         impulses: [N s], shape (k, rows); where there are joints, these flat and then those of joints [N s, N m s], shape (k rows + m,).
@@ -54,11 +56,11 @@ class ContactImpulses(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointPart:
-    """The joints' rows of a problem: y = B x + b, lower <= x <= upper of the rows.
+    """Joint rows of a contact problem: y = B x + b, lower <= x <= upper.
 
     Args:
         rows: as those of contacts, times a factor of the inverse masses.
-        b: velocities without impulses, with what removes errors [m/s, rad/s], shape (m,).
+        b: velocities without impulses, plus position correction [m/s, rad/s], shape (m,).
     """
 
     rows: JointRows
@@ -67,7 +69,9 @@ class JointPart:
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """y = B x + b with x_n >= 0 and |x_t| <= mu x_n at k contacts; a contact's rows are its normal and its tangents.
+    """Contact problem y = B x + b with x_n >= 0 and |x_t| <= mu x_n.
+
+    The rows of each of the k contacts are its normal and its tangents.
 
     B = J J' + YIELDS diag(J J') along tangents, J = what velocities of bodies make at contacts, times a factor of the inverse masses.
 
@@ -92,14 +96,14 @@ class ContactProblem:
     joints: JointPart | None = None
 
     def yields(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the diagonal of B and what it has besides that of J J', shape (k rows,) each."""
+        """Return the diagonal of B and its part besides J J', shape (k rows,) each."""
         own = np.square(self.one).sum(axis=2) + np.square(self.other).sum(axis=2)
         more = YIELDS * own
         more[:, 0] = 0.0
         return (own + more).ravel(), more.ravel()
 
     def islands(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the contacts sorted by groups of bodies that touch each other, and where each group begins."""
+        """Return the contacts sorted by islands of touching bodies, and island starts."""
         pairs = self.second < self.bodies
         links = coo_array((np.ones(int(pairs.sum())), (self.first[pairs], self.second[pairs])), shape=(self.bodies, self.bodies))
         group = connected_components(links, directed=False)[1][self.first] if pairs.any() else self.first
@@ -108,7 +112,7 @@ class ContactProblem:
         return order, np.append(starts, len(order))
 
     def part(self, contacts: np.ndarray) -> ContactProblem:
-        """Return the problem of some contacts, with their bodies alone."""
+        """Return the problem of some contacts, with only their bodies."""
         first, second = self.first[contacts], self.second[contacts]
         bodies = np.unique(np.concatenate([first, second[second < self.bodies]]))
         number = np.full(self.bodies + 1, len(bodies))
@@ -117,7 +121,7 @@ class ContactProblem:
         return ContactProblem(number[first], number[second], *fields, len(bodies))
 
     def solve(self, stopping: StoppingCriteria, start: np.ndarray | None = None, unsolved: float = np.inf) -> ContactImpulses:
-        """Return impulses, their residual and the iterations that they took.
+        """Return impulses, residual and number of iterations.
 
         An island that does not reach the tolerance is taken at its least residual, which says so.
 
@@ -130,7 +134,7 @@ class ContactProblem:
             ValueError: there are joints.
         """
         if self.joints is not None:
-            raise ValueError("joints: sweeps of NNCG and Newton's methods take contacts alone; give RigidBodies another solver")
+            raise ValueError("joints: the default solver (NNCG sweeps and Newton) handles only contacts; give RigidBodies another solver")
         k, rows, q = self.one.shape
         order, starts = self.islands()
         diagonal, yields = (values.reshape(k, rows)[order] for values in self.yields())

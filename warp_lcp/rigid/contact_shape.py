@@ -1,4 +1,4 @@
-"""Shapes as contacts see them: points of the surface of one, and the signed distance and its direction of the other."""
+"""Shapes for contacts: surface points, signed distance and its gradient."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ THICK = 1.0  # half the thickness of a 2-D box in the plane's contacts, of its s
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContactShape:
-    """A shape where its scene places it.
+    """Shape for contacts, as placed by the scene.
 
     Args:
         points: the surface is `radius` away from them: shape (n, 3) [m].
         radius: [m].
         distance: signed distance and its gradient.
-        boxes: what the shape consists of if that is boxes; in 2-D a thick one.
+        boxes: boxes of the shape if it consists of boxes; in 2-D a thick one.
         size: about half its extent [m].
         closed: whether the inside has an end; contacts with others than such need points of theirs.
         signed: the signed distance alone, where that takes less time.
@@ -61,7 +61,9 @@ class ContactShape:
 
     @classmethod
     def of(cls, geometry: Geometry, dimension: int) -> ContactShape:
-        """Return the shape of a box, sphere, capsule or mesh; inverted ones have no points.
+        """Return a box, sphere, capsule or mesh as a contact shape.
+
+        Inverted shapes have no points.
 
         Raises:
             ValueError: it is none of these.
@@ -75,7 +77,7 @@ class ContactShape:
         elif isinstance(geometry, TriangleMesh):
             shape = _polygon(geometry) if dimension == 2 else _surface(geometry)
         else:
-            raise ValueError(f"{type(geometry).__name__.lower()}: bodies touch boxes, spheres, capsules, meshes and planes")
+            raise ValueError(f"{type(geometry).__name__.lower()}: contacts are available for boxes, spheres, capsules, meshes and planes")
         if not getattr(geometry, "invert", False):
             return shape
 
@@ -87,7 +89,10 @@ class ContactShape:
 
     @classmethod
     def united(cls, boxes: Sequence[Box]) -> ContactShape:
-        """Return boxes in space as one shape. Its points are their corners alone: what is flat touches a plane nowhere else first."""
+        """Return boxes in space as one shape.
+
+        Its points are only their corners: a flat face first touches a plane at a corner.
+        """
         parts = [_box(box, 3) for box in boxes]
 
         def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +105,9 @@ class ContactShape:
         return cls(points=corners, radius=0.0, distance=nearest, size=max(part.size for part in parts), boxes=made)
 
     def nearest_on(self, edges: np.ndarray, margin: float) -> np.ndarray:
-        """Return the point of each edge that is nearest to this shape, or deepest in it, if that may be within a margin, shape (n, 3).
+        """Return the point of each edge nearest to this shape, shape (n, 3).
+
+        Or deepest in it; only those that may be within a margin.
 
         The distance to a convex shape has one minimum along a segment; near others it is the one beside the nearest of nine points.
 
@@ -121,7 +128,7 @@ class ContactShape:
         return np.asarray(start + (0.5 * (low + high))[:, None] * way)
 
     def reach(self, center: np.ndarray) -> float:
-        """Return the largest distance of a point of the shape from a center [m]."""
+        """Return the largest distance of a surface point from a center [m]."""
         return float(np.linalg.norm(self.points - center, axis=1).max(initial=0.0)) + self.radius
 
 

@@ -1,4 +1,4 @@
-"""Impulses of contacts at the level of velocities: what bodies touch, and how far contacts let them go."""
+"""Velocity-level contact impulses: which bodies touch, and their response."""
 
 from __future__ import annotations
 
@@ -39,12 +39,15 @@ ImpulseSolver = Callable[[ContactProblem, np.ndarray], ContactImpulses]  # of a 
 
 
 def sweeps_and_newton(problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
-    """Solve by nonlinear conjugate gradients on sweeps, and by Newton's methods where sweeps are not enough."""
+    """Solve by nonlinear conjugate gradients on sweeps, then by Newton's methods.
+
+    Newton's methods run only where sweeps do not reach the tolerance.
+    """
     return problem.solve(EXACT, start, UNSOLVED)
 
 
 class ContactSolve:
-    """Find contacts and solve for their impulses.
+    """Contact detection and solve for impulses.
 
     Args:
         detection: of the bodies.
@@ -90,7 +93,7 @@ class ContactSolve:
             raise ValueError(f"{name} overlaps {self.bodies[found.second].name} by {deep:.3g} m at the start: bodies must lie apart")
 
     def find(self, time: float, dt: float, gravity: np.ndarray, gone: np.ndarray | None = None) -> Contacts:
-        """Return where bodies touch now or may in the step.
+        """Return current contacts and those possible within the step.
 
         Args:
             time: of the state [s].
@@ -111,11 +114,11 @@ class ContactSolve:
         return self.assembled(found, time, dt, gravity)
 
     def approach(self, contacts: Contacts) -> np.ndarray:
-        """Return normal velocities at contacts [m/s], negative where they close, shape (k,)."""
+        """Return normal velocities at contacts [m/s], shape (k,); negative: approaching."""
         return contacts.velocities(self._velocities())[:, 0] if len(contacts) else np.zeros(0)
 
     def bounce(self, contacts: Contacts, approach: np.ndarray, dt: float, kick_dt: float, gravity: np.ndarray) -> np.ndarray:
-        """Give impacts the velocity with which they bounce, and the time within the step at which they do (updates the contacts).
+        """Set the rebound velocity and time of impacts (updates the contacts).
 
         The bodies' velocities are those after gravity has acted on them for `kick_dt`, which are of the middle of the step. A gap closes by
         v t + a t^2 / 2 with v at the step's beginning; where it is 0, at t = `when`, the speed v_i = v + a t becomes -e v_i. At the end
@@ -195,7 +198,10 @@ class ContactSolve:
         contacts.other[k] = -_rows(arms[1:], frames, self.dimension)[0]
 
     def detour(self, contacts: Contacts, before: np.ndarray, impulses: np.ndarray) -> np.ndarray | None:
-        """Return how far bodies are from where their velocities after impacts bring them in the step (m, rad), shape (n, q); None: nowhere.
+        """Return displacement errors of bodies due to impacts within the step.
+
+        The difference to where velocities after impacts would move them (m, rad), shape (n, q);
+        None: zero.
 
         An impact at time t of the step has changed velocities by M^-1 J' r, and bodies have gone without it until then. With the target of
         `bounce` that is exact for what flies along parabolas before and after.
@@ -210,7 +216,9 @@ class ContactSolve:
         return -self._answer(contacts.on_bodies(contacts.when[:, None] * (impulses - before), len(self.bodies)))
 
     def push_apart(self, contacts: Contacts, start: np.ndarray | None = None, *, dt: float = 0.0, kick_dt: float = 0.0) -> np.ndarray:
-        """Solve for the impulses of contacts and joints and give them to the bodies; return those of contacts [N s], shape (k, dimension).
+        """Solve for contact and joint impulses and apply them to the bodies.
+
+        Returns those of contacts [N s], shape (k, dimension).
 
         Args:
             contacts: the contacts.
@@ -264,7 +272,10 @@ class ContactSolve:
         return impulses, pushes
 
     def motor_torques(self) -> dict[int, float]:
-        """Return the torque of each motor in the last step [N m], by the number of its joint; 0 before the first step."""
+        """Return the torque of each motor in the last step [N m], by joint number.
+
+        0 before the first step.
+        """
         found, rows = dict.fromkeys(range(len(self.joints)), 0.0), self.joint_rows
         if rows is not None:
             owners = np.repeat(np.arange(len(self.joints)), [joint.row_count(self.dimension) for joint in self.joints])
@@ -282,7 +293,9 @@ class ContactSolve:
         return moved
 
     def separation(self, contacts: Contacts, dt: float, detour: np.ndarray | None = None) -> np.ndarray | None:
-        """Return the smallest ways (m, rad) of the bodies, in the metric of their masses, that reduce overlaps at the end of a step.
+        """Return the smallest displacements that reduce overlaps at the end of a step.
+
+        (m, rad), in the metric of the bodies' masses.
 
         They give no velocity, so no energy of motion; a frictionless problem like that of the impulses. Shape (n, q); None: no ways.
 
@@ -316,7 +329,9 @@ class ContactSolve:
         return self._answer(apart + (rows.jacobian(n).T @ x[gaps.size :]).reshape(n, -1))
 
     def hold(self, contacts: Contacts, impulses: np.ndarray) -> None:
-        """Let contacts that bear against walls and other solids take what impulses would move into them, for each body by itself.
+        """Let contacts with walls and solids absorb impulses into them.
+
+        For each body by itself.
 
         A body that is held holds what bears against it where it cannot move itself: a stack on the floor is held up to its top.
         """
@@ -355,7 +370,10 @@ class ContactSolve:
         return [pair for pair in found if (pair.second, pair.first) not in self._joined]
 
     def assembled(self, found: Sequence[ContactPair], time: float, dt: float, gravity: np.ndarray | None) -> Contacts:
-        """Return the contacts with their rows; tangents are along the slip, or along gravity, if that is given."""
+        """Return the contacts with their rows.
+
+        Tangents are along the slip, or along gravity if that is given.
+        """
         falls, n, dim = 0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
         counts = np.array([len(entry.points) for entry in found], dtype=int)
         first, second = (np.repeat(np.array([getattr(entry, name) for entry in found], dtype=int), counts) for name in ("first", "second"))

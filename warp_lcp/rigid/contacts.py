@@ -1,4 +1,4 @@
-"""The contacts of a step, and what is remembered of them for the next one."""
+"""Contacts of a step, and the impulses remembered for the next one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ KEPT = 32  # contacts remembered for each body, at most
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """The contacts of a step, k of them; a contact's rows are its normal and `dimension` - 1 tangents. q: velocities of a body.
+    """The k contacts of a step; rows: normal and `dimension` - 1 tangents.
+
+    A body has q velocities.
 
     Args:
         first: body that the normal points into, shape (k,).
@@ -28,8 +30,8 @@ class Contacts:
         friction: Coulomb's coefficient, shape (k,).
         one: relative velocities of the first body's velocities, shape (k, dimension, q).
         other: of the second's, 0 where that is none.
-        wall: what surroundings that move add to them [m/s], shape (k, dimension).
-        target: normal velocity that is the least [m/s]: what closes the gap, or bounces, shape (k,).
+        wall: velocity of moving obstacles [m/s], shape (k, dimension).
+        target: smallest allowed normal velocity [m/s], which closes the gap or rebounds, shape (k,).
         restitution: the part of the speed of an impact that comes back, shape (k,).
         when: time from the step's beginning to the impact that bounces, there or elsewhere among bodies that touch [s], shape (k,);
             0: none does.
@@ -54,17 +56,23 @@ class Contacts:
         return len(self.gap)
 
     def jacobian(self, bodies: int) -> csr_array:
-        """Return J: what velocities of all bodies make at contacts, shape (k dimension, bodies q)."""
+        """Return the contact Jacobian J, shape (k dimension, bodies q)."""
         return jacobian(self.first, self.second, self.one, self.other, bodies)
 
     def velocities(self, of_bodies: np.ndarray) -> np.ndarray:
-        """Return relative velocities at contacts [m/s], shape (k, dimension), from those of the bodies, shape (n, q)."""
+        """Return relative velocities at contacts [m/s], shape (k, dimension).
+
+        From those of the bodies, shape (n, q).
+        """
         V = np.vstack([of_bodies, np.zeros(of_bodies.shape[1])])
         both = (self.one @ V[self.first][:, :, None] + self.other @ V[self.second][:, :, None])[:, :, 0]
         return np.asarray(both + self.wall)
 
     def on_bodies(self, impulses: np.ndarray, count: int) -> np.ndarray:
-        """Return what impulses of contacts, shape (k, rows) with rows <= dimension, add up to at each body, shape (count, q)."""
+        """Return the impulse on each body, shape (count, q).
+
+        From impulses of contacts, shape (k, rows) with rows <= dimension.
+        """
         rows = impulses.shape[1]
         total = np.zeros((count + 1, self.one.shape[2]))
         np.add.at(total, self.first, (impulses[:, None] @ self.one[:, :rows])[:, 0])
@@ -73,7 +81,7 @@ class Contacts:
 
 
 class ContactMemory:
-    """Impulses of the last step's contacts, from which those of the next one start.
+    """Impulses of the last step's contacts, to start the next solve from.
 
     Attributes:
         values: first and second body, place in the first body's own axes [m], impulse in the world's [N s]; shape (k, 8).
@@ -83,21 +91,24 @@ class ContactMemory:
         self.values, self._most = np.zeros((0, 8)), KEPT * bodies
 
     def state(self) -> np.ndarray:
-        """Return the values with rows of -1 for those that there are not: of one shape, whatever bodies touch."""
+        """Return the values, padded with rows of -1 to a fixed shape."""
         return np.concatenate([self.values, np.full((self._most - len(self.values), 8), -1.0)])
 
     def restore(self, state: np.ndarray) -> None:
-        """Continue from `state`; an empty one is no memory."""
+        """Restore `state`; empty: no memory."""
         values = np.array(state, dtype=np.float64).reshape(-1, 8)
         self.values = values[values[:, 0] >= 0.0]
 
     def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: Sequence[RigidBody]) -> None:
-        """Remember impulses, shape (k, dimension)."""
+        """Store impulses, shape (k, dimension)."""
         world = (impulses[:, None] @ contacts.frames)[:, 0]
         self.values = np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])[: self._most]
 
     def recall(self, contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:
-        """Return impulses to start from, shape (k, dimension): those of the nearest contact of the same two, once each."""
+        """Return impulses to start from, shape (k, dimension).
+
+        Those of the nearest contact of the same pair, each used once.
+        """
         start, old = np.zeros(contacts.wall.shape), self.values
         if not len(old) or not len(contacts):
             return start
@@ -128,7 +139,7 @@ def _places(contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:
 
 
 def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.ndarray, bodies: int) -> csr_array:
-    """Return J: what velocities of bodies make along the rows of pairs, shape (k rows, q bodies).
+    """Return the Jacobian J of pairs, shape (k rows, q bodies).
 
     Args:
         first: of each pair, shape (k,).
@@ -143,7 +154,9 @@ def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.n
 
 
 def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.ndarray, float]] = ()) -> np.ndarray:
-    """Return normal and tangents of contacts, shape (k, dimension, 3), right-handed in space.
+    """Return normal and tangents of contacts, shape (k, dimension, 3).
+
+    Right-handed in space.
 
     There the first tangent is along the last of some ways that is longer than its least: boxes of friction then are as wide as the cone
     where it counts.

@@ -1,4 +1,4 @@
-"""Joints between bodies as rows of a velocity problem: equations, limits of the angle, motors of limited torque."""
+"""Joints as rows of a velocity problem: equations, angle limits, motors."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ MOST_ANGLE = np.pi  # [rad]: angles are known up to a whole turn
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """What holds two bodies together at a point.
+    """Joint of two bodies at a point.
 
-    A ball lets them turn about it, a hinge about an axis, and fixed they do not turn. A hinge's angle is that of `first` relative to
-    `second`, 0 as the scene places them. In the plane the axis is z, and a hinge is what a ball would be.
+    A ball joint allows rotation about the point, a hinge about an axis, a fixed joint none. A hinge's angle is that of `first` relative to
+    `second`, 0 in the initial pose. In the plane the axis is z, and a hinge takes the place of a ball joint.
 
     Args:
         first: a body.
@@ -31,13 +31,13 @@ class Joint:
         anchor: the point as the scene places it [m], shape (3,).
         axis: of a hinge, of any length, shape (3,).
         limits: of a hinge, least and largest angle [rad]; infinite for none, else within half a turn.
-        motor_speed: of a hinge, angular velocity that its motor wants [rad/s].
-        motor_torque: the most that it can do [N m]; 0 for no motor.
+        motor_speed: target angular velocity of a hinge's motor [rad/s].
+        motor_torque: largest torque of the motor [N m]; 0: no motor.
         kind: "ball", "hinge" or "fixed".
 
     Raises:
         ValueError: the bodies are the same, limits are crossed or too wide, the torque is negative or infinite, there is no axis, or a
-            joint that is no hinge has limits or a motor.
+            joint other than a hinge has limits or a motor.
     """
 
     first: int
@@ -61,7 +61,7 @@ class Joint:
         if not 0.0 <= self.motor_torque < np.inf:
             raise ValueError(f"motor_torque = {self.motor_torque}: must be >= 0 and finite, in N m")
         if self.kind != "hinge" and (self.motor_torque > 0.0 or np.isfinite(self.limits).any()):
-            raise ValueError(f"kind = {self.kind!r}: limits and motors are those of hinges")
+            raise ValueError(f"kind = {self.kind!r}: only hinges have limits and motors")
         length = float(np.linalg.norm(self.axis))
         if not 0.0 < length < np.inf:
             raise ValueError(f"axis = {self.axis}: must be finite and not zero")
@@ -69,16 +69,16 @@ class Joint:
 
     @property
     def pair(self) -> tuple[int, int]:
-        """The bodies, the smaller index first."""
+        """Pair of bodies, the smaller index first."""
         return min(self.first, self.second), max(self.first, self.second)
 
     def row_count(self, dimension: int) -> int:
-        """Return how many rows it has."""
+        """Return the number of rows."""
         turns = {"ball": 0, "hinge": 2, "fixed": 3} if dimension == 3 else {"ball": 0, "hinge": 0, "fixed": 1}
         return dimension + turns[self.kind] + int(np.isfinite(self.limits).sum()) + int(self.motor_torque > 0.0)
 
     def side(self, bodies: Sequence[RigidBody], number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return how a body, or WORLD, carries the joint now: the arm of the anchor [m], the anchor [m], and the rotation."""
+        """Return the joint on a body or WORLD: arm [m], anchor [m] and rotation."""
         if number == WORLD:
             return self.anchor, self.anchor, np.eye(3)
         body = bodies[number]
@@ -86,14 +86,17 @@ class Joint:
         return arm, body.position + arm, body.rotation
 
     def angle(self, bodies: Sequence[RigidBody]) -> float:
-        """Return the angle of first relative to second about the axis [rad], in (-pi, pi]."""
+        """Return the angle of the first body relative to the second [rad], (-pi, pi].
+
+        About the axis of the hinge.
+        """
         R, S = (self.side(bodies, number)[2] for number in (self.first, self.second))
         zero = contact_frames(np.asarray(self.axis)[None], 3)[0, 1]  # a direction across the axis that is the same for both at angle 0
         mine, other = R @ zero, S @ zero
         return float(np.arctan2(np.cross(other, mine) @ (R @ self.axis), other @ mine))
 
     def held(self, bodies: Sequence[RigidBody], dimension: int) -> np.ndarray:
-        """Return the directions about which the bodies do not turn relative to each other now, shape (d, 3)."""
+        """Return the axes without relative rotation, shape (d, 3)."""
         if self.kind == "fixed":
             return np.eye(3) if dimension == 3 else np.eye(3)[2:]
         if self.kind == "ball" or dimension == 2:
@@ -102,7 +105,9 @@ class Joint:
         return contact_frames(axis[None], 3)[0, 1:]
 
     def errors(self, bodies: Sequence[RigidBody], held: np.ndarray, dimension: int) -> np.ndarray:
-        """Return how far the joint is from what its rows ask for (m, rad): errors of equations, distances to limits, 0 of a motor.
+        """Return the position errors of the rows (m, rad).
+
+        Errors of equations, distances to limits, 0 for a motor.
 
         Args:
             bodies: all, as they are.
@@ -120,7 +125,7 @@ class Joint:
         return np.concatenate([(anchor - other_anchor)[:dimension], turned, distances, [0.0] if self.motor_torque > 0.0 else []])
 
     def rows(self, bodies: Sequence[RigidBody], dt: float, dimension: int = 3) -> JointRows:
-        """Return the rows for impulses over a time [s].
+        """Return the rows for the impulses over a time [s].
 
         y = J v' + c: the anchors' relative velocity and the angular velocity about `held` directions are equations (y = 0, x free); the
         angle's rate plus its distance to a limit over the step is >= 0 where x > 0; the motor's y is the rate less the wanted one,
@@ -152,7 +157,9 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class JointRows:
-    """Rows of joints in a velocity problem y = J v' + c, m of them. q: velocities of a body.
+    """Rows of joints in a velocity problem y = J v' + c.
+
+    m rows; a body has q velocities.
 
     Args:
         sources: the joints, each with the directions of its `Joint.held`.
@@ -182,24 +189,24 @@ class JointRows:
 
     @classmethod
     def joined(cls, several: Sequence[JointRows]) -> JointRows:
-        """Return the rows of several joints, one at least, as one."""
+        """Return the rows of several joints (at least one) as one."""
         names = ("first", "second", "one", "other", "error", "wanted", "lower", "upper")
         arrays = {name: np.concatenate([getattr(rows, name) for rows in several]) for name in names}
         return cls(sources=tuple(source for rows in several for source in rows.sources), **arrays)
 
     def where(self, chosen: np.ndarray) -> JointRows:
-        """Return some of the rows, by a mask."""
+        """Return selected rows, by a mask."""
         names = ("first", "second", "one", "other", "error", "wanted", "lower", "upper")
         return JointRows(self.sources, *(getattr(self, name)[chosen] for name in names))
 
     @property
     def equations(self) -> np.ndarray:
-        """Which rows are equations, shape (m,)."""
+        """Mask of rows that are equations, shape (m,)."""
         return np.isneginf(self.lower)
 
     @property
     def motors(self) -> np.ndarray:
-        """Which rows are motors, shape (m,)."""
+        """Mask of rows of motors, shape (m,)."""
         return np.isfinite(self.upper)
 
     def jacobian(self, bodies: int) -> csr_array:
@@ -207,7 +214,9 @@ class JointRows:
         return jacobian(self.first, self.second, self.one, self.other, bodies)
 
     def bias(self, dt: float, rate: float = 1.0) -> np.ndarray:
-        """Return c of a step of dt [s], shape (m,): what is to be gone of errors, what is left up to limits, less a motor's speed.
+        """Return c for a step of dt [s], shape (m,).
+
+        Error to remove, distance to limits, less the speed of a motor.
 
         Args:
             dt: time step [s].
@@ -217,12 +226,14 @@ class JointRows:
         return part * self.error / dt - self.wanted
 
     def errors(self, bodies: Sequence[RigidBody], dimension: int) -> np.ndarray:
-        """Return the errors of these rows where bodies are now, shape (m,)."""
+        """Return the current errors of the rows, shape (m,)."""
         return np.concatenate([joint.errors(bodies, held, dimension) for joint, held in self.sources])
 
 
 def joined_pairs(joints: Sequence[Joint], bodies: int) -> frozenset[tuple[int, int]]:
-    """Return the pairs of bodies that do not collide, the smaller number first: those of a joint, and those of one piece.
+    """Return the pairs of bodies that do not collide, the smaller index first.
+
+    Bodies of a joint, and bodies rigidly connected by fixed joints.
 
     A piece is what fixed joints hold together; fixed in space, or joined to a body of a piece, says nothing about the others of it.
 

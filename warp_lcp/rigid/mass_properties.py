@@ -1,4 +1,4 @@
-"""Mass, center of mass and inertia of a scene's shapes of uniform density, in space and in the plane."""
+"""Mass, center of mass and inertia of shapes of uniform density, 2-D and 3-D."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TWICE = 0.01  # of a mesh's surface, from which what lies inside the mesh itself
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MassProperties:
-    """What a body's motion depends on.
+    """Mass, center of mass and inertia of a body.
 
     Args:
         mass: [kg]; 2-D: [kg/m], per meter of depth.
@@ -54,7 +54,7 @@ class MassProperties:
 
 
 def mass_properties(geometry: Geometry, dimension: int, *, mass: float | None = None, density: float | None = None) -> MassProperties:
-    """Return the mass properties of a shape filled evenly, as it is placed.
+    """Return the mass properties of a placed shape of uniform density.
 
     Boxes, spheres and capsules by their closed forms; meshes by the integrals of 1, x and x x' over the tetrahedra between the origin and
     their triangles, in 2-D over the triangles between the origin and the segments of their cut by z = 0, which are exact.
@@ -71,7 +71,7 @@ def mass_properties(geometry: Geometry, dimension: int, *, mass: float | None = 
     if (mass is None) == (density is None):
         raise ValueError("give either mass or density")
     if getattr(geometry, "invert", False) or not isinstance(geometry, (Box, Sphere, Capsule, TriangleMesh)):
-        raise ValueError(f"{type(geometry).__name__.lower()}: a shape without an end has no mass")
+        raise ValueError(f"{type(geometry).__name__.lower()}: an unbounded shape has no mass")
     if isinstance(geometry, TriangleMesh):
         volume, center, inertia = _mesh(geometry, dimension)
     else:
@@ -120,7 +120,7 @@ def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.nda
     """Return volume, center and inertia at density 1 of a mesh as placed, or of its cut by z = 0."""
     if mesh.surface.crossings.doubled > TWICE:
         raise ValueError(
-            f"{mesh.surface.name}: about {mesh.surface.crossings.doubled:.0%} of its surface lies inside itself, which would weigh twice; "
+            f"{mesh.surface.name}: about {mesh.surface.crossings.doubled:.0%} of its surface lies inside itself and would count twice; "
             "unite its parts (in Blender: Boolean, Union)"
         )
     vertices = mesh.placement.apply(mesh.surface.vertices)

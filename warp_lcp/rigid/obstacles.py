@@ -1,4 +1,4 @@
-"""What bodies may touch besides each other: the domain's walls, and solids that stand or that the scene moves."""
+"""Obstacles of bodies: the domain's walls, fixed and moving solids."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warp_lcp.rigid.contact_shape import ContactShape
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Obstacle:
-    """A solid that no impulse moves.
+    """Solid that no impulse moves.
 
     Args:
         name: what messages call it.
@@ -32,12 +32,12 @@ class Obstacle:
     motion: Motion | None = None
 
     def pose(self, time: float) -> Pose:
-        """Return where it is at a time [s]."""
+        """Return the pose at a time [s]."""
         return Pose.identity() if self.motion is None else self.motion.pose(time)
 
 
 def domain_walls(size: Sequence[float], *, open_sides: int = 0, endless: Sequence[int] = ()) -> Obstacle:
-    """Return the walls of a box from the origin to `size` [m], shape (2,) or (3,).
+    """Return the walls of the domain, a box from the origin to `size` [m].
 
     Args:
         size: of the domain.
@@ -58,7 +58,10 @@ def domain_walls(size: Sequence[float], *, open_sides: int = 0, endless: Sequenc
 
 
 def obstacle(solid: PlacedSolid, dimension: int) -> Obstacle:
-    """Return a solid of a scene as bodies meet it: half spaces and the outside of a box by their planes, others by their distance."""
+    """Return a solid of a scene as an obstacle.
+
+    Half spaces and inverted boxes by their planes, other shapes by their distance.
+    """
     shape = solid.geometry
     if isinstance(shape, Plane):
         flip = -1.0 if shape.invert else 1.0

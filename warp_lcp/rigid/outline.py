@@ -1,4 +1,4 @@
-"""What a shape looks like: triangles of its surface, in 2-D the segments around its cut by the plane z = 0."""
+"""Surface of a shape: triangles, in 2-D the segments of its cut by z = 0."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ AROUND = 48  # points around a disc or ball; even
 
 
 def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
-    """Return the segments [m] in which a placed mesh meets the plane z = 0, shape (m, 2, 3), the inside on the left.
+    """Return the segments of a placed mesh in the plane z = 0 [m], shape (m, 2, 3).
+
+    The inside is on the left.
 
     Corners on the plane count as above it, so that each triangle that reaches below gives one segment or none.
     """
@@ -46,7 +48,9 @@ def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class BodySurface:
-    """Triangles, in 2-D segments; as `warp_lcp.simulation.Surface` without a name.
+    """Surface of a body: triangles, in 2-D segments.
+
+    As `warp_lcp.simulation.Surface`, without a name.
 
     Args:
         points: [m], shape (n, 3).
@@ -60,7 +64,7 @@ class BodySurface:
 
     @classmethod
     def joined(cls, surfaces: Sequence[BodySurface]) -> BodySurface:
-        """Return several surfaces as one, their corners counted on."""
+        """Return several surfaces as one."""
         first = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
         corners = np.concatenate([surface.corners + start for surface, start in zip(surfaces, first, strict=False)])
         fields = {name: np.concatenate([surface.fields[name] for surface in surfaces]) for name in surfaces[0].fields}
@@ -68,7 +72,7 @@ class BodySurface:
 
 
 def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
-    """Return the surface of a box, sphere, capsule or mesh as placed, or the surfaces of a union of such.
+    """Return the surface of a placed box, sphere, capsule, mesh or union of these.
 
     Raises:
         ValueError: it is none of these.
@@ -88,7 +92,7 @@ def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
         start, end = (np.array([*point, 0.0][:3]) for point in ends)
         points, corners = _round(start, end, geometry.radius, dimension)
     else:
-        raise ValueError(f"{type(geometry).__name__.lower()}: no surface that ends")
+        raise ValueError(f"{type(geometry).__name__.lower()}: its surface is unbounded")
     return BodySurface(geometry.placement.apply(points), corners)
 
 

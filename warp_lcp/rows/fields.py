@@ -73,7 +73,7 @@ def real_array(values: Any, name: str) -> np.ndarray:
     """
     masked = int(np.count_nonzero(np.ma.getmaskarray(values))) if isinstance(values, np.ma.MaskedArray) else 0
     if masked:
-        raise ValueError(f"{name} is a masked array with {masked} masked entries: say what they are, {name}.filled(...)")
+        raise ValueError(f"{name} is a masked array with {masked} masked entries: replace them, {name}.filled(...)")
     try:
         host = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
         if host.dtype.kind == "O" and hasattr(values, "to_numpy"):

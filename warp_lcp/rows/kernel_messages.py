@@ -43,7 +43,7 @@ class KernelMessages:
         elif found and found[3] == "compiled" and found[2] not in self._told:
             self._told.add(found[2])
             print(
-                f"compiling kernels for {found[2]}, which takes seconds at their first use; they are kept in {wp.config.kernel_cache_dir}",
+                f"compiling kernels for {found[2]}, which takes seconds and is done once; cache: {wp.config.kernel_cache_dir}",
                 file=self._stream or sys.stderr, flush=True,
             )  # fmt: skip
 

@@ -272,9 +272,9 @@ def _entry() -> Entry | None:
         launch = wp.launch(trial_kernel, 5, [a, 2, 3.0], device="cpu", record_cmd=True)
         Team(1, made).run(Table([launched_alone(launch)]))
         if a.numpy().tolist() != [0, 0, 3, 4, 5, 6, 7, 0]:
-            raise RuntimeError("a launch did not do what was asked")
+            raise RuntimeError("a test launch gave a wrong result")
     except Exception as error:
-        warnings.warn(f"one CPU thread: Warp {wp.__version__} records launches in another way than expected ({error})", stacklevel=2)
+        warnings.warn(f"one CPU thread: Warp {wp.__version__} records launches in an unknown format ({error})", stacklevel=2)
         return None
     return made
 

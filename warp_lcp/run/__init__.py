@@ -1,1 +1,1 @@
-"""A run: its loop, folder, checkpoints, log, progress and devices, on one process or on ranks."""
+"""Run a scene: loop, folder, checkpoints, log, progress and devices."""

@@ -1,4 +1,4 @@
-"""What can be told of a scene before its run: whether it is valid, and what a run of it would do."""
+"""Check a scene before its run, and summarize the run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ EVERYTHING = ("vtu", "xdmf", "vtk", "gmsh")  # formats that hold all parts with 
 
 
 def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene, list[tuple[str, str]]]:
-    """Return a scene, its shapes built once, and what a run of it would do, as pairs of a word and a line.
+    """Return a scene, with its shapes built once, and a summary of its run.
+
+    The summary has pairs of a word and a line.
 
     Args:
         path_or_name: as of `load_scene`.
@@ -58,7 +60,7 @@ def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
 
 
 def check_ranks(scene: Scene) -> None:
-    """Refuse a scene that nothing simulates on ranks, or whose output cannot be written in pieces.
+    """Refuse a scene that cannot run on ranks, or whose output cannot be in pieces.
 
     Raises:
         SceneError: listing what stands against it.
@@ -68,15 +70,17 @@ def check_ranks(scene: Scene) -> None:
     if not isinstance(simulators()[name], DistributedSimulator):
         problems.append(KeyFault("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
     if scene.output.format != "vtu":
-        problems.append(KeyFault("output.format", "--engine petsc writes .vtu pieces alone", written(scene.output.format)))
+        problems.append(KeyFault("output.format", "--engine petsc writes only .vtu pieces", written(scene.output.format)))
     if scene.output.surface_ply:
-        problems.append(KeyFault("output.surface_ply", "--engine petsc writes surfaces as .vtu pieces alone", "true"))
+        problems.append(KeyFault("output.surface_ply", "--engine petsc writes surfaces only as .vtu pieces", "true"))
     if problems:
         raise SceneError(scene.scene.name, problems)
 
 
 def check_output(scene: Scene) -> list[str]:
-    """Refuse a format of frames that does not hold what the scene writes; return a line for parts whose fields it does not hold.
+    """Refuse a format that cannot store the scene's output; return notes.
+
+    A note names the parts whose fields the format does not store.
 
     Raises:
         SceneError: naming the parts, why, and what the format holds.
@@ -86,7 +90,8 @@ def check_output(scene: Scene) -> list[str]:
         return []
     if output.format == "ply" and output.surface_ply:
         raise SceneError(
-            scene.scene.name, [KeyFault("output.surface_ply", 'output.format = "ply" writes surfaces so; leave one out', "true")]
+            scene.scene.name,
+            [KeyFault("output.surface_ply", 'is redundant: output.format = "ply" writes surfaces as PLY, too; leave one out', "true")],
         )
     has_bodies, cells = any(solid.is_body for solid in scene.solid), output.grid_format == "vtu"
     kinds: dict[str, tuple[bool, type, int]] = {
@@ -98,7 +103,7 @@ def check_output(scene: Scene) -> list[str]:
     found = {name: holds(output.format, kind, dimension) for name, (wanted, kind, dimension) in kinds.items() if wanted}
     refused = {name: held.why for name, held in found.items() if held.dress is None}
     if refused:
-        what = f"does not hold {' and '.join(refused)}"
+        what = f"cannot store {' and '.join(refused)}"
         why = next((f" ({one_line(why.strip())})" for why in refused.values() if why.strip()), "")
         off = [f"output.{name} = false" for name in refused if name in type(output).model_fields]
         others = " or ".join(name for name in EVERYTHING if name != output.format)
@@ -111,11 +116,13 @@ def check_output(scene: Scene) -> list[str]:
             ],
         )
     bare = [name for name, held in found.items() if held.dress is Dress.BARE]
-    return [f'output.format = "{output.format}" holds the shape of {" and ".join(bare)}, without their fields'] if bare else []
+    return [f'output.format = "{output.format}" writes the geometry of {" and ".join(bare)}, without fields'] if bare else []
 
 
 def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
-    """Return the simulation of a scene where a run begins, which refuses what a run would refuse before its first step.
+    """Return the simulation of a scene at its start.
+
+    Errors that a run would raise before its first step are raised.
 
     Args:
         scene: what would run.

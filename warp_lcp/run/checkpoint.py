@@ -113,7 +113,9 @@ class CheckpointFolder:
         return sorted((int(match["step"]) for file in files if (match := CHECKPOINT_FILE.fullmatch(file.name))), reverse=True)
 
     def write(self, checkpoint: Checkpoint) -> Path:
-        """Write a checkpoint atomically; of several ranks each its piece, and then the root rank the file that makes them count.
+        """Write a checkpoint atomically.
+
+        On ranks each writes its piece, then the root rank the file that completes them.
 
         Returns:
             The file of this rank's state.
@@ -156,7 +158,9 @@ class CheckpointFolder:
 
     @on_root
     def prune(self, kept: int) -> None:
-        """Delete all but the newest `kept` and those that are spared, and pieces that belong to none.
+        """Delete all but the newest `kept` checkpoints and the spared ones.
+
+        Pieces of no checkpoint are deleted, too.
 
         Raises:
             OSError: a file cannot be deleted.
@@ -170,7 +174,9 @@ class CheckpointFolder:
                 piece.unlink()
 
     def set_aside(self, after: int) -> list[Path]:
-        """Rename what is newer than a step, so that it is neither continued from nor counted; return the new names.
+        """Rename checkpoints newer than a step, which are then ignored.
+
+        Returns the new names.
 
         Raises:
             OSError: a file cannot be renamed.
@@ -196,20 +202,22 @@ class CheckpointFolder:
                     raise CheckpointError(f"{path}: belongs to another scene")
                 foreign = [name for name in archive.headers if name != META and not name.startswith(STATE)]
                 if foreign:
-                    raise CheckpointError(f"{path}: holds arrays that no run writes: {', '.join(map(repr, foreign))}")
+                    raise CheckpointError(f"{path}: holds unexpected arrays: {', '.join(map(repr, foreign))}")
                 arrays = archive.read([name for name in archive.headers if name != META])
         except ArchiveError as error:
             raise CheckpointError(f"{path}: cut short, damaged or not a checkpoint ({error})") from error
         state = {name.removeprefix(STATE): array for name, array in arrays.items()}
         checkpoint = Checkpoint(step, float(meta["time"]), state, meta["keys"])
         if meta["checksum"] != checkpoint.checksum or np.ndim(state.get(PIECES, [])) != 1:
-            raise CheckpointError(f"{path}: damaged (its checksum does not fit)")
+            raise CheckpointError(f"{path}: damaged (wrong checksum)")
         if meta["step"] != step:
-            raise CheckpointError(f"{path}: holds step {meta['step']}, renamed")
+            raise CheckpointError(f"{path}: holds step {meta['step']}; the file was renamed")
         return checkpoint
 
     def verify(self, checkpoint: Checkpoint) -> None:
-        """Read and verify the pieces of a checkpoint, if it is in pieces; ranks have done so in `complete`.
+        """Read and verify the pieces of a checkpoint, if it is in pieces.
+
+        Ranks have done so in `complete`.
 
         Raises:
             CheckpointError: one of them cannot be used.
@@ -223,7 +231,10 @@ class CheckpointFolder:
                 raise CheckpointError(problem)
 
     def complete(self, checkpoint: Checkpoint) -> bool:
-        """Verify the pieces of a checkpoint, each on one rank; without a valid one `newest` refuses the checkpoint from now on."""
+        """Verify the pieces of a checkpoint, each on one rank.
+
+        Without a valid piece `newest` refuses the checkpoint from now on.
+        """
         self._continued = checkpoint.step
         ranks = self.collective.ranks
         mine = range(ranks.rank, len(checkpoint.state.get(PIECES, ())), ranks.size)
@@ -262,7 +273,7 @@ class CheckpointFolder:
         return [(int(match["step"]), file) for match, file in matches if match]
 
     def newest(self) -> tuple[Checkpoint | None, list[str]]:
-        """Return the newest valid checkpoint, if there is one, and what is wrong with each newer file."""
+        """Return the newest valid checkpoint or None, and the errors of newer files."""
         refused: list[str] = []
         for step in self.steps():
             try:

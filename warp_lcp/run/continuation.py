@@ -1,4 +1,4 @@
-"""What of a scene may change when its run is continued, and what that means for the results."""
+"""Rules for scene keys that change when a run is resumed."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ MAY_CHANGE = (
 
 
 class Change(Enum):
-    """What another value of a key means for a run that goes on."""
+    """Effect of a changed key on a resumed run."""
 
     SAME_STEPS = "the steps are those of a run that had this value from the start"
-    OTHER_STEPS = "from here on the steps are not those of the run that began"
-    RESAMPLED = "the state goes to another grid"
-    REFUSED = "it would be another run"
+    OTHER_STEPS = "later steps differ from those of the original run"
+    RESAMPLED = "the state is resampled to another grid"
+    REFUSED = "not allowed: it would be a different run"
 
 
 RULES = (
@@ -40,12 +40,12 @@ MESH_KEY = re.compile(r"\w+\[\d+\]\.file")
 
 
 def change_of(key: str) -> Change:
-    """Return what a change of a key, such as `time.cfl`, means."""
+    """Return the effect of a change of a key such as `time.cfl`."""
     return next((change for pattern, change in RULES if pattern.fullmatch(key)), Change.REFUSED)
 
 
 def mesh_digests(scene: Scene) -> dict[str, str]:
-    """Return a digest of the content of each mesh file that a scene names, by its key, such as `solid[0].file`.
+    """Return a digest of each mesh file of a scene, by key (`solid[0].file`).
 
     Raises:
         SceneError: a file cannot be read.
@@ -75,7 +75,10 @@ def fingerprint(scene: Scene, digests: Mapping[str, str] | None = None) -> str:
 
 
 def differences(before: Mapping[str, Any], after: Mapping[str, Any], *changes: Change) -> list[str]:
-    """Return a line for each key whose change is one of `changes` and that differs, such as `time.cfl: 2.0 before, 4.0 now`."""
+    """Return a line per changed key, such as `time.cfl: 2.0 before, 4.0 now`.
+
+    Only keys whose effect is one of `changes`.
+    """
     return [
         f"{key}: {written(before.get(key, 'none'))} before, {written(after.get(key, 'none'))} now"
         for key in sorted(before.keys() | after.keys())

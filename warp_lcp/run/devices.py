@@ -1,4 +1,4 @@
-"""What a run runs on: this process or ranks, devices, and the versions of the software."""
+"""Devices, engines and software versions of a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class EngineError(InputError):
 
 
 class Engine(StrEnum):
-    """What carries a computation: this process, or the ranks that `mpiexec` has started."""
+    """Engine of a computation: this process, or MPI ranks started by `mpiexec`."""
 
     SINGLE = "single"  # one process with one device
     PETSC = "petsc"  # the ranks of MPI, whose grids PETSc cuts and exchanges
@@ -30,7 +30,7 @@ class DeviceError(InputError):
 
 
 def devices() -> dict[str, str]:
-    """Return the devices of this machine with their descriptions, the preferred one first.
+    """Return the devices of this machine and their descriptions, preferred one first.
 
     Raises:
         KernelCacheError: there is no place for compiled kernels.
@@ -60,7 +60,7 @@ def choose_device(name: str | None) -> str:
 
 
 def free_memory(name: str) -> int | None:
-    """Return the memory of a device that programs may still take [bytes]; None where the system does not tell."""
+    """Return the free memory of a device [bytes]; None if unknown."""
     device = wp.get_device(name)
     if device.is_cuda:
         return int(device.free_memory)

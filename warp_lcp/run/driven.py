@@ -34,12 +34,17 @@ from warp_lcp.simulation import InputError, Part, Simulation, SimulationFailed
 
 
 class RunError(InputError):
-    """What a program asks of its run is wrong. The message names the argument and says what is allowed."""
+    """Wrong argument of a run in Python.
+
+    The message names the argument and what is allowed.
+    """
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What a run shows at the time of a frame: the simulation's own arrays, without copies, as they are until the run goes on.
+    """Frame of a run: the simulation's own arrays, without copies.
+
+    They are valid until the run continues.
 
     Args:
         index: number of the frame, 0 at the start.
@@ -55,18 +60,26 @@ class Frame:
 
     @property
     def particles(self) -> Particles:
-        """The particles' `position` [m], `velocity` [m/s] and `affine`: Warp arrays, wp.vec3, shape (count,). Spray is not among them."""
+        """Arrays of the particles, without spray: Warp arrays, wp.vec3, shape (count,).
+
+        `position` [m], `velocity` [m/s] and `affine`.
+        """
         return _of_particles(self.simulation).particles
 
     @property
     def bodies(self) -> Sequence[RigidBody]:
-        """The rigid bodies in the order of their solids: `position` [m], `velocity`, `rotation`, `angular_velocity`, `momentum`."""
+        """Rigid bodies in the order of their solids.
+
+        `position` [m], `velocity`, `rotation`, `angular_velocity`, `momentum`.
+        """
         bodies = _of_particles(self.simulation).bodies
         return bodies.bodies if bodies is not None else ()
 
     @property
     def fields(self) -> dict[str, wp.array]:
-        """The fields on the faces of the grid, `velocity_x` to `velocity_z` [m/s], shape (nz + 2, ny + 2, nx + 2): a ring of cells around.
+        """Velocity on the faces of the grid, `velocity_x` to `velocity_z` [m/s].
+
+        Shape (nz + 2, ny + 2, nx + 2), with a ring of cells around the domain.
 
         Entry [k, j, i] is of the lower face of cell (i - 1, j - 1, k - 1) along the axis.
         """
@@ -74,7 +87,9 @@ class Frame:
         return {f"velocity_{axis}": field for axis, field in zip("xyz", faces, strict=False)}
 
     def to_meshio(self) -> dict[str, Any]:
-        """Return a `meshio.Mesh` for each part of the frame, by its name: points [m], cells, and the fields as point data or cell data.
+        """Return a `meshio.Mesh` for each part of the frame, by name.
+
+        Points [m], cells, and the fields as point data or cell data.
 
         The parts are `particles`, `grid` (its cells are quadrilaterals or hexahedra), and `surface`, `bodies`, `level_set` and `density`
         where the scene has them. Of volumes the cells are those within the level set's band, and where the density is not 0.
@@ -82,7 +97,10 @@ class Frame:
         return {part.name: to_meshio(part) for part in self.parts()}
 
     def parts(self) -> list[Part]:
-        """Return copies of what a frame's files show: points, cells with their pressure, surfaces and volumes if the scene wants them."""
+        """Return copies of the parts that a frame's files contain.
+
+        Points, cells with pressure, and surfaces and volumes if the scene wants them.
+        """
         return self.simulation.frame()
 
 
@@ -92,22 +110,22 @@ class Run:
     `for frame in run` takes the steps from one frame to the next.
 
     The steps are those of `warp-lcp run`, and with a `folder` so are log, frames and checkpoints, bit for bit. Once the loop is left, with
-    `break`, by an error in it or by Ctrl-C, the run ends as one that was stopped, with a checkpoint that `Run.resume` goes on from. Ctrl-C
-    waits for the end of the step that is being taken, and is then raised as ever; a second one does not wait.
+    `break`, by an error in it or by Ctrl-C, the run is stopped with a checkpoint, from which `Run.resume` continues. Ctrl-C
+    waits for the end of the current step and is then raised as usual; a second one does not wait.
 
     Args:
         scene: a scene file, the name of a built-in scene, its tables as a dict, or a Scene.
-        folder: takes log, frames and checkpoints; None: nothing is written.
-        device: a Warp device; a GPU where there is one unless given.
-        frames: end after this frame; the scene's last one unless given.
+        folder: folder for log, frames and checkpoints; None: nothing is written.
+        device: a Warp device; default: a GPU, if there is one.
+        frames: stop after this frame; default: the last one of the scene.
         force: delete the run that is in the folder.
         on_step: called after each step, as by `on_step`.
         overrides: keys of the scene with other values, such as {"domain.resolution": 96, "liquid.0.max": [1, 1]}.
-        keys: the same for keys that only one table has, without its name: `resolution=96`.
+        keys: the same, without the name of the table, for keys that only one table has: `resolution=96`.
 
     Attributes:
-        scene: what runs.
-        record: how the run goes, as in run.json.
+        scene: the scene.
+        record: record of the run, as in run.json.
 
     Raises:
         SceneError: the scene is wrong; the message lists everything that is.
@@ -142,18 +160,18 @@ class Run:
         overrides: Mapping[str, Any] | None = None,
         **keys: Any,
     ) -> Self:
-        """Return the run of a folder, to continue from its newest checkpoint.
+        """Return the run of a folder, continued from its newest checkpoint.
 
         The next frame is the first one without a file; arguments as of `Run`.
 
-        What callbacks have changed is in the checkpoint, but for gravity: that is the scene's again.
+        Changes made by callbacks are in the checkpoint, except gravity, which is that of the scene.
 
         Raises:
             OutputError: there is no run in the folder.
         """
         path, run = _folder(folder), cls.__new__(cls)
         if path is None:
-            raise RunError("folder: must be that of a run, which None is not")
+            raise RunError("folder: must be the folder of a run, not None")
         scene = path / "scene.toml"
         given = scene_to_resume(path, None, _overrides(scene, overrides, keys) if overrides or keys else ())
         run._set_up(given, RunRequest(scene=given.scene, out=path, resume=True), device, frames, on_step)
@@ -177,13 +195,13 @@ class Run:
     _loop: RunLoop | None
 
     def on_step(self, callback: Callable[[Run], object]) -> Callable[[Run], object]:
-        """Register a function that is called with the run after each step.
+        """Register a callback that is called with the run after each step.
 
         It is called before the frame and the checkpoint of that time are written. It may be used as
         a decorator.
 
-        It may look (`run.row`, `run.time`, `run.simulation`), `push` a body, change `gravity`, `add` material and `stop` the run. An error
-        that it raises ends the run with a checkpoint of the step; `Run.resume` goes on, first with the frame if the step was to end one.
+        It may read `run.row`, `run.time` and `run.simulation`, `push` a body, change `gravity`, `add` material and `stop` the run. An error
+        that it raises ends the run with a checkpoint of the step; `Run.resume` continues, first with the frame if the step ends one.
 
         Raises:
             RunError: it cannot be called.
@@ -203,7 +221,7 @@ class Run:
             KeyboardInterrupt: Ctrl-C was pressed; the run has been stopped, with a checkpoint.
         """
         if self._used:
-            raise RunError("this run has been driven already; Run.resume(folder) goes on, another Run begins anew")
+            raise RunError("this run was iterated already; use Run.resume(folder) to continue, or a new Run to start again")
         self._used = True
         interruption = Interruption(self.notes.append, signals=[signal.SIGINT])
         running = running_scene(self._request, observer=_Ears(self), stop=lambda: interruption() or self._stopped)
@@ -229,7 +247,7 @@ class Run:
             return goes_on
 
     def finish(self) -> RunRecord:
-        """Run to the last frame, and return how the run ended.
+        """Run to the last frame and return the record of the run.
 
         Raises:
             SimulationFailed: the run has failed.
@@ -241,13 +259,13 @@ class Run:
 
     @property
     def simulation(self) -> Simulation:
-        """The simulation, from the first frame on.
+        """Simulation, from the first frame on.
 
         Raises:
             RunError: the run has not begun.
         """
         if self._loop is None:
-            raise RunError("the run has not begun: its simulation is there from the first frame on")
+            raise RunError("the run has not started: the simulation exists from the first frame on")
         return self._loop.simulation
 
     @property
@@ -261,7 +279,7 @@ class Run:
 
         Set it with as many numbers as the scene has dimensions.
 
-        Bounds that the pressure of liquids takes from gravity, as for what rests on shelves of particles, stay those of the scene's.
+        Limits that the pressure of liquids derives from gravity are still computed from the scene's gravity.
         """
         return _of_particles(self.simulation).gravity.copy()
 
@@ -270,12 +288,12 @@ class Run:
         _of_particles(self.simulation).gravity[:] = self._vector("gravity", value)
 
     def push(self, body: int, impulse: Sequence[float], *, at: Sequence[float] | None = None) -> None:
-        """Give a rigid body an impulse.
+        """Apply an impulse to a rigid body.
 
         Args:
             body: its number, counted from 0 in the order of the scene's solids.
             impulse: [N s; N s/m in 2-D].
-            at: the point that it acts on [m]; the center of mass unless given.
+            at: the point that it acts on [m]; default: the center of mass.
 
         Raises:
             RunError: there is no such body, or a vector is not finite or of another dimension.
@@ -311,7 +329,7 @@ class Run:
             raise RunError(f"add: {error}") from error
 
     def stop(self) -> None:
-        """End the run after the step that is being taken, with a checkpoint."""
+        """Stop the run after the current step, with a checkpoint."""
         self._stopped = "its program"
 
     def _vector(self, name: str, value: Sequence[float]) -> np.ndarray:
@@ -355,7 +373,7 @@ class _Ears:
 
 def _of_particles(simulation: Simulation) -> ParticleSimulation:
     if not isinstance(simulation, ParticleSimulation):
-        raise RunError(f"{type(simulation).__name__} has no particles; its `state()` and `frame()` have what it shows")
+        raise RunError(f"{type(simulation).__name__} has no particles; use its `state()` or `frame()`")
     return simulation
 
 
@@ -374,7 +392,9 @@ def _overrides(scene: SceneSource, overrides: Mapping[str, Any] | None, keys: Ma
         owners = [table for table, names in tables.items() if key in names]
         if len(owners) != 1:
             known = [name for names in tables.values() for name in names]
-            which = f"is a key of {', '.join(owners)}: name one in `overrides`" if owners else f"no such key; {nearest(key, known)}"
+            which = (
+                f"is a key of {', '.join(owners)}: write TABLE.{key} in `overrides`" if owners else f"no such key; {nearest(key, known)}"
+            )
             raise SceneError("Run", [KeyFault(key, which)])
         given[f"{owners[0]}.{key}"] = value
     return [f"{key}={_written(key, value)}" for key, value in given.items()]
@@ -386,6 +406,4 @@ def _written(key: str, value: Any) -> str:
     try:
         return json.dumps(plain, ensure_ascii=False)
     except TypeError as error:
-        raise RunError(
-            f"{key}: a value of a scene is a number, a text, true, false or a list of them, not {type(value).__name__}"
-        ) from error
+        raise RunError(f"{key}: must be a number, a string, true, false or a list of them, not {type(value).__name__}") from error

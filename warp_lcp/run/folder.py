@@ -40,7 +40,7 @@ Status = Literal["running", "finished", "stopped", "failed"]
 RECORD = "run.json"
 SCENE = "scene.toml"
 ROUNDING = 1e-9
-BEFORE = "before its first step had ended"
+BEFORE = "during the first step"
 LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
 OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|(?:log|probes|forces)\.csv|[a-z][a-z_]*\.pvd|{POST}")
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
@@ -51,7 +51,7 @@ OWN_FOLDERS = {"frames": FRAME_FILE, CHECKPOINTS: STORED_STATE, "images": IMAGE_
 
 @dataclass
 class RunRecord:
-    """What run.json says of a run.
+    """Record of a run, as in run.json.
 
     Args:
         scene: the scene's name.
@@ -96,7 +96,7 @@ class RunRecord:
 
 @dataclass(frozen=True)
 class Continuation:
-    """Where a run goes on.
+    """State from which a run continues.
 
     Args:
         checkpoint: to continue from; None: nothing was computed yet.
@@ -141,7 +141,7 @@ class RunFolder:
 
     @contextmanager
     def held(self, *, resume: bool) -> Iterator[list[str]]:
-        """Keep other processes out of the folder, which is made if a new run needs it; yields remarks.
+        """Hold the lock of the folder, created if a new run needs it; yields remarks.
 
         Args:
             resume: there must be a run.
@@ -185,12 +185,16 @@ class RunFolder:
             return
         if foreign or not holds_run(self.path):
             shown = ", ".join(one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3])
-            raise OutputError(f"{self.path}: holds files that are no run's ({shown}), which --force does not delete; choose another folder")
+            raise OutputError(
+                f"{self.path}: holds files that do not belong to a run ({shown}), which --force does not delete; choose another folder"
+            )
         if not force:
-            raise OutputError(f"{self.path}: holds a run already; --resume continues it, --force deletes it, --out takes another folder")
+            raise OutputError(
+                f"{self.path}: holds a run already; use --resume to continue it, --force to delete it, or --out for another folder"
+            )
 
     def start(self, record: RunRecord) -> None:
-        """Begin a run in a folder that `check_new` found fit: what an earlier run left is deleted.
+        """Start a run in a checked folder; files of an earlier run are deleted.
 
         Raises:
             OSError: a file cannot be deleted or written.
@@ -214,7 +218,7 @@ class RunFolder:
         write_text(self.path / SCENE, dump_scene(self.scene))
 
     def resume(self) -> Continuation:
-        """Return where to continue: the newest checkpoint of which all is valid; one of a single process is on all ranks.
+        """Return the newest valid checkpoint to continue from; the same on all ranks.
 
         Raises:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
@@ -241,33 +245,33 @@ class RunFolder:
         self._check_same_scene()
         checkpoint, refused = self.checkpoints.newest()
         if checkpoint is None and not refused and not self._has_steps():
-            return Continuation(None, [f"{self.path}: the run that was interrupted had no checkpoint yet; it begins anew"])
+            return Continuation(None, [f"{self.path}: the interrupted run had no checkpoint; it starts again"])
         if checkpoint is None:
             reasons = refused or ["none was written"]
             raise OutputError("\n  ".join([f"{self.path}: no checkpoint to resume from; --force starts again", *reasons]))
         end = self.scene.time.frame_time(self.scene.time.frame_count)
         if checkpoint.time > end * (1.0 + ROUNDING):
             raise OutputError(
-                f"{self.path}: time.duration = {self.scene.time.duration:g} s ends before the checkpoint's time, {checkpoint.time:.6g} s: "
-                "frames would be lost; choose a longer one"
+                f"{self.path}: time.duration = {self.scene.time.duration:g} s is less than the checkpoint's time, {checkpoint.time:.6g} s: "
+                "frames would be lost; choose a longer duration"
             )
         lost = [name for name, found in ((RECORD, read_record(self.path)), (SCENE, recorded_keys(self.path / SCENE))) if not found]
-        remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; written anew" for name in lost)]
+        remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; rewritten" for name in lost)]
         if RECORD in lost:
-            remarks.append("what --set gave the run before is not known: what is not given again is the scene's")
+            remarks.append("earlier --set values are unknown: pass them again, else those of the scene are used")
         if refused:
             remarks.append(f"continuing from step {checkpoint.step} instead; refused checkpoints stay as checkpoints/refused_*.npz")
         now = keys(self.scene)
         before = checkpoint.keys or now
         steps = differences(before, now, Change.OTHER_STEPS)
         if steps:
-            remarks.append(f"from step {checkpoint.step} on the steps are not those of the run that began: {'; '.join(steps)}")
+            remarks.append(f"from step {checkpoint.step} on, steps differ from those of the original run: {'; '.join(steps)}")
         old = int(before.get(RESOLUTION, now[RESOLUTION]))
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
 
     def gaps(self, tables: Mapping[str, tuple[str, ...]], step: int, times: list[float], frame: list[Part]) -> list[str]:
-        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.run.gaps`; tables as of `open_log`.
+        """Return a line for each gap in the files up to a step; see `warp_lcp.run.gaps`.
 
         Raises:
             OSError: a file cannot be read.
@@ -282,7 +286,7 @@ class RunFolder:
         return gaps(logs, whole, self.checkpoints, step=step, times=times, frame=frame)
 
     def lacks(self, index: int, frame: list[Part]) -> bool:
-        """Return whether a file of a frame is missing or cut, given the frame as the run would write it.
+        """Return whether a file of a frame, as the run would write it, is missing or cut.
 
         Raises:
             OSError: a file cannot be read.
@@ -295,7 +299,7 @@ class RunFolder:
         return any(index in whole.missing(kind, index + 1) for kind in whole.kinds(frame))
 
     def go_on(self, record: RunRecord, step: int) -> None:
-        """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
+        """Prepare a checked folder to continue after a step; delete incomplete files.
 
         Raises:
             OSError: a file cannot be written, renamed or deleted.
@@ -318,11 +322,14 @@ class RunFolder:
         return Log(self.log.with_stem(table), columns, after_step=after_step, collective=self.collective)
 
     def frame_writer(self, watch: Stopwatch) -> FrameWriter | RankFrameWriter:
-        """Return what writes the frames while the simulation goes on."""
+        """Return the frame writer, which works while the simulation continues."""
         return RankFrameWriter(self.frames, watch) if isinstance(self.frames, RankFrames) else FrameWriter(self.frames, watch)
 
     def write_record(self, record: RunRecord) -> None:
-        """Write run.json; that of a run that begins keeps room for the one of its end, which is written even if the disk is full.
+        """Write run.json.
+
+        At the start, room for the final record is reserved, so that it can be written on a full
+        disk.
 
         Raises:
             OSError: the disk is full before the run begins, or cannot be written at all; on the root rank.
@@ -368,11 +375,11 @@ class RunFolder:
         wrong = [self.path / name for name in OWN_FOLDERS if (self.path / name).exists() and not (self.path / name).is_dir()]
         wrong += [path for path in (self.path / RECORD, self.path / SCENE, self.log) if path.is_dir()]
         if wrong:
-            kind = "is a folder where a run has a file" if wrong[0].is_dir() else "is a file where a run has a folder"
+            kind = "is a folder, expected a file" if wrong[0].is_dir() else "is a file, expected a folder"
             raise OutputError(f"{wrong[0]}: {kind}; move it away")
         links = [path for path, pattern in _walk(self.path) if path.is_symlink() and _is_of_run(path, self.path, pattern)]
         if links:
-            raise OutputError(f"{links[0]}: is a link, which no run makes, and a run writes into its own folder alone; move it away")
+            raise OutputError(f"{links[0]}: is a link: a run writes only into its own folder; move it away")
 
     def _check_same_scene(self) -> None:
         """Refuse other values of keys that must not change, and mesh files that hold something else."""
@@ -385,12 +392,12 @@ class RunFolder:
                 before[key] = now[key]  # the same mesh in another place
             elif key in files and before.get(key) == now[key]:
                 raise OutputError(
-                    f"{self.path}: {key} = {now[key]!r}: what is in the file has changed since the run began; put the old one back, or "
+                    f"{self.path}: {key} = {now[key]!r}: the content of the file has changed since the run began; restore it, or "
                     "start again with --force"
                 )
         changes = differences(before, now, Change.REFUSED)
         if changes:
-            head = f"{self.path}: --resume continues the same scene, and these keys have other values"
+            head = f"{self.path}: --resume needs the same scene, but these keys have changed"
             raise OutputError("\n  ".join([head, *changes, f"may change: {MAY_CHANGE}"]))
 
     def _has_steps(self) -> bool:
@@ -406,7 +413,7 @@ class RunFolder:
         before, now = read_record(self.path).get("versions", {}), versions()
         now.pop("platform", None)  # its name tells the kernel, not the processor
         other = [f"{name} {before[name]}, now {now[name]}" for name in sorted(before.keys() & now.keys()) if before[name] != now[name]]
-        return [f"written with other software ({'; '.join(other)}): results need not be the same bit for bit"] if other else []
+        return [f"written with other software ({'; '.join(other)}): results may not be bitwise identical"] if other else []
 
     def _contents(self) -> tuple[list[Path], list[Path]]:
         """Return the files that a run makes, and everything else."""
@@ -419,12 +426,12 @@ class RunFolder:
 
 
 def holds_run(folder: Path) -> bool:
-    """Return whether there is a run in a folder: its record, or a checkpoint where somebody has deleted that."""
+    """Return whether a folder holds a run: its record, or a checkpoint."""
     return (folder / RECORD).is_file() or any(CHECKPOINT_FILE.fullmatch(file.name) for file in folder.glob(f"{CHECKPOINTS}/*"))
 
 
 def mark_ended(folder: Path, status: Status, reason: str) -> None:
-    """Write into run.json how the run has ended, if it says that it is running; for who ends the process and has no record of the run."""
+    """Write the end of a run into run.json, if it still says that the run goes on."""
     with suppress(OSError):
         record = read_record(folder)
         if record.get("status") == "running":
@@ -432,7 +439,7 @@ def mark_ended(folder: Path, status: Status, reason: str) -> None:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return what run.json says; nothing if it cannot be read, or a value is of a type that no run writes."""
+    """Return the content of run.json; empty if it cannot be read or is invalid."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         for key, kind in _record_types().items():
@@ -450,7 +457,7 @@ def _record_types() -> dict[str, TypeAdapter[Any]]:
 
 
 def recorded_keys(path: Path) -> dict[str, Any] | None:
-    """Return the keys of the scene as it ran; None if there is no such file or it is not a scene's."""
+    """Return the keys of the scene as run; None without a valid file."""
     try:
         return keys(load_scene(path))
     except SceneError:

@@ -1,4 +1,4 @@
-"""One process a run's folder: a lock that ends with its process, however that ends."""
+"""Exclusive lock on a run folder, released when the process exits."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def locked(folder: Path) -> Iterator[list[str]]:
         OSError: the file cannot be written, or is a link.
     """
     if fcntl is None:
-        yield ["this system has no file locks: see to it that no other run writes into the folder"]
+        yield ["this system has no file locks: make sure that no other run writes into the folder"]
         return
     path = folder / LOCK
     descriptor, remarks = _acquire(path)
@@ -76,7 +76,7 @@ def _acquire(path: Path) -> tuple[int, list[str]]:
                 os.close(descriptor)
                 message = f"{path.parent}: another run writes there ({_describe(held)}); wait for it, stop it, or choose another folder"
                 raise FolderBusyError(message) from error
-            return descriptor, [f"{path}: the file system has no locks ({error.strerror}): see to it that no other run writes there"]
+            return descriptor, [f"{path}: the file system has no locks ({error.strerror}): make sure that no other run writes there"]
         if _is_at(descriptor, path):
             return descriptor, []
         os.close(descriptor)  # its holder ended, and removed it, between the two calls

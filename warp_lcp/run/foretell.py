@@ -1,4 +1,4 @@
-"""Estimate steps, time and disk of a run before it begins; find settings that look like mistakes once its material is there."""
+"""Estimate steps, time and disk of a run; warn about suspicious settings."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ROW_SECONDS = 0.8e-3  # beside a step: how long it may be, its row of the log
 
 
 def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None) -> list[tuple[str, str]]:
-    """Return how many steps, seconds and bytes a run will take, as pairs of a word and a line.
+    """Return estimates of steps, run time and disk use, as pairs of a word and a line.
 
     Args:
         scene: what would run.
@@ -42,7 +42,7 @@ def foretold(scene: Scene, simulation: Simulation, seconds: float | None = None)
     if isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation):
         steps = expected_steps(scene, simulation)
         if seconds is None:
-            seconds, where = expected_step(scene, simulation), "by the list of prices, on one core"
+            seconds, where = expected_step(scene, simulation), "by the cost table, on one core"
     else:
         steps = longest_steps(scene, simulation)
     size = expected_bytes(scene, simulation, steps)
@@ -62,7 +62,10 @@ def in_words(size: float) -> str:
 
 
 def expected_step(scene: ParticleScene, simulation: ParticleSimulation) -> float:
-    """Return how long a step takes by the list of prices, of as much material as there is in the mean of the run [s]."""
+    """Return the estimated time of a step from the cost table [s].
+
+    For the mean amount of material in the run.
+    """
     growth = expected_growth(scene)
     cells = min(round(math.prod(simulation.grid.counts) * growth), math.prod(scene.cell_counts))  # a grid that follows grows, too
     listed, particles = prices(scene.scene.simulator, scene.dimension), round(simulation.particles.count * growth)
@@ -70,14 +73,20 @@ def expected_step(scene: ParticleScene, simulation: ParticleSimulation) -> float
 
 
 def expected_growth(scene: ParticleScene) -> float:
-    """Return how many times the material of the start there is in the mean of a run: what comes in comes evenly, and half may leave."""
+    """Return the mean amount of material in a run relative to the start.
+
+    Inflow is taken as even; half of it may leave.
+    """
     leaves = bool(scene.drain or scene.domain.open)
     most, first = scene.particle_estimate(), max(scene.particle_estimate(later=False), 1)
     return 1.0 + 0.5 * (0.5 if leaves else 1.0) * (most / first - 1.0)
 
 
 def expected_speed(scene: ParticleScene, simulation: ParticleSimulation) -> float:
-    """Return the speed that the steps of a run will be as long as [m/s]: of the start, of sources, solids, and of the fall to come."""
+    """Return the speed that limits the steps of a run [m/s].
+
+    Of the material at the start, sources, solids, and a fall under gravity.
+    """
     totals, g = simulation.particles.totals(), float(np.linalg.norm(simulation.gravity))
     parts, end = (simulation.boundary, simulation.sources), scene.time.duration
     solids, sources = (0.0 if part is None else part.top_speed(0.0, end) for part in parts)
@@ -111,14 +120,14 @@ def expected_steps(scene: ParticleScene, simulation: ParticleSimulation) -> int:
 
 
 def longest_steps(scene: Scene, simulation: Simulation) -> int:
-    """Return how many steps a run takes if all are as long as the first may be."""
+    """Return the number of steps if all are as long as the first may be."""
     dt = min(max(simulation.stable_dt(), scene.time.dt_min), scene.time.dt_max)
     count = scene.time.frame_count
     return count * math.ceil(scene.time.duration / count / dt * (1.0 - 1e-9))
 
 
 def expected_bytes(scene: Scene, simulation: Simulation, steps: int) -> int:
-    """Return about how much a run will leave on the disk: frames, of as many particles as there will be, checkpoints and the log."""
+    """Return the estimated disk use of a run: frames, checkpoints and log [bytes]."""
     output, wanted = scene.output, {"particles": scene.output.particles, "grid": scene.output.grid}
     growth = expected_growth(scene) if isinstance(scene, ParticleScene) else 1.0
     frame = [_grown(part, growth) for part in simulation.frame() if wanted.get(part.name, True)]
@@ -141,11 +150,14 @@ def _grown(part: Part, factor: float) -> Part:
 
 
 def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
-    """Yield settings that look like mistakes, a line each, besides those of `Scene.notes`: of frames and of what solids fill."""
+    """Yield suspicious settings of frames and of solids, a line each.
+
+    In addition to those of `Scene.notes`.
+    """
     yield from check_output(scene)
     frames, rate = scene.time.frame_count, scene.time.frames_per_second
     if frames > MANY_FRAMES:
-        yield f"{frames:,} frames: time.duration {scene.time.duration:g} s at time.frames_per_second {rate:g}; were so many meant?"
+        yield f"{frames:,} frames: time.duration {scene.time.duration:g} s at time.frames_per_second {rate:g}; is this intended?"
     if not (isinstance(scene, ParticleScene) and isinstance(simulation, ParticleSimulation)):
         return
     if not scene.solid:
@@ -155,9 +167,9 @@ def doubts(scene: Scene, simulation: Simulation) -> Iterator[str]:
     points = np.concatenate([lattice(grid, 1, 0.0, 0, plane) for plane in planes])  # one a cell
     free = simulation.admits(points)
     if free.mean() < 1.0 - FULL:
-        yield f"solids fill {100.0 - 100.0 * free.mean():.4g} % of the domain; a shape with invert = true is everything but itself"
+        yield f"solids fill {100.0 - 100.0 * free.mean():.4g} % of the domain; with invert = true, the outside of a shape is solid"
     for number, material in enumerate(materials):
         mine = inside([material.to_geometry(Path.cwd(), scene.dimension)], points, device=grid.device)
         covered = 1.0 - float(np.mean(free[mine])) if mine.any() else 0.0
         if covered > BURIED:
-            yield f"{key}[{number}] ({material.shape}): {100.0 * covered:.0f} % of it lies inside solids, and is left out"
+            yield f"{key}[{number}] ({material.shape}): {100.0 * covered:.0f} % of it lies inside solids and is left out"

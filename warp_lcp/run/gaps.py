@@ -1,4 +1,4 @@
-"""What a run's folder lacks of the steps and frames before the one that the run goes on from: somebody has cut or deleted files."""
+"""Find missing log rows and frames when a run is resumed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ def gaps(
     logs: Mapping[Path, Sequence[str]], frames: FrameFolder, checkpoints: CheckpointFolder, *, step: int, times: Sequence[float],
     frame: Sequence[Part],
 ) -> list[str]:  # fmt: skip
-    """Return a line for each file or kind of files that has holes, with what to do about it; the checkpoints that it takes are spared.
+    """Return a line for each kind of files with gaps, with a remedy.
+
+    Checkpoints that the remedy needs are spared.
 
     Args:
         logs: the columns of log.csv and of the tables beside it.
@@ -36,14 +38,14 @@ def gaps(
         steps = sorted({*range(1, step + 1)} - rows)
         if steps:
             again = _again(checkpoints, partial(_precedes, steps[0]))
-            lines.append(f"{log.name}: rows are missing, of steps {spans(steps)}; {again}")
+            lines.append(f"{log.name}: rows of steps {spans(steps)} are missing; {again}")
     missing = {name: numbers for name in frames.kinds(frame) if (numbers := frames.missing(name, len(times)))}
     if missing:
         first = times[min(min(numbers) for numbers in missing.values())]
         listed = ", ".join(f"{name} {spans(numbers)}" for name, numbers in missing.items())
-        lines.append(f"{frames.frames.name}: {listed} are missing or cut; {_again(checkpoints, lambda _, time: time < first)}")
+        lines.append(f"{frames.frames.name}: {listed} are missing or truncated; {_again(checkpoints, lambda _, time: time < first)}")
     lost = [part.name for part in frame if frames.has_collection(part) and not (frames.folder / f"{part.name}.pvd").is_file()]
-    return [*lines, *(f"{name}.pvd: is missing; written anew from the frames that are there" for name in lost)]
+    return [*lines, *(f"{name}.pvd: was missing; rebuilt from the existing frames" for name in lost)]
 
 
 def spans(numbers: Iterable[int]) -> str:
@@ -70,7 +72,7 @@ def _again(checkpoints: CheckpointFolder, is_before: Callable[[int, float], bool
             if is_before(step, checkpoints.read(step).time):
                 checkpoints.spared.add(step)
                 away = f" of step {newer}" if newer == steps[0] else f"s of steps {newer} to {steps[0]}"
-                return f"to have them again, move the checkpoint{away} away and resume from that of step {step}"
+                return f"to recompute them, move the checkpoint{away} away and resume from step {step}"
         except CheckpointError:
             continue
-    return "no checkpoint is from before them: only --force, from the start, makes them again"
+    return "no earlier checkpoint exists: only --force (start again) recomputes them"

@@ -1,4 +1,4 @@
-"""The scene that a run is given: a file with what `--set` overrides, also when it goes on, with what was overridden before."""
+"""Scene of a new or resumed run, with its `--set` overrides."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) 
     ran, now = (recorded_keys(own) or {}).get(RESOLUTION), keys(scene)[RESOLUTION]
     if ran not in (None, now) and RESOLUTION not in asked:
         raise OutputError(
-            f"{folder}: {RESOLUTION} is {ran}, that of {source} {now}: with --set {RESOLUTION}={now} the run goes on on the other grid, "
-            f"with --set {RESOLUTION}={ran} on its own"
+            f"{folder}: {RESOLUTION} is {ran}, but {now} in {source}: use --set {RESOLUTION}={now} to resample to the other grid, "
+            f"or --set {RESOLUTION}={ran} to keep the grid"
         )
     return GivenScene(scene, _noted(source, [*kept, *overrides]), kept)
 

@@ -1,4 +1,7 @@
-"""Signals that end a run: after its step, with a checkpoint; before the first step has ended, at once."""
+"""Signal handling: stop after the current step, with a checkpoint.
+
+Before the end of the first step a run stops at once.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,9 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """A `with` block in which signals ask a run to end; called after each step, it says which signal did, "" if none.
+    """Context in which signals stop a run.
+
+    Called after each step, it returns the name of the signal, "" if none.
 
     Until it is called first there is nothing to lose, and much to wait for, as kernels are compiled: there a signal raises `Interrupted`.
     Python hands a signal on only once the compiler is back, which may take many seconds, so a thread of its own says at once that it has

@@ -1,4 +1,4 @@
-"""Compiled kernels on the disk: what a full disk or a power failure has damaged there is compiled again, and not a riddle."""
+"""Detect damaged cached kernels and recompile them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ BINARIES = (".o", ".cubin", ".ptx")
 
 
 class KernelCacheError(OSError):
-    """The folder of compiled kernels cannot be used; the message names it and says what to do."""
+    """The kernel cache cannot be used; the message names the folder and a remedy."""
 
 
 def watch_loads() -> None:
-    """Look at the files of each module of kernels before Warp loads it first; Warp itself loads whatever is there, and fails for good."""
+    """Check the files of a kernel module before Warp first loads it.
+
+    Warp loads damaged files and then fails.
+    """
     load = wp.Module.load
     if hasattr(load, "__wrapped__") or not hasattr(wp.Module, "get_module_identifier"):
         return
@@ -40,7 +43,7 @@ def watch_loads() -> None:
 
 
 def cache_error(error: OSError) -> KernelCacheError:
-    """Return what to say of the cache's folder."""
+    """Return the error message for the kernel cache."""
     where = f" {wp.config.kernel_cache_dir}" if wp.config.kernel_cache_dir else ""
     file = f" ({error.filename})" if error.filename and f" {error.filename}" != where else ""
     text = f"the folder of compiled kernels{where} cannot be used{file}; repair or delete it, or have WARP_CACHE_PATH name another one"
@@ -48,7 +51,9 @@ def cache_error(error: OSError) -> KernelCacheError:
 
 
 def mend(folder: Path) -> bool:
-    """Delete the folder of a module of kernels if a file in it is damaged; return whether it was.
+    """Delete the folder of a kernel module if a file in it is damaged.
+
+    Returns whether it was.
 
     Raises:
         OSError: it is damaged, and cannot be deleted.

@@ -1,4 +1,4 @@
-"""The launcher of a command: this process alone, or the ranks that started with it."""
+"""Launcher of a command: one process, or the ranks started together."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Launcher:
 
     @property
     def ranks(self) -> Ranks | None:
-        """Who share the work; None if this process has it alone."""
+        """MPI ranks; None for a single process."""
         return self.collective.ranks if self.collective else None
 
     def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
@@ -61,7 +61,7 @@ class Launcher:
         out = options.get("--out")
         if not options.get("--resume"):
             if scene is None:
-                raise OutputError("SCENE is missing: a scene file or the name of a built-in one; --resume --out DIR goes on without")
+                raise OutputError("SCENE is missing: give a scene file or the name of a built-in scene; only --resume --out DIR needs none")
             return given_scene(scene, overrides)
         if out is None and scene is None:
             raise OutputError("--resume: needs SCENE or --out DIR, the folder of the run")

@@ -21,7 +21,9 @@ class OutputError(InputError):
 
 
 class Log:
-    """A CSV file that grows by a row a step. What has no value is empty, never nan; every row reaches the system at once.
+    """CSV file with a row per step.
+
+    A missing value is empty, never nan; every row is flushed at once.
 
     The root rank writes it; methods are collective, so that a full disk ends all ranks.
     """
@@ -88,7 +90,9 @@ def _cell(value: Value) -> Value:
 
 
 def rows_until(path: Path, header: str, step: int) -> list[str]:
-    """Return the header of a log and its rows up to a step, in their order; rows that are cut short or of no step are left out.
+    """Return the header of a log and its rows up to a step, in order.
+
+    Incomplete rows are left out.
 
     Args:
         path: the file; there may be none.

@@ -1,4 +1,4 @@
-"""The run loop: frames at their exact times, steps that are tried again, checkpoints, and an honest end."""
+"""Time loop: step retries, exact frame times, checkpoints, exit status."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ SPACE_MARGIN = 1.1
 
 @dataclass(frozen=True, kw_only=True)
 class RunRequest:
-    """What a run is asked for, as the options of `warp-lcp run`.
+    """Options of a run, as of `warp-lcp run`.
 
     Args:
         scene: what to simulate, the same on all ranks.
@@ -107,7 +107,7 @@ def running_scene(
     profile: Profile | None = None,
     collective: Collective | None = None,
 ) -> Generator[RunLoop, None, RunRecord]:
-    """Simulate a scene as far as its frames are asked for; collective where ranks share the run.
+    """Simulate a scene as far as frames are requested; collective on ranks.
 
     Between frames the caller may change the simulation. Once the generator is closed, the run ends as one that was stopped.
 
@@ -130,7 +130,7 @@ def running_scene(
     """
     scene, everyone = request.scene, collective or Collective.of_one()
     if collective is not None and request.record_problems is not None:
-        raise OutputError("--record-problems: not with --engine petsc, whose ranks have but parts of a problem")
+        raise OutputError("--record-problems cannot be combined with --engine petsc: each rank has only a part of the problem")
     share = everyone.share_of_device(request.device)
     with everyone.together():
         if collective is not None:
@@ -195,10 +195,10 @@ def _go_on(simulation: Simulation, folder: RunFolder, continued: Continuation, *
     assert continued.checkpoint is not None
     state, name, other_grid = continued.checkpoint.state, folder.scene.scene.simulator, continued.resampled_from is not None
     if PIECES in state and not isinstance(simulation, Joined):
-        raise ValueError("the checkpoint is one of several ranks: continue with --engine petsc, on any number of ranks")
+        raise ValueError("the checkpoint was written on several ranks: continue with --engine petsc, on any number of ranks")
     if other_grid and (on_ranks or PIECES in state or not isinstance(simulation, Resampled)):
         who = "--engine petsc" if on_ranks else name
-        why = "the checkpoint is one of several ranks" if PIECES in state and not on_ranks else f"{who} cannot change grids"
+        why = "the checkpoint was written on several ranks" if PIECES in state and not on_ranks else f"{who} cannot change grids"
         raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: {why}")
     if PIECES in state and isinstance(simulation, Joined):
         simulation.restore_pieces(folder.checkpoints.pieces(continued.checkpoint))
@@ -212,9 +212,9 @@ def _go_on(simulation: Simulation, folder: RunFolder, continued: Continuation, *
 def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more: bool) -> None:
     """Have a simulation write the problem of each step into a folder."""
     if not isinstance(simulation, Recorded):
-        raise OutputError(f"--record-problems: the simulator {scene.scene.simulator} has no problems to show")
+        raise OutputError(f"--record-problems: the simulator {scene.scene.simulator} has no problems to record")
     if any(solid.is_body for solid in scene.solid):
-        raise OutputError("--record-problems: the files have no place for the part of the matrix that rigid bodies add; take them out")
+        raise OutputError("--record-problems cannot be combined with rigid bodies, whose part of the matrix cannot be stored")
     simulation.record = ProblemFolder(folder, more=more).write
 
 
@@ -256,7 +256,7 @@ class RunLoop:
         self._checkpoint_time = clock.monotonic()
 
     def execute(self, last_frame: int | None, stop: Callable[[], bool | str], *, resumed: bool) -> Generator[RunLoop, None, RunRecord]:
-        """Run from frame to frame to the last, and write in run.json how that ended, whatever happened."""
+        """Run to the last frame and write the exit status into run.json."""
         count = self.time.frame_count
         last = count if last_frame is None else min(last_frame, count)
         start = self._frame()
@@ -270,7 +270,7 @@ class RunLoop:
                 try:
                     stopped = yield from self._advance(log, last, stop, resumed=resumed)
                 except GeneratorExit:  # nobody asks for more frames; the state is that of the last one
-                    stopped = f"left by its program after frame {self._frames_done()}"
+                    stopped = f"stopped by the program after frame {self._frames_done()}"
                 self._write_checkpoint(log)
             self.record.status = "stopped" if stopped else "finished"
             self.record.reason = stopped or f"frame {last} of {count} reached"
@@ -283,7 +283,7 @@ class RunLoop:
                 self._try_to(self._write_checkpoint)
         except OSError as error:
             full = "the disk is full: " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-            self._fail(f"{full}{error}; what was written before is intact")
+            self._fail(f"{full}{error}; files written before are intact")
         except Exception as error:  # it is raised again
             self._fail(str(error) if isinstance(error, RankFailed) else f"{type(error).__name__}: {error}")
             raise
@@ -403,7 +403,7 @@ class RunLoop:
         stable, number = stable_dt(self.simulation), self.simulation.step_count + 1
         if stable < self.time.dt_min and not self._below_dt_min:
             self._below_dt_min = True  # once is enough: the log's column cfl has the rest
-            self._warn(f"step {number}: the longest stable step is {stable:.3g} s, below time.dt_min; steps are longer than is stable")
+            self._warn(f"step {number}: the longest stable step is {stable:.3g} s, less than time.dt_min; steps may be unstable")
         dt, retries, values = take_step(self.simulation, stable, end, self.time)
         seconds = clock.perf_counter() - begun
         return {

@@ -58,7 +58,7 @@ class NoFolder(RunFolder):
             OutputError: there is no run to resume.
         """
         if resume:
-            raise OutputError("resume: a run without a folder has left nothing to resume from")
+            raise OutputError("resume: a run without a folder has no checkpoints")
         yield []
 
     def check_new(self, *, force: bool) -> None:
@@ -68,11 +68,11 @@ class NoFolder(RunFolder):
         """Do nothing."""
 
     def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None, table: str = "log") -> NoLog:
-        """Return what takes the rows."""
+        """Return a log that discards its rows."""
         return NoLog(columns)
 
     def frame_writer(self, watch: Stopwatch) -> FrameWriter:
-        """Return what takes the frames."""
+        """Return a frame writer that discards its frames."""
         return FrameWriter(NoFrames(), watch)
 
     def write_record(self, record: RunRecord) -> None:

@@ -16,7 +16,10 @@ README = "README.md"
 
 
 class ProblemError(InputError):
-    """The files do not make a problem, or the method does not take it; the message names the file or the option."""
+    """Invalid problem files, or a method that cannot solve the problem.
+
+    The message names the file or the option.
+    """
 
 
 class ProblemFolder:
@@ -42,7 +45,7 @@ class ProblemFolder:
             raise OutputError(f"--record-problems {folder}: {error}") from error
 
     def write(self, problem: Mapping[str, np.ndarray]) -> Path:
-        """Write a problem atomically; one of the same step, which was tried before, is replaced.
+        """Write a problem atomically; a problem of a retried step is replaced.
 
         Raises:
             OSError: the file cannot be written; the earlier ones are intact.

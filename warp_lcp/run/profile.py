@@ -1,4 +1,4 @@
-"""Where a run's time goes: seconds and bytes by stage."""
+"""Profile of a run: seconds and bytes by stage."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOADED = re.compile(r"Module .* took ([0-9.]+) ms")  # what Warp says of each
 
 @dataclass
 class Stage:
-    """What a stage took.
+    """Time and memory traffic of a stage.
 
     Args:
         beside: it ran on a thread of its own.
@@ -49,7 +49,9 @@ class Stage:
 
 
 class LoadedKernels:
-    """A logger for Warp that adds up the time kernels take to be compiled and loaded; what else Warp says goes where it went.
+    """Warp logger that adds up compile and load times of kernels.
+
+    Other messages are passed on.
 
     Attributes:
         loads: of modules.
@@ -82,7 +84,7 @@ class LoadedKernels:
 
 
 class Profile:
-    """Measure stages on a device, which is waited for at the begin and the end of each.
+    """Timer of stages; the device is synchronized at the begin and end of each.
 
     Args:
         device: a Warp device, such as `cuda:0`.
@@ -98,7 +100,7 @@ class Profile:
 
     @contextmanager
     def kernels_apart(self) -> Iterator[None]:
-        """Count the time that kernels take to be compiled and loaded as a stage of its own, not as that of the stage that needs them."""
+        """Count compile and load times of kernels as a stage of their own."""
         kernels = LoadedKernels()
         self.stages[KERNELS] = self._loads = kernels.loads
         with wp.ScopedLogger(kernels), wp.ScopedLogLevel(min(wp.config.log_level, wp.LOG_INFO)):

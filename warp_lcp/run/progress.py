@@ -1,4 +1,4 @@
-"""What a user sees of a run: a bar on a terminal, plain lines elsewhere."""
+"""Progress of a run: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Observer(Protocol):
 
 
 def time_left(progress: Progress) -> str:
-    """Return the wall time that a run still needs, at the rate of its recent past: a run grows slower when its liquid spreads.
+    """Return the estimated remaining wall time, at the recent rate.
 
     The first step, which loads kernels, does not count.
     """
@@ -126,7 +126,9 @@ class Bar:
 
 
 class Count:
-    """How many of a known number of things are done: a line that changes on a terminal, elsewhere a plain line every few seconds.
+    """Counter of finished items: a changing line on a terminal, else plain lines.
+
+    Plain lines come every few seconds.
 
     Args:
         console: where it is told.
@@ -181,7 +183,10 @@ def describe(row: Mapping[str, Value]) -> str:
 
 
 def residual_of(row: Mapping[str, Value]) -> float | None:
-    """Return what a step's solve left, in the unit of the scene's tolerance; None if there was no solve."""
+    """Return the residual of a step's solve; None without a solve.
+
+    In the unit of the scene's tolerance.
+    """
     found = next((row[name] for name in RESIDUALS if isinstance(row.get(name), float)), None)
     return found if isinstance(found, float) else None
 

@@ -1,4 +1,4 @@
-"""Frames that several ranks write: each its own pieces, and the first one the files that name them all."""
+"""Frames of several ranks: a piece per rank, and files that name all pieces."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ Pieces = dict[str, Piece]  # of a rank, by their parts' names
 
 
 class RankFrames:
-    """The frames of a run on several ranks: `frames/rank_0003/<name>_<index>.vtu` (or .vti), and `frames/<name>_<index>.pvtu` (.pvti).
+    """Frames of a run on several ranks.
+
+    `frames/rank_0003/<name>_<index>.vtu` (or .vti), and `frames/<name>_<index>.pvtu` (.pvti).
 
     Volumes are whole, on one rank, and stand beside those.
 
@@ -56,7 +58,7 @@ class RankFrames:
         self.whole.resume(times)
 
     def describe(self, frame: list[Part]) -> Pieces:
-        """Return what there is to say of the rank's pieces.
+        """Return the metadata of the rank's pieces.
 
         Raises:
             ValueError: a field has another length than its points or cells.
@@ -85,7 +87,9 @@ class RankFrames:
 
 
 class RankFrameWriter:
-    """A FrameWriter on each rank. Its methods are collective: what goes wrong with a rank's pieces is raised on all.
+    """Frame writer on each rank; errors of any rank are raised on all.
+
+    Its methods are collective.
 
     A frame is published, as a whole and in order, when all ranks have written their pieces.
 

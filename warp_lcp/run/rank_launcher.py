@@ -1,4 +1,4 @@
-"""The ranks of MPI as launchers of a command: they start alike, the root rank speaks, and they end alike."""
+"""Run a command on all ranks; the root prints; exit codes agree."""
 
 from __future__ import annotations
 
@@ -87,7 +87,10 @@ class RankLauncher(Launcher):
         return f"{size} rank{'s' if size > 1 else ''} ({device})"
 
     def run(self, request: RunRequest, *, observer: Observer, stop: Callable[[], bool | str], profile: Profile | None) -> RunRecord:
-        """Simulate a scene on all ranks, as `run_scene` does; if they end from inside MPI, run.json says so."""
+        """Simulate a scene on all ranks, as `run_scene` does.
+
+        If MPI aborts, run.json records it.
+        """
         self._folder = request.out
         return super().run(request, observer=observer, stop=stop, profile=profile)
 
@@ -121,7 +124,9 @@ class RankLauncher(Launcher):
 
 @contextmanager
 def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
-    """Give this process's part in what all ranks do; all but the root rank end silently, with its exit code.
+    """Run this process's part of a collective command.
+
+    All but the root rank end silently, with its exit code.
 
     Args:
         rank_timeout: seconds that one of them may keep the others waiting; 0: any.
@@ -139,8 +144,8 @@ def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
     started = next((os.environ[name] for name in SIZES if name in os.environ), "1")
     if started != "1" and ranks.size == 1:
         raise EngineError(
-            f"--engine petsc: {started} processes were started, but mpi4py knows only one: they are of different MPIs; use the mpiexec "
-            "of the MPI that mpi4py was built with, or the --mpi of srun that it knows"
+            f"--engine petsc: {started} processes were started, but mpi4py sees only one: the MPI libraries differ; use the mpiexec "
+            "of the MPI that mpi4py was built with, or the matching --mpi option of srun"
         )
     if ranks.size > 1:
         atexit.register(signal.alarm, PARTING)  # Python's threads have ended by then: the system's own clock ends what does not

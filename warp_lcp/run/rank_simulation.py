@@ -1,4 +1,4 @@
-"""A simulation that ranks share, as the run loop wants it: an error on one rank is one on all."""
+"""Simulation on ranks for the run loop: an error on one rank is raised on all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Corners = tuple[tuple[int, int, int], tuple[int, int, int]]
 
 
 class RankSimulation:
-    """A rank's part of a simulation as the run loop wants it: an error on one rank is one on all.
+    """A rank's part of a simulation: an error on one rank is raised on all.
 
     Args:
         simulation: of this rank, where the run begins or goes on.
@@ -45,7 +45,7 @@ class RankSimulation:
 
     @property
     def watch(self) -> Stopwatch:
-        """What the stages are measured with."""
+        """Profile of the stages."""
         return self._watch
 
     @watch.setter
@@ -97,7 +97,7 @@ class RankSimulation:
         return self._simulation.columns()
 
     def frame(self) -> list[Part]:
-        """Return this rank's pieces of a frame; cells know which part of the grid they are from."""
+        """Return this rank's pieces of a frame, with their place in the grid."""
         with self._collective.together():
             return [replace(part, box=part.box or self._box) if isinstance(part, Cells) else part for part in self._simulation.frame()]
 
@@ -112,7 +112,7 @@ class RankSimulation:
         self.time, self.step_count = self._simulation.time, self._simulation.step_count
 
     def notes(self) -> list[str]:
-        """Return what is worth a line at the start of a run."""
+        """Return remarks for the start of a run."""
         return self._simulation.notes()
 
     @cached_property

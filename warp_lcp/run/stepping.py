@@ -26,7 +26,9 @@ def stable_dt(simulation: Simulation) -> float:
 
 
 def plan_dt(stable: float, remaining: float, time: Time, events: Sequence[float] = ()) -> float:
-    """Return the next step [s]: within the scene's bounds, ending on the frame's time, never leaving a sliver before it.
+    """Return the next time step [s], within the scene's bounds.
+
+    It ends on the frame's time and never leaves a sliver before it.
 
     It depends on nothing but the state, so a run that was interrupted takes the same steps. The last two steps before a frame or an event
     are equal; they may be shorter than dt_min. Steps run across events that are closer than SHARE dt to now or to the frame, and of several
@@ -47,7 +49,9 @@ def plan_dt(stable: float, remaining: float, time: Time, events: Sequence[float]
 
 
 def take_step(simulation: Simulation, stable: float, end: float, time: Time) -> tuple[float, int, dict[str, Value]]:
-    """Take a step, or a shorter one where it fails; return its length [s], how often it was halved and what the log gets.
+    """Take a step, with half its length if it fails.
+
+    Returns its length [s], the number of halvings and the log columns.
 
     Args:
         simulation: that takes it.

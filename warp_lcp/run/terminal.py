@@ -1,4 +1,4 @@
-"""Where the command line writes: what others wrote is made harmless, and a terminal that is gone is no error."""
+"""Terminal output: escaped text, and no error if the terminal is gone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Refusal: Any = typer.BadParameter.__mro__[2]  # click's ClickException, which ne
 
 
 class Terminal(Console):
-    """A console whose own colors and bars reach the terminal, and no control character of the text that it is given."""
+    """Console that prints colors and bars but no control characters of its text."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -37,7 +37,7 @@ class Commands(TyperGroup):
     """The commands; wrong usage is told as everything else is."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse control characters, which no name needs and which a message cannot show within its line."""
+        """Refuse control characters in arguments."""
         for before, argument in zip(["", *args], args, strict=False):
             if before != FREE_TEXT and not argument.startswith(f"{FREE_TEXT}=") and any(c < " " or c == "\x7f" for c in argument):
                 raise typer.BadParameter(f"{one_line(argument)}: holds control characters; choose another name", ctx)
@@ -59,7 +59,7 @@ class Commands(TyperGroup):
             raise
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; an interruption or a cache that cannot be written ends it with exit code 1."""
+        """Run a command; interruptions and an unusable cache end with exit code 1."""
         try:
             return super().invoke(ctx)
         except Refusal as error:
@@ -71,19 +71,19 @@ class Commands(TyperGroup):
 
 
 def say(console: Console, text: str) -> None:
-    """Write a text to a console, without markup; a terminal that was closed is no error."""
+    """Print a text to a console, without markup; a closed terminal is no error."""
     with suppress(OSError):
         console.print(visible(text), markup=False, highlight=False, soft_wrap=True)
 
 
 def tell(text: object, *, error: bool = False) -> None:
-    """Write a text of one or more lines to the output, or to the error stream; a stream that nobody reads any more is no error."""
+    """Print lines to the output or the error stream; a closed stream is no error."""
     with suppress(BrokenPipeError):
         typer.echo(visible(str(text)), err=error)
 
 
 def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]], *, left: Iterable[int] = (0,)) -> str:
-    """Return a table as text, in columns as wide as their cells; those of `left` begin at their left sides."""
+    """Return a table as text with aligned columns; those of `left` are left-aligned."""
     table = Table(*(Column(name, justify="left" if i in left else "right") for i, name in enumerate(header)), box=None, pad_edge=False)
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))

@@ -1,4 +1,4 @@
-"""A run's first frames without its folder: seconds of its steps, and what there was to see, how near it is to that of a reference."""
+"""Time the first frames of a run and compare them with a reference run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BIN = 2.0  # cells: the edge of the boxes that densities are compared in, so tha
 
 @dataclass(frozen=True)
 class Look:
-    """What there is to see at a time.
+    """Mass distribution, energy and front of the material at one time.
 
     Attributes:
         time: [s].
@@ -45,7 +45,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Trial:
-    """What a run's first frames took and showed.
+    """Time and results of the first frames of a run.
 
     Attributes:
         seconds: of the steps, frames not counted. On the CPU those of the process, which other programs disturb least.
@@ -75,7 +75,9 @@ class Trial:
         return None if self.volume is None or self.volume[0] == 0.0 else self.volume[1] / self.volume[0] - 1.0
 
     def distance(self, reference: Trial) -> float:
-        """Return the share of the mass that is elsewhere than in a reference run, the mean over the looks: 0 alike, 1 all of it.
+        """Return the displaced fraction of the mass relative to a reference run.
+
+        The mean over the looks: 0 equal, 1 all of it.
 
         Raises:
             ValueError: the two were not looked at alike.
@@ -83,19 +85,19 @@ class Trial:
         shares = []
         for own, other in zip(self.looks[1:], reference.looks[1:], strict=True):
             if own.mass.shape != other.mass.shape or abs(own.time - other.time) > SAME_TIME:
-                raise ValueError("the two runs were looked at in other boxes or at other times")
+                raise ValueError("the two runs were sampled in different boxes or at different times")
             total = float(other.mass.sum())
             shares.append(0.5 * float(np.abs(own.mass - other.mass).sum()) / total if total > 0.0 else 0.0)
         return float(np.mean(shares))
 
     def energy_error(self, reference: Trial) -> float:
-        """Return the largest difference from a reference's energy, relative to the largest that the reference had."""
+        """Return the largest energy difference over the reference's largest energy."""
         scale = max(abs(look.energy) for look in reference.looks)
         differences = [abs(a.energy - b.energy) for a, b in zip(self.looks, reference.looks, strict=True)]
         return max(differences) / scale if scale > 0.0 else 0.0
 
     def volume_error(self, reference: Trial) -> float:
-        """Return the difference from a reference in the growth of the volume, or in how densely sand was packed; 0 if not known."""
+        """Return the difference of volume growth or packing to a reference; 0: unknown."""
         for own, other in ((self.volume_drift, reference.volume_drift), (self.packing, reference.packing)):
             if own is not None and other is not None:
                 return abs(own - other)
@@ -107,7 +109,7 @@ class Trial:
 
 
 def look_times(scene: Scene, frames: int) -> list[float]:
-    """Return the frames' times [s] that are looked at, the last of `frames` among them."""
+    """Return the times [s] of the compared frames, the last of `frames` among them."""
     last = min(frames, scene.time.frame_count)
     every = max(1, -(-last // LOOKS))
     return [scene.time.frame_time(n) for n in range(last, 0, -every)][::-1]
@@ -183,7 +185,7 @@ class _Trial:
     def _points(self) -> np.ndarray:
         points = next((part.points for part in self.simulation.frame() if isinstance(part, Points)), None)
         if points is None:
-            raise SceneError(self.scene.scene.name, [KeyFault("scene.simulator", "shows no particles, which runs are compared by")])
+            raise SceneError(self.scene.scene.name, [KeyFault("scene.simulator", "has no particles, which the comparison of runs needs")])
         return points
 
     def _penetration(self) -> float | None:
@@ -203,7 +205,9 @@ class _Trial:
 
 
 def spread(points: np.ndarray, size: Sequence[float], box: float) -> np.ndarray:
-    """Return the share of the points in each box of a grid, spread by tents as wide as two boxes.
+    """Return the fraction of the points in each box of a grid, by tent weights.
+
+    The tents are as wide as two boxes.
 
     Args:
         points: [m], shape (n, dimension).
@@ -239,11 +243,13 @@ class Differences:
     volume: float
 
     def miss(self, own: Trial, reference: Trial) -> float:
-        """Return how many times its bound a run's larger difference is: at most 1 within both."""
+        """Return the larger ratio of a difference to its bound: at most 1 within both."""
         return max(own.distance(reference) / self.distance, own.volume_error(reference) / self.volume)
 
     def beside(self, noise: Differences) -> Differences:
-        """Return the bounds of what is measured where a difference and a noise, which know nothing of each other, add up.
+        """Return the bounds for a difference plus an independent noise.
+
+        Both add in quadrature.
 
         Their squares do: a run that lies a bound from the mean of runs as good as the reference lies so far from one of them.
         """
@@ -251,7 +257,7 @@ class Differences:
 
 
 def spread_of(references: Sequence[Trial]) -> Differences:
-    """Return the largest differences between runs that are as good as each other, 0 of a single one.
+    """Return the largest differences between equally accurate runs; 0 for one run.
 
     Nothing can be shown to be nearer to one of them.
     """
@@ -261,7 +267,9 @@ def spread_of(references: Sequence[Trial]) -> Differences:
 
 
 def step_seconds(scene: Scene, *, device: str) -> tuple[float, int]:
-    """Return how long a step takes [s], as the median of a run's first ones but the very first, and of how many.
+    """Return the median time of a step [s] and the number of steps.
+
+    Of the first steps except the very first.
 
     They are those of a run: a step that fails is tried again with a shorter dt, and none follows the last frame's but the second.
     Later steps depend on where the liquid goes. Measured on a CPU for dam-break-2d, dam-break, mesh-obstacle and splash-in-circle:

@@ -1,4 +1,7 @@
-"""The fastest settings for an accuracy: measured on a scene's own first frames, on the device that is to run it."""
+"""Find the fastest settings for an accuracy by trial runs of the first frames.
+
+On the device that will run the scene.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ class Candidate:
 
 @dataclass
 class Tuning:
-    """What a tuning found.
+    """Result of a tuning.
 
     Attributes:
         scene: with the settings chosen.
@@ -75,15 +78,15 @@ class Tuning:
 
     @property
     def met(self) -> bool:
-        """Return whether the settings chosen are as near as the accuracy asks, or as can be told."""
+        """Return whether the chosen settings meet the accuracy, or the noise limit."""
         return self.limit <= 1.0
 
     def near_enough(self, own: Trial) -> bool:
-        """Return whether another run is as near to the reference as those that the fastest was chosen of."""
+        """Return whether another run is within the bounds of the chosen one."""
         return self.bounds.miss(own, self.reference) <= self.limit
 
     def verdict(self, accuracy: str) -> list[str]:
-        """Return in words what is the fastest, whether it keeps the accuracy, and where not, by how much, why, and what would help."""
+        """Return the result in words: settings, accuracy, missed bounds and a remedy."""
         best, asked, volume = self.chosen, self.preset, self.chosen.trial.volume_error(self.reference)
         words = f"{best.words()}: {best.seconds:.3g} s"
         found = f"distance {best.distance:.4f} (at most {asked.distance:g}), volume or packing {volume:.3f} (at most {asked.volume:g})"
@@ -91,15 +94,15 @@ class Tuning:
             return [f"{accuracy}: {words}", found]
         differences = (("distance", best.distance, asked.distance), ("volume or packing", volume, asked.volume))
         missed = ", ".join(f"{name} by a factor of {own / most:.2g}" for name, own, most in differences if own > most)
-        unsure = f"runs as good as the reference differ by {self.noise.distance:.4f} and {self.noise.volume:.3f}"
+        unsure = f"runs as accurate as the reference differ by {self.noise.distance:.4f} and {self.noise.volume:.3f}"
         if self.met:
             return [
-                f"as near as can be told, not {accuracy}: {words}",
+                f"within the noise of the reference, but not {accuracy}: {words}",
                 found,
-                f"bounds missed: {missed}; but {unsure}: nothing can be shown to be nearer",
-                "whatever their settings, runs drift so far apart in these frames: fewer --frames tell what holds before",
+                f"bounds missed: {missed}; but {unsure}: smaller errors cannot be measured",
+                "runs diverge this far with any settings in these frames: use fewer --frames to compare earlier times",
             ]
-        return [f"the nearest that was tried, not {accuracy}: {words}", found, f"bounds missed: {missed}; {unsure}", self._remedy()]
+        return [f"nearest of the settings tried, but not {accuracy}: {words}", found, f"bounds missed: {missed}; {unsure}", self._remedy()]
 
     def _remedy(self) -> str:
         """Return what would help, by what shorter steps brought at the fine end of those tried."""
@@ -110,10 +113,10 @@ class Tuning:
         next_one = max(coarser, key=lambda c: c.trial.steps)
         times, nearer = finest.trial.steps / next_one.trial.steps, finest.distance / next_one.distance
         if nearer * TWICE <= 1.0:
-            return "the distance falls with the steps: shorter ones than those tried would help"
+            return "the distance decreases with the step: shorter steps than those tried would help"
         return (
-            f"{times:.2g} times as many steps left {100.0 * nearer:.0f} % of the distance, where the error of a step's length would leave "
-            "half or less: a higher domain.resolution would help, shorter steps hardly"
+            f"{times:.2g} times as many steps left {100.0 * nearer:.0f} % of the distance; if the step were the cause, it would be "
+            "half or less: increase domain.resolution instead"
         )
 
     def rows(self) -> list[tuple[str, ...]]:
@@ -173,7 +176,7 @@ def write_tuned(path: Path, tuning: Tuning, accuracy: str, device: str) -> None:
     head = [
         f"# Tuned for {accuracy} accuracy on {device}:",
         *(f"# {line}" for line in tuning.verdict(accuracy)),
-        f"# What was measured on {tuning.frames} frames:",
+        f"# Measured on {tuning.frames} frames:",
         *(f"#   {', '.join(row)}" for row in tuning.rows()),
     ]
     write_text(path, "\n".join(head) + "\n" + dump_scene(tuning.scene).removeprefix(HEADER))
@@ -238,7 +241,7 @@ class _Search:
 
     def _noise(self) -> Differences:
         """Return what runs as good as the reference differ by."""
-        self.say("nothing is within the bounds; how sure is the reference?")
+        self.say("no settings are within the bounds; measuring how accurate the reference is")
         references = [self.reference]
         for part in TWINS:
             try:
@@ -247,7 +250,7 @@ class _Search:
                 self.failed.append(f"reference with {part:g} times its steps: {error}")
                 self.say(self.failed[-1])
         noise = spread_of(references)
-        self.say(f"runs as good as it: distance {noise.distance:.4f}, volume or packing {noise.volume:.3f}")
+        self.say(f"equally accurate runs differ by: distance {noise.distance:.4f}, volume or packing {noise.volume:.3f}")
         return noise
 
     def _miss(self, candidate: Candidate) -> float:

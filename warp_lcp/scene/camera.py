@@ -1,4 +1,4 @@
-"""Where the images of a run are seen from: the table [camera] of a scene, and the pinhole camera that it makes."""
+"""Table [camera] of a scene, and the pinhole camera of images."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Camera(Table):
     high: Vector | None = Field(default=None, alias="max", description="upper corner of the image [m], 2-D; default: the domain's")
 
     def complaints(self, dimension: int, size: list[float]) -> list[Complaint]:
-        """Return what is wrong with the camera in a domain of two or three sides [m]."""
+        """Return errors of the camera in a domain of two or three sides [m]."""
         wrong, right = (ROOM_KEYS, WINDOW_KEYS) if dimension == 2 else (WINDOW_KEYS, ROOM_KEYS)
         found = []
         for key in wrong:
             if getattr(self, key) is not None:
                 allowed = ", ".join(type(self).model_fields[name].alias or name for name in right)
-                message = f"is of no use in a scene of {dimension} dimensions; it may have {allowed}"
+                message = f"cannot be used in {dimension}-D; allowed are {allowed}"
                 found.append(Complaint((type(self).model_fields[key].alias or key,), getattr(self, key), message))
         for key in right:
             value = getattr(self, key)
@@ -95,7 +95,10 @@ class Viewpoint:
 
     @property
     def axes(self) -> np.ndarray:
-        """Return unit vectors to the image's right, up, and into the scene, as rows, shape (3, 3)."""
+        """Return the image's unit vectors (right, up, into the scene), shape (3, 3).
+
+        As rows.
+        """
         forward = (self.focus - self.position) / np.linalg.norm(self.focus - self.position)
         right = np.cross(forward, self.up)
         right /= np.linalg.norm(right)
@@ -103,7 +106,10 @@ class Viewpoint:
 
 
 def viewpoint(scene: Scene, aspect: float) -> Viewpoint:
-    """Return where images of this aspect are seen from: as the scene's [camera] says, or from as near as shows all of the domain."""
+    """Return the viewpoint of images with a given aspect.
+
+    Of the scene's [camera], else the nearest one that shows the whole domain.
+    """
     camera = scene.camera
     low, high = scene.seen
     if scene.dimension == 2:

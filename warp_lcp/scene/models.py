@@ -1,4 +1,4 @@
-"""The models that a scene turns on: why each is there, and what it adds to memory and to a step, from a list of measured prices."""
+"""Models of a scene, with the reason and the measured cost of each."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Price:
-    """What a model adds, measured on one processor core.
+    """Cost of a model, measured on one processor core.
 
     Args:
         fixed_seconds: of a step, however small the scene [s]: launches and what the host does.
@@ -47,23 +47,26 @@ class Price:
     particle_bytes: float = 0.0
 
     def seconds(self, cells: int, particles: int) -> float:
-        """Return what it adds to a step [s]."""
+        """Return the cost per step [s]."""
         return self.fixed_seconds + self.cell_seconds * cells + self.particle_seconds * particles
 
     def bytes(self, cells: int, particles: int) -> int:
-        """Return what it adds to memory."""
+        """Return the cost in memory [bytes]."""
         return max(round(self.cell_bytes * cells + self.particle_bytes * particles), 0)
 
 
 @cache
 def prices(simulator: str, dimension: int) -> Mapping[str, Price]:
-    """Return what models cost by name, `base` among them: what every scene of a simulator has; empty where nothing was measured."""
+    """Return the costs of models by name; `base`: what every scene has.
+
+    Empty if nothing was measured.
+    """
     read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
     return {name: Price(**price) for name, price in read.get(simulator, {}).get(f"{dimension}d", {}).items()}
 
 
 def predicted_seconds(models: Iterable[Model], listed: Mapping[str, Price], cells: int, particles: int) -> float:
-    """Return how long a step takes by the list of prices [s]; 0: not known."""
+    """Return the estimated time of a step from the cost table [s]; 0: unknown."""
     counts = {"base": 1, **{model.name: model.count for model in models if model.built}}
     return sum(n * listed[name].seconds(cells, particles) for name, n in counts.items() if name in listed) if "base" in listed else 0.0
 
@@ -71,7 +74,9 @@ def predicted_seconds(models: Iterable[Model], listed: Mapping[str, Price], cell
 def model_lines(
     models: Sequence[Model], listed: Mapping[str, Price], cells: int, particles: int, *, memory: int, measured: float | None = None
 ) -> list[tuple[str, str]]:
-    """Return a line for each model, as pairs of a word and a line: why it is there, its share of memory and of a step.
+    """Return a line per model: reason, share of memory and of a step.
+
+    As pairs of a word and a line.
 
     Args:
         models: of a scene.
@@ -94,6 +99,6 @@ def model_lines(
             text += f"; {share:.0f} % of memory, {1e3 * scale * seconds:.2g} ms a step ({part:.0f} %)"
         lines.append(("model" if model.built else "not built", text))
     if predicted > 0.0:
-        where = "here" if measured is not None else "by the list of prices, on one core"
+        where = "here" if measured is not None else "by the cost table, on one core"
         lines.append(("step", f"about {1e3 * scale * predicted:.3g} ms {where}, all models together"))
     return lines

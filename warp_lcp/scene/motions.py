@@ -20,7 +20,10 @@ AXIS = "direction of the axis, 3-D only"
 
 
 class PrescribedMotion(Table):
-    """A motion that is a function of time alone, relative to the shape as it is placed, in the domain's coordinates."""
+    """Motion given as a function of time, relative to the placed shape.
+
+    In the domain's coordinates.
+    """
 
     @abstractmethod
     def to_motion(self, dimension: int) -> motion.Motion:
@@ -34,7 +37,7 @@ class PrescribedMotion(Table):
         """
 
     def complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the motion in a scene of 2 or 3 dimensions."""
+        """Return errors of the motion in a scene of 2 or 3 dimensions."""
         found = self._size_complaints(dimension)
         if found:
             return found

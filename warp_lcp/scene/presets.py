@@ -1,4 +1,4 @@
-"""`[solver] preset`: settings that trade speed for accuracy together, in the table `presets.toml`, filled in where a scene says nothing."""
+"""`[solver] preset`: defaults that trade speed for accuracy, from `presets.toml`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Settings = Mapping[str, Any]  # by "section.key", such as time.cfl
 
 @dataclass(frozen=True)
 class Preset:
-    """What a preset stands for.
+    """Accuracy and settings of a preset.
 
     Attributes:
         distance: the largest share of the mass that may be elsewhere than in the simulator's reference run.
@@ -64,7 +64,9 @@ def price_table() -> Mapping[str, Prices]:
 
 
 def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a scene's raw data with what its preset says; what the data say stays. Wrong data are for the validation to refuse.
+    """Return a scene's raw data with the defaults of its preset.
+
+    Keys in the data are kept; wrong data are left to the validation.
 
     Args:
         model: the scene's class, which knows which tables turn a model on.
@@ -84,13 +86,16 @@ def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def preset_values(scene: Scene, table: str) -> dict[str, Any]:
-    """Return what a scene's preset says of a table; nothing where there is no preset."""
+    """Return the values of a scene's preset for a table; empty without a preset."""
     prices, name = price_table().get(scene.scene.simulator), scene.solver.preset
     return _nested(prices.presets[name].settings).get(table, {}) if prices is not None and name is not None else {}
 
 
 def preset_line(scene: Scene) -> str | None:
-    """Return what a scene has from its preset and what is its own, for the plan; None: it has no preset."""
+    """Return a line with the values of the preset and those of the scene.
+
+    For the plan; None without a preset.
+    """
     name = scene.solver.preset
     prices = price_table().get(scene.scene.simulator)
     if name is None or prices is None:
@@ -103,14 +108,16 @@ def preset_line(scene: Scene) -> str | None:
 
 
 def value_of(scene: Scene, key: str) -> Any:
-    """Return what a scene has at `section.key`; None: the section is off."""
+    """Return the value at `section.key` of a scene; None if the section is off."""
     table, _, name = key.partition(".")
     found = getattr(scene, table)
     return None if found is None else getattr(found, name)
 
 
 def changed(scene: SceneT, settings: Settings) -> SceneT:
-    """Return a scene with other values at `section.key`; those of models that are off are left out.
+    """Return a scene with other values at `section.key`.
+
+    Those of models that are off are left out.
 
     Raises:
         pydantic.ValidationError: the scene does not take them.

@@ -1,4 +1,4 @@
-"""Old names of scene keys: read with a warning, rewritten by `warp-lcp check --fix`."""
+"""Old names of scene keys: read with a warning, replaced by `check --fix`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ def rename_keys(tables: MutableMapping[str, Any], model: type[Table], source: st
 
 
 def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]]:
-    """Return a scene file's text with today's names of its keys, and the renamed keys; all else stays as it is.
+    """Return a scene file's text with current key names, and the renamed keys.
+
+    The rest of the text is unchanged.
 
     Args:
         text: of a valid TOML file.

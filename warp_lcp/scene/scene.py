@@ -1,4 +1,7 @@
-"""What every scene has, whatever it is made of. Simulators subclass `Scene` with their materials and models."""
+"""Base class of scenes: tables that every scene has.
+
+Simulators subclass `Scene` with their materials and models.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ def _name(text: str) -> str:
 
 
 def file_name(text: str) -> str:
-    """Return a text as a name that `scene.name` may be, "scene" if nothing is left of it."""
+    """Return a text as a valid `scene.name`; "scene" if nothing is left of it."""
     kept = "".join(c if c.isalnum() or c in "-_. " else "-" for c in normalize("NFC", text))[:LONGEST_NAME].strip(". ")
     return kept or "scene"
 
@@ -85,18 +88,24 @@ class Time(Table):
         return max(1, math.ceil(self.duration * self.frames_per_second * (1.0 - 1e-9)))
 
     def frame_time(self, frame: int) -> float:
-        """Return the time [s] of a frame. The last one is the end of the run, be that a multiple of the frame interval or not."""
+        """Return the time [s] of a frame.
+
+        The last one is the end of the run, whether or not that is a multiple of the frame interval.
+        """
         return min(frame / self.frames_per_second, self.duration)
 
 
 class Domain(Table):
-    """[domain]: a box from the origin, and its grid. With `spacing`, the domain has no far ends: right, top and front are open."""
+    """[domain]: a box from the origin, and its grid.
+
+    With `spacing` the domain is unbounded: right, top and front are open.
+    """
 
     later: ClassVar = {"periodic": frozenset({True})}
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
     size: list[Positive] = Field(min_length=2, max_length=3, description="sides [m], [x, y] or [x, y, z]; omitted with spacing")
     resolution: int = Field(ge=2, le=MOST_CELLS, description="cells along the longest side; omitted with spacing")
-    spacing: Positive | None = Field(default=None, description="cell size [m] of a domain without far ends, instead of size and resolution")
+    spacing: Positive | None = Field(default=None, description="cell size [m] of an unbounded domain, instead of size and resolution")
     dimension: Literal[2, 3] | None = Field(default=None, description="number of axes, with spacing; default: 3")
     wall: Wall = Field(default="separating", description="boundary condition on the domain's walls")
     solids: Literal["cut-cell", "voxel"] = Field(
@@ -122,13 +131,15 @@ class Domain(Table):
         return self.spacing is not None
 
     def spacing_complaints(self) -> list[Complaint]:
-        """Return what stands against `spacing` and `dimension`."""
+        """Return errors of `spacing` and `dimension`."""
         place, axes = ("domain", "spacing"), int(self.dimension or 0)
         if self.spacing is None:
-            return [Complaint(("domain", "dimension"), axes, "is of a domain with spacing; size says it otherwise")] if axes else []
+            return [Complaint(("domain", "dimension"), axes, "is only for a domain with spacing; otherwise size gives it")] if axes else []
         if (self.size, self.resolution) != ([MOST_CELLS * self.spacing] * axes, MOST_CELLS):
-            return [Complaint(place, self.spacing, "stands instead of size and resolution: leave these out, or it")]
-        return [] if self.follow else [Complaint(("domain", "follow"), False, "must be true with spacing: no grid covers such a domain")]
+            return [Complaint(place, self.spacing, "replaces size and resolution: give either spacing or these")]
+        return (
+            [] if self.follow else [Complaint(("domain", "follow"), False, "must be true with spacing: no grid covers an unbounded domain")]
+        )
 
 
 class Physics(Table):
@@ -170,7 +181,10 @@ class Output(Table):
 
 
 class Scene(Table):
-    """A scene file, read and checked. SI units; y is up; a domain of two sides is the x-y plane."""
+    """Scene file, read and validated.
+
+    SI units; y is up; a domain of two sides is the x-y plane.
+    """
 
     elsewhere: ClassVar = dict.fromkeys(("sand", "material", "friction", "gauge"), "granular")
     palette: ClassVar[Literal["water", "sand"]] = "water"  # of its images
@@ -218,7 +232,10 @@ class Scene(Table):
 
     @property
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low and the high corner [m] of what pictures show: the domain, without far ends what shapes reach over, shape (3,)."""
+        """Return the low and high corner [m] of the region in pictures, shape (3,).
+
+        The domain; if unbounded, the region of the shapes.
+        """
         size = np.array([*self.domain.size, 0.0][:3])
         boxes = [shape.bounds(self.dimension) for _, shape in self.shapes()] if self.domain.boundless else []
         near = [np.clip(box, 0.0, size) for box in boxes if box is not None]
@@ -239,11 +256,17 @@ class Scene(Table):
         return ()
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
-        """Return the key of the material's shapes in the file, such as `liquid`, and the shapes; bodies alone have none."""
+        """Return the key of the material's shapes, such as `liquid`, and the shapes.
+
+        Empty for bodies alone.
+        """
         return "material", ()
 
     def joints(self) -> Sequence[Joint]:
-        """Return the joints between rigid bodies, which are numbered from 0 in the order of their solids."""
+        """Return the joints between rigid bodies.
+
+        Bodies are numbered from 0 in the order of their solids.
+        """
         return ()
 
     def body_frictions(self) -> list[float]:
@@ -252,7 +275,10 @@ class Scene(Table):
         return [STICKS if friction == "stick" else float(friction) for friction in given]
 
     def complaints(self) -> list[Complaint]:
-        """Return what is wrong across keys. Subclasses add theirs to `super().complaints()`."""
+        """Return errors that involve several keys.
+
+        Subclasses add theirs to `super().complaints()`.
+        """
         found = self._grid_complaints()
         if len(self.physics.gravity) != self.dimension:
             message = f"must have {self.dimension} entries, as domain.size has"
@@ -266,7 +292,7 @@ class Scene(Table):
         return found + self._outside_complaints()
 
     def shape_complaints(self, key: str, shapes: Sequence[Shape], *, inside: bool = False) -> list[Complaint]:
-        """Return what is wrong with an array of shapes.
+        """Return errors of an array of shapes.
 
         Args:
             key: the array's name in the file, such as `liquid`.
@@ -277,12 +303,15 @@ class Scene(Table):
         for index, shape in enumerate(shapes):
             own = shape.complaints(self.dimension)
             if inside and not own and self.enclosed_volume(shape) == 0.0:
-                own = [Complaint((), None, f"lies outside the domain, which reaches from the origin to {self.domain.size} m")]
+                own = [Complaint((), None, f"lies outside the domain, which extends from the origin to {self.domain.size} m")]
             found += [Complaint((key, index, *complaint.place), complaint.value, complaint.message) for complaint in own]
         return found
 
     def enclosed_volume(self, shape: Shape) -> float:
-        """Return an upper bound of a shape's volume in the domain [m^3; m^2 in 2-D]: that of the box around it."""
+        """Return an upper bound of a shape's volume in the domain [m^3; m^2 in 2-D].
+
+        The volume of its bounding box.
+        """
         size = np.array(self.domain.size)
         bounds = shape.bounds(self.dimension)
         if bounds is None:
@@ -298,28 +327,40 @@ class Scene(Table):
                     yield f"{key}[{index}]", entry
 
     def notes(self) -> list[str]:
-        """Return settings that look like mistakes, a line each, for the start of a run. Subclasses add those of their tables."""
+        """Return suspicious settings, a line each, for the start of a run.
+
+        Subclasses add those of their tables.
+        """
         found = []
         for place, shape in self.shapes():
             turned = shape.turned_out(self.domain.size)
             if turned is not None and turned[0] > STRAY * self.spacing:
                 center = [float(f"{coordinate:.6g}") for coordinate in turned[1]]
                 found.append(
-                    f"{place} ({shape.shape}): rotate turns it about the origin, {turned[0]:.4g} m out of the domain; about its center it "
-                    f"turns with about = {center}"
+                    f"{place} ({shape.shape}): rotate about the origin moves it {turned[0]:.4g} m out of the domain; to rotate it "
+                    f"about its center, set about = {center}"
                 )
         return [*found, *scene_notes(self)]
 
     def memory_parts(self) -> dict[str, int]:
-        """Return about how much memory each part of a run takes on its device [bytes]. Subclasses that know it say so."""
+        """Return the estimated memory of each part of a run on its device [bytes].
+
+        Defined by subclasses.
+        """
         return {}
 
     def memory_estimate(self) -> int:
-        """Return about how much memory a run takes at most [bytes], without the program itself; 0: not known."""
+        """Return the estimated peak memory of a run [bytes]; 0: unknown.
+
+        Without the program itself.
+        """
         return sum(self.memory_parts().values())
 
     def plan(self) -> list[tuple[str, str]]:
-        """Return what a run would do, as pairs of a word and a line. Subclasses append theirs, such as particles and memory."""
+        """Return a summary of the run, as pairs of a word and a line.
+
+        Subclasses append theirs, such as particles and memory.
+        """
         cells, spacing = self.cell_counts[: self.dimension], f"{self.spacing:.6g} m"
         extent = f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {spacing}"
         moving = ", ".join(f"solid {index} {solid.motion.kind}" for index, solid in enumerate(self.solid) if solid.motion)
@@ -327,7 +368,7 @@ class Scene(Table):
         preset = preset_line(self)
         return [
             *([("preset", preset)] if preset else []),
-            ("grid", f"no far ends, cells of {spacing}, at most {MOST_CELLS} along an axis" if self.domain.boundless else extent),
+            ("grid", f"unbounded, cells of {spacing}, at most {MOST_CELLS} along an axis" if self.domain.boundless else extent),
             ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
             *([("open", ", ".join(self.domain.open))] if self.domain.open else []),
             *([("moving", moving)] if moving else []),
@@ -349,7 +390,7 @@ class Scene(Table):
     def _outside_complaints(self) -> list[Complaint]:
         """Return which rigid bodies lie wholly outside the domain, as far as their keys tell."""
         return [
-            Complaint(("solid", index), None, f"lies outside the domain, which reaches from the origin to {self.domain.size} m")
+            Complaint(("solid", index), None, f"lies outside the domain, which extends from the origin to {self.domain.size} m")
             for index, solid in enumerate(self.solid)
             if solid.is_body and not solid.complaints(self.dimension) and self.enclosed_volume(solid) == 0.0
         ]

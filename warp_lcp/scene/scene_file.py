@@ -1,4 +1,4 @@
-"""Read a scene by its name or path, apply overrides, and write a scene back as it was resolved."""
+"""Read a scene by name or path, apply overrides, and write the resolved scene."""
 
 from __future__ import annotations
 
@@ -47,12 +47,14 @@ def installed_simulators() -> dict[str, Simulator]:
     try:
         return simulators()
     except (AttributeError, ImportError, TypeError) as error:
-        problem = KeyFault("", f"a simulator cannot be loaded: {error}; `warp-lcp info` tells whether another package has its name")
+        problem = KeyFault("", f"a simulator cannot be loaded: {error}; `warp-lcp info` shows whether another package has its name")
         raise SceneError("warp-lcp", [problem]) from error
 
 
 def load_scene(source: SceneSource, overrides: Sequence[str] = ()) -> Scene:
-    """Return a scene, checked, with absolute paths: the class is the `scene_model` of its simulator.
+    """Return a validated scene with absolute paths.
+
+    Its class is the `scene_model` of its simulator.
 
     Args:
         source: a TOML file, the name of a built-in scene, tables as such a file has them, or a scene.
@@ -112,7 +114,9 @@ def override_value(override: str) -> str:
 
 
 def scene_value(source: SceneSource, override: str) -> str:
-    """Return the value that a scene's file has where an override sets one, in words; `null` if there is none.
+    """Return the value of an overridden key in the scene file, in words.
+
+    `null` if there is none.
 
     Raises:
         SceneError: the file cannot be read.
@@ -127,7 +131,7 @@ def scene_value(source: SceneSource, override: str) -> str:
 
 
 def single_tables(source: SceneSource) -> dict[str, set[str]]:
-    """Return the keys of each table of which a scene of its simulator has one at most, such as `domain`.
+    """Return the keys of each table that a scene has at most once, such as `domain`.
 
     Raises:
         SceneError: the file cannot be read, or names no simulator.
@@ -142,14 +146,16 @@ def single_tables(source: SceneSource) -> dict[str, set[str]]:
 
 
 def fix_file(source: str) -> list[str]:
-    """Replace old names of keys in a scene file; return a line for each, such as "material.angle_of is now ...".
+    """Replace old key names in a scene file; return a line for each.
+
+    Such as "material.angle_of is now ...".
 
     Raises:
         SceneError: the source is no file, cannot be read, or cannot be rewritten.
     """
     file = Path(source)
     if not file.is_file() or source in built_in_scenes():
-        raise SceneError(source, [KeyFault("", "--fix rewrites scene files: this is none")])
+        raise SceneError(source, [KeyFault("", "--fix needs a scene file")])
     model = _scene_model(_parse(file, source), source)
     text, renamed = fix_text(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"), model, source)
     if renamed:
@@ -179,7 +185,7 @@ def dump_scene(scene: Scene) -> str:
 
 
 def keys(scene: Scene) -> dict[str, Any]:
-    """Return every key of a scene with its value, such as `time.cfl` or `liquid[0].max`."""
+    """Return all keys of a scene with values, such as `time.cfl` or `liquid[0].max`."""
     return table_keys(scene.model_dump(by_alias=True, exclude_none=True))
 
 
@@ -252,7 +258,7 @@ def _refuse_extremes(data: dict[str, Any], source: str) -> None:
         if isinstance(value, dict):
             waiting += [(f"{path}.{key}", entry, depth + 1) for key, entry in value.items()]
         elif isinstance(value, list) and len(value) > MOST_TABLES and isinstance(value[0], dict):
-            message = f"has {len(value):,} entries, of which a scene may have {MOST_TABLES:,}; a mesh holds more of them in one"
+            message = f"has {len(value):,} entries: at most {MOST_TABLES:,} are allowed; combine shapes in a mesh"
             problems.append(KeyFault(path, message))
         elif isinstance(value, list):
             waiting += [(f"{path}[{index}]", entry, depth + 1) for index, entry in enumerate(value)]

@@ -48,7 +48,9 @@ class _Boxes:
 
 
 class Shape(Table):
-    """A region of space, placed by p = about + rotation (scale (q - about)) + translation; `about` is the origin unless given.
+    """Region of space: p = about + rotation (scale (q - about)) + translation.
+
+    `about` is the origin by default.
 
     `rotate` is in degrees: one angle in 2-D, angles about the fixed axes x, y, z (in that order) in 3-D. `invert` swaps inside and outside.
     """
@@ -84,7 +86,9 @@ class Shape(Table):
         return placed if self.about is None else placed.about(self.about)
 
     def turned_out(self, domain: list[float]) -> tuple[float, list[float]] | None:
-        """Return how far `rotate` takes the shape out of a domain of these sides [m], and its center before [m]; None: it does not.
+        """Return the distance by which `rotate` moves the shape out of a domain.
+
+        And its center before [m]; None: it does not.
 
         Of a shape that turns about the origin, which may not have been meant.
         """
@@ -113,7 +117,7 @@ class Shape(Table):
         return _Boxes()
 
     def complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the shape in a scene of 2 or 3 dimensions."""
+        """Return errors of the shape in a scene of 2 or 3 dimensions."""
         wanted = {name: dimension for name, value in self if isinstance(value, list)}
         wanted |= {name: 1 if dimension == 2 else 3 for name in ("rotate", "angular_velocity") if name in wanted}
         return [
@@ -141,7 +145,7 @@ class BoxTable(Shape):
         return solids.Box(lower=self.min, upper=self.max, placement=self.placement(dimension), invert=self.invert)
 
     def complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the box in a scene of 2 or 3 dimensions."""
+        """Return errors of the box in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension)
         if not found and any(low >= high for low, high in zip(self.min, self.max, strict=True)):
             found.append(Complaint(("max",), self.max, f"must be greater than min = {self.min} along every axis"))
@@ -177,7 +181,7 @@ class CapsuleTable(Shape):
         return solids.Capsule(start=self.start, end=self.end, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
 
     def complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the capsule in a scene of 2 or 3 dimensions."""
+        """Return errors of the capsule in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension)
         if self.start == self.end:
             found.append(Complaint(("to",), self.end, 'must differ from "from"; use a sphere otherwise'))
@@ -198,7 +202,7 @@ class PlaneTable(Shape):
         return solids.Plane(point=self.point, normal=self.normal, placement=self.placement(dimension), invert=self.invert)
 
     def complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the plane in a scene of 2 or 3 dimensions."""
+        """Return errors of the plane in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension)
         if not any(self.normal):
             found.append(Complaint(("normal",), self.normal, "must not be zero"))
@@ -206,7 +210,7 @@ class PlaneTable(Shape):
 
 
 class MeshTable(Shape):
-    """The inside of a closed surface of triangles; in 2-D, of its cut by the plane z = 0."""
+    """Interior of a closed triangle surface; in 2-D its cut by the plane z = 0."""
 
     shape: Literal["mesh"] = "mesh"
     file: str = Field(min_length=1, description=f"OBJ, STL or PLY file, or a built-in mesh, such as {BUILTIN}torus")
@@ -223,7 +227,10 @@ class MeshTable(Shape):
 
 
 class SolidProperties(Shape):
-    """What a solid has besides its shape; where solids have more, classes of their own derive from SolidBox, SolidSphere and so on."""
+    """Properties of a solid besides its shape.
+
+    Where solids have more, their classes derive from SolidBox, SolidSphere and so on.
+    """
 
     rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
     wall: Wall | None = Field(default=None, description="boundary condition on its surface; default: domain.wall")
@@ -259,11 +266,11 @@ class SolidProperties(Shape):
         return self.is_body or self.motion is not None
 
     def complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the solid in a scene of 2 or 3 dimensions."""
+        """Return errors of the solid in a scene of 2 or 3 dimensions."""
         moves = self.motion.complaints(dimension) if self.motion else []
         found = super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
         if self.drag is not None and self.rubs:
-            found.append(Complaint(("drag",), self.drag, "is for liquids: sand has friction"))
+            found.append(Complaint(("drag",), self.drag, "is for liquids; sand uses friction"))
         return found + (self._body_complaints() if self.is_body else self._still_complaints())
 
     def _body_complaints(self) -> list[Complaint]:
@@ -271,11 +278,11 @@ class SolidProperties(Shape):
         key = "mass" if self.mass is not None else "density"
         found = []
         if self.mass is not None and self.density is not None:
-            found.append(Complaint(("density",), self.density, "goes without mass: give one of them"))
+            found.append(Complaint(("density",), self.density, "cannot be combined with mass: give one of them"))
         if self.motion is not None:
-            found.append(Complaint(("motion",), None, f"goes without {key}: a rigid body moves as forces ask"))
+            found.append(Complaint(("motion",), None, f"cannot be combined with {key}: a rigid body is moved by forces"))
         if self.invert:
-            found.append(Complaint(("invert",), True, f"goes without {key}: everything but a shape has no mass"))
+            found.append(Complaint(("invert",), True, f"cannot be combined with {key}: the outside of a shape has no mass"))
         if self.shape == "plane":
             found.append(Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass"))
         return found
@@ -290,18 +297,18 @@ class SolidProperties(Shape):
         message = "needs mass or density, which make the solid a rigid body"
         found = [Complaint((name,), value, message) for name, value in given.items() if value is not None]
         if self.friction is not None and not self.rubs:
-            found.append(Complaint(("friction",), self.friction, f"{message}: a liquid does not rub against solids"))
+            found.append(Complaint(("friction",), self.friction, f"{message}: a liquid has no friction with solids"))
         return found
 
 
 class MaterialProperties(Shape):
-    """What a material has besides its shape, whatever it is."""
+    """Properties of a material besides its shape."""
 
     velocity: Vector | None = Field(default=None, description="initial velocity [m/s]; default: 0")
 
 
 class LiquidProperties(MaterialProperties):
-    """What a liquid has besides."""
+    """Properties of a liquid besides its shape."""
 
     viscosity: float | None = Field(
         default=None, gt=0, le=1e9, allow_inf_nan=False, description="viscosity [Pa s]; default: viscosity.value"
@@ -349,20 +356,20 @@ class LiquidMesh(LiquidProperties, MeshTable):
 
 
 class Schedule(Table):
-    """When a source or a drain runs."""
+    """Times at which a source or a drain runs."""
 
     begin: NonNegative = Field(alias="start", default=0.0, description="start time [s]")
     stop: float | None = Field(default=None, description="end time [s]; default: never")
 
     def schedule_complaints(self) -> list[Complaint]:
-        """Return what is wrong with the times."""
+        """Return errors of the times."""
         if self.stop is not None and self.stop <= self.begin:
             return [Complaint(("stop",), self.stop, f"must be later than start = {self.begin:g}")]
         return []
 
 
 class SourceProperties(Schedule, Shape):
-    """What a source has besides its shape."""
+    """Properties of a source besides its shape."""
 
     velocity: Vector = Field(description="velocity of the inflow [m/s]")
     viscosity: float | None = Field(
@@ -370,7 +377,7 @@ class SourceProperties(Schedule, Shape):
     )
 
     def complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the source in a scene of 2 or 3 dimensions."""
+        """Return errors of the source in a scene of 2 or 3 dimensions."""
         found = super().complaints(dimension) + self.schedule_complaints()
         if not any(self.velocity):
             found.append(Complaint(("velocity",), self.velocity, "must not be zero: nothing would come out"))
@@ -378,10 +385,10 @@ class SourceProperties(Schedule, Shape):
 
 
 class DrainProperties(Schedule, Shape):
-    """What a drain has besides its shape."""
+    """Properties of a drain besides its shape."""
 
     def complaints(self, dimension: int) -> list[Complaint]:
-        """Return what is wrong with the drain in a scene of 2 or 3 dimensions."""
+        """Return errors of the drain in a scene of 2 or 3 dimensions."""
         return super().complaints(dimension) + self.schedule_complaints()
 
 

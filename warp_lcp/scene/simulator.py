@@ -1,4 +1,4 @@
-"""What simulates a scene, and how it is found: the entry-point group `warp_lcp.simulators`."""
+"""Simulator plug-ins, found by the entry-point group `warp_lcp.simulators`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ class Simulator(Protocol):
     scene_model: type[Any]  # a subclass of warp_lcp.scene.scene.Scene
 
     def create(self, scene: Scene, *, device: str, folder: Path) -> Simulation:
-        """Build a simulation of `scene`. Files that the scene names are relative to `folder`.
+        """Build the simulation of a scene.
+
+        Files that the scene names are relative to `folder`.
 
         Raises:
             ValueError: the scene cannot be simulated; the message names the key and what is allowed.
@@ -32,7 +34,7 @@ class Simulator(Protocol):
 
 @runtime_checkable
 class DistributedSimulator(Protocol):
-    """What a Simulator may also be: one whose simulations several MPI ranks share."""
+    """Simulator whose simulations can run on several MPI ranks."""
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSimulation:
         """Build this rank's part of a simulation of `scene`; collective.
@@ -54,7 +56,7 @@ def simulators() -> dict[str, Simulator]:
 
 
 def plug_ins(group: str, kind: type[Any], what: str) -> dict[str, Any]:
-    """Return what the entry points of a group load, by name.
+    """Return the objects loaded by the entry points of a group, by name.
 
     Raises:
         TypeError: something is not of a kind, which `what` says in words.

@@ -1,4 +1,4 @@
-"""A table of a scene file: a strict, frozen pydantic model, and the words for what is wrong with one."""
+"""Table of a scene file: strict, frozen pydantic model, and its error messages."""
 
 from __future__ import annotations
 
@@ -54,7 +54,9 @@ Angles = Annotated[list[float], Field(min_length=1, max_length=3), BeforeValidat
 
 
 class Table(BaseModel):
-    """A table of a scene file. Unknown keys, loose types, nan and inf are refused; a table does not change once read.
+    """Table of a scene file.
+
+    Unknown keys, wrong types, nan and inf are refused; a table is immutable.
 
     A field's description, with its unit, is quoted when its value is refused.
     """
@@ -71,7 +73,7 @@ class Table(BaseModel):
 
 @dataclass(frozen=True)
 class KeyFault:
-    """Something wrong in a scene: where (`liquid[0].max`), what the file says there, and what is allowed."""
+    """Error in a scene: key (`liquid[0].max`), value, and what is allowed."""
 
     path: str
     message: str
@@ -99,7 +101,10 @@ class SceneError(InputError):
 
 @dataclass(frozen=True)
 class Complaint:
-    """What a check across keys found: the key's place (`("liquid", 0, "max")`), its value if that says more, what is allowed."""
+    """Error of a check across keys: key, value, and what is allowed.
+
+    The value is given if it helps.
+    """
 
     place: tuple[str | int, ...]
     value: object
@@ -107,7 +112,7 @@ class Complaint:
 
 
 def refuse(title: str, complaints: Iterable[Complaint]) -> None:
-    """Raise pydantic's error for the complaints, if there are any, so that each keeps its place.
+    """Raise pydantic's error for the complaints, if any, each with its place.
 
     Raises:
         pydantic.ValidationError: there is a complaint.
@@ -212,7 +217,7 @@ def _variants(tables: tuple[type[Table], ...]) -> dict[str, type[Table]]:
 
 
 def counted(count: int) -> str:
-    """Return what must be true of a list of so many numbers, where one number alone needs no list."""
+    """Return the required length of a list in words; one number needs no list."""
     return "be one number" if count == 1 else f"have {count} entries"
 
 

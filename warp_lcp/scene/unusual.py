@@ -1,4 +1,4 @@
-"""Settings that look like mistakes: a number in another unit, gravity upward, angles in radians, material beyond the domain.
+"""Suspicious settings: wrong units, gravity upward, material beyond the domain.
 
 They are allowed, and told at the start of a run and by `check`, with the value, what is usual, and the unit.
 """
@@ -25,7 +25,7 @@ MOVED = 0.5  # cells: a motion shorter than this by the end of a run is not visi
 
 @dataclass(frozen=True)
 class Usual:
-    """What a key usually is.
+    """Usual range of a key.
 
     Args:
         low: least value that is not told of.
@@ -57,7 +57,10 @@ BODY_DENSITY = Usual(5.0, 25e3, "kg/m^3", "10 (foam) to 22,600 (osmium)", "g/cm^
 
 
 def radians_meant(place: str, values: float | Sequence[float] | None, unit: str = "degrees") -> Iterator[str]:
-    """Yield a line about angles whose number is one that radians have: a multiple of pi / 4, to three digits, with two decimals or more."""
+    """Yield a line about angles that look like radians.
+
+    A multiple of pi / 4 to three digits, with two decimals or more.
+    """
     for value in np.atleast_1d([] if values is None else values).tolist():
         multiple = round(value / FRACTION)
         near = abs(value - FRACTION * multiple) < DIGITS * abs(value) and round(value, 1) != value
@@ -70,13 +73,13 @@ def scene_notes(scene: Scene) -> Iterator[str]:
     gravity, time = scene.physics.gravity, scene.time
     strength = math.hypot(*gravity)
     if gravity[1] > 0.0:
-        yield f"physics.gravity = {gravity} points up: y is up, so what falls has a gravity of [0, -9.81] m/s^2"
+        yield f"physics.gravity = {gravity} points up: y is up, so gravity is usually [0, -9.81] m/s^2"
     if strength > STRONG:
-        yield f"physics.gravity = {gravity} is in m/s^2, of which the Earth has 9.81; if cm/s^2 were meant, it is {0.01 * strength:g}"
+        yield f"physics.gravity = {gravity} is in m/s^2 (Earth: 9.81); if cm/s^2 were meant, it is {0.01 * strength:g}"
     if time.duration * time.frames_per_second < 1.0 - 1e-9:
         yield (
             f"time.duration = {time.duration:g} s is shorter than a frame, {1.0 / time.frames_per_second:g} s at time.frames_per_second ="
-            f" {time.frames_per_second:g}: the run has its start and its end alone"
+            f" {time.frames_per_second:g}: only the first and the last frame are written"
         )
     for number, solid in enumerate(scene.solid):
         yield from _solid_notes(scene, f"solid[{number}]", solid)
@@ -84,7 +87,7 @@ def scene_notes(scene: Scene) -> Iterator[str]:
         yield from radians_meant(f"{place}.rotate", shape.rotate)
         velocity = getattr(shape, "velocity", None)
         if velocity is not None and math.hypot(*velocity) > FAST:
-            yield f"{place}.velocity = {velocity} is in m/s, of which sound in air has 340; if mm/s were meant, take a thousandth"
+            yield f"{place}.velocity = {velocity} is in m/s (sound in air: 340); if mm/s were meant, divide by 1000"
 
 
 def _solid_notes(scene: Scene, place: str, solid: Solid) -> Iterator[str]:
@@ -105,7 +108,7 @@ def _solid_notes(scene: Scene, place: str, solid: Solid) -> Iterator[str]:
 
 
 def material_notes(scene: Scene, key: str, materials: Sequence[MaterialProperties]) -> Iterator[str]:
-    """Yield which material reaches far out of the domain, and whether nothing moves by half a cell."""
+    """Yield material that extends far out of the domain, and scenes without motion."""
     size = np.array(scene.domain.size)
     for number, shape in enumerate(materials):
         box = None if shape.invert else shape.bounds(scene.dimension)
@@ -116,16 +119,16 @@ def material_notes(scene: Scene, key: str, materials: Sequence[MaterialPropertie
         outside = bool(((middle < 0.0) | (middle > size)).any())  # a drop may stand at a wall, and be cut in half by it
         if beyond > scene.spacing and (outside or (shape.shape == "box" and shape.rotate is None)):
             yield (
-                f"{key}[{number}] ({shape.shape}) reaches {beyond:.4g} m beyond the domain, which reaches from the origin to "
-                f"{scene.domain.size} m: what lies there is left out"
+                f"{key}[{number}] ({shape.shape}) extends {beyond:.4g} m beyond the domain, which extends from the origin to "
+                f"{scene.domain.size} m: the part outside is left out"
             )
     velocities = [getattr(shape, "velocity", None) or [0.0] for _, shape in scene.shapes()]
     fastest = max((math.hypot(*velocity) for velocity in velocities), default=0.0)
     shortest = scene.time.cfl * scene.spacing / fastest if fastest > 0.0 else math.inf
     if scene.time.dt_min > shortest:
         yield (
-            f"time.dt_min = {scene.time.dt_min:g} s is longer than the steps of {shortest:.3g} s that time.cfl = {scene.time.cfl:g} asks "
-            f"for at {fastest:g} m/s: they are longer than is stable"
+            f"time.dt_min = {scene.time.dt_min:g} s is longer than the stable step, {shortest:.3g} s for time.cfl = {scene.time.cfl:g} "
+            f"at {fastest:g} m/s: steps may be unstable"
         )
     if any(solid.motion is not None for solid in scene.solid):
         return

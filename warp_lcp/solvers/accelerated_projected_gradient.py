@@ -39,7 +39,7 @@ class AcceleratedProjectedGradient(Settings):
     It iterates the proximal map x = prox_K(x - r (A x + b)) of the box K ([Book] 1.1.4).
 
     With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z + b) / L, l, u), where z = x + beta
-    (x - x before) with Nesterov's beta. The momentum starts anew where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows
+    (x - x before) with Nesterov's beta. The momentum is reset where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows
     where a step's curvature exceeds it; where by far, the step is taken back. One product a step, since A z + b is extrapolated as z is.
     Converges for symmetric positive semidefinite A; the error of the energy falls as 1/k^2, faster in the end.
 
@@ -62,7 +62,7 @@ class AcceleratedProjectedGradient(Settings):
             ValueError: A is not symmetric, or a diagonal entry is negative.
         """
         if not problem.A.symmetric:
-            raise ValueError(f"{type(problem.A).__name__} is not symmetric: A x + b is no gradient")
+            raise ValueError(f"{type(problem.A).__name__} is not symmetric: A x + b is not a gradient")
         positive_diagonal(problem)
         return AcceleratedWorkspace(problem, self)
 

@@ -50,7 +50,7 @@ class GridLines(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class BlockedGaussSeidel(Settings):
-    """Solve blocks of unknowns in turn, the others held ([Book] 2.2.3).
+    """Blocked Gauss-Seidel: solve blocks of unknowns in turn ([Book] 2.2.3).
 
     With blocks of one unknown it is projected Gauss-Seidel, with one block its solver. Strong coupling within a block, as of a contact's
     normal and tangential forces, then costs no sweeps. Converges for symmetric positive definite A. Blocks of at most 6 unknowns are
@@ -68,7 +68,7 @@ class BlockedGaussSeidel(Settings):
         sub_solver: a method for the blocks; None: the kernel for blocks of at most 6 unknowns, MinimumMapNewton for larger ones.
         omega: relaxation factor in (0, 2) of blocks that the kernel solves; 1 for others.
         direction: "forward", "backward" or "symmetric".
-        eta: each solve of a block by a `sub_solver` reduces its residual by this factor, or to what the whole one needs.
+        eta: each solve of a block by a `sub_solver` reduces its residual by this factor, or to the accuracy that the whole problem needs.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """
 
@@ -101,10 +101,10 @@ class BlockedGaussSeidel(Settings):
             given = GridLines.X if has(A, HasStencil) else CONSECUTIVE
         if isinstance(given, GridLines):
             if not has(A, HasStencil) or self.sub_solver is not None:
-                raise ValueError(f"blocks = {given}: are for GridPoisson without a sub_solver; A is a {kind}")
+                raise ValueError(f"blocks = {given}: only for GridPoisson without a sub_solver; A is a {kind}")
             return LineWorkspace(problem, given, self)
         if rows is None and (isinstance(given, int) or self.sub_solver is None):
-            raise ValueError(f"{kind} shows no rows: give BlockedGaussSeidel GridLines, or lists as blocks and a sub_solver")
+            raise ValueError(f"{kind} gives no access to rows: give BlockedGaussSeidel GridLines, or lists as blocks and a sub_solver")
         blocks = blocks_of_size(problem, given) if isinstance(given, int) else given_blocks(problem, given)
         if rows is not None and self.sub_solver is None and max(map(len, blocks)) <= MOST:
             return BlockWorkspace(problem, rows, blocks, self)
@@ -175,7 +175,7 @@ class LineWorkspace(SweepWorkspace):
         A = problem.A
         assert has(A, HasStencil)
         if A.periodic[axis.value]:
-            raise ValueError(f"blocks = {axis}: lines along a periodic axis have no ends; take another axis")
+            raise ValueError(f"blocks = {axis}: lines cannot run along a periodic axis; choose another axis")
         check_colors(problem)
         padding = A.layout.padding
         strides, counts = (1, padding.row, padding.plane), tuple(reversed(padding.counts))

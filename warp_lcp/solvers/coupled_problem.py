@@ -22,7 +22,7 @@ SHARE = 0.3  # of the coupled tolerance, which a block need not be solved beyond
 
 
 class CoupledBlock(Protocol):
-    """One of several problems that depend on each other.
+    """Problem that depends on the solutions of other problems.
 
     Examples: pressure and friction of sand, a liquid and its rigid bodies.
 
@@ -35,10 +35,13 @@ class CoupledBlock(Protocol):
     problem: LCP
 
     def couple(self) -> None:
-        """Write b and the bounds of `problem` from what the other blocks have published."""
+        """Write b and the bounds of `problem` from the other blocks' solutions."""
 
     def guess(self) -> wp.array[Any]:
-        """Return the block's last solution, a field of its problem; called after `couple`."""
+        """Return the block's last solution, a field of its problem.
+
+        Called after `couple`.
+        """
 
     def accept(self, result: SolveResult) -> None:
         """Publish the block's new solution.
@@ -77,13 +80,13 @@ class CoupledResult:
 
 
 class StaggeredRound:
-    """Solves every block once, in turn.
+    """One round of staggering: every block is solved once, in turn.
 
     Args:
         blocks: in their order.
         solvers: one for each.
-        eta: a block's residual is reduced by this factor, or to what the whole one needs.
-        max_iterations: the most steps in a block.
+        eta: a block's residual is reduced by this factor, or to the accuracy that the whole problem needs.
+        max_iterations: maximum number of steps in a block.
     """
 
     def __init__(self, blocks: Sequence[CoupledBlock], solvers: Sequence[Solver], *, eta: float, max_iterations: int) -> None:
@@ -93,7 +96,7 @@ class StaggeredRound:
         self._works = [solver.init(block.problem) for block, solver in zip(self.blocks, self.solvers, strict=True)]
 
     def residuals(self) -> tuple[float, ...]:
-        """Return each block's residual at the state as it is."""
+        """Return the residual of each block at the current state."""
         return tuple(self._residual(k) for k in range(len(self.blocks)))
 
     def run(self, target: float, *, forward: bool = True) -> int:
@@ -126,9 +129,9 @@ def solve_coupled(
     blocks: Sequence[CoupledBlock], solvers: Sequence[Solver], *, stopping: StoppingCriteria | None = None, eta: float = 1e-2,
     max_block_iterations: int = 100, staggered: StaggeredRound | None = None,
 ) -> CoupledResult:  # fmt: skip
-    """Solve coupled problems in turn until all are solved at one state.
+    """Solve coupled problems in turn until all converge at one state (staggering).
 
-    Staggering ([Book] 2.2.4).
+    [Book] 2.2.4.
 
     Converges where the coupling is weak or comes from one symmetric positive definite matrix; there is no proof for friction.
 
@@ -137,8 +140,8 @@ def solve_coupled(
         solvers: a method for each.
         stopping: criteria for the blocks' residuals together; relative to those at the state in which the loop starts. A round that
             `max_seconds` cuts short leaves what its blocks have accepted.
-        eta: each solve of a block reduces its residual by this factor, or to what the whole still needs.
-        max_block_iterations: the most steps in one block's solve.
+        eta: each solve of a block reduces its residual by this factor, or to the accuracy that the whole problem still needs.
+        max_block_iterations: maximum number of steps in one block's solve.
         staggered: memory of an earlier call with these blocks and solvers.
 
     Raises:

@@ -49,7 +49,7 @@ class DirectEnumeration:
         return DenseWorkspace(problem)
 
     def step(self, problem: LCP, work: DenseWorkspace, x: wp.array[Any]) -> Step:
-        """Try all sets, and take the best one's x."""
+        """Try all active sets and keep the best x."""
         candidates, measures = _candidates(work.data)
         best = int(measures.argmin())
         if measures[best] <= ACCEPTED[wp.float64]:
@@ -90,7 +90,7 @@ class DirectEnumeration:
 
 @dataclass(frozen=True)
 class BatchResult(FieldsOnHost):
-    """The answers of `enumerate_batch`.
+    """Result of `enumerate_batch`.
 
     Attributes:
         x: solutions, shape (m, n), type of A; the best candidate where there is no solution.
@@ -105,7 +105,7 @@ class BatchResult(FieldsOnHost):
 def enumerate_batch(
     A: Array, b: Array, lower: Any = 0.0, upper: Any = np.inf, *, device: Any = None, out: BatchResult | None = None
 ) -> BatchResult:
-    """Solve many LCPs of at most 4 unknowns in one launch, one a thread.
+    """Solve many LCPs of at most 4 unknowns in one launch, one per thread.
 
     [Book] 2.1.1.
 
@@ -118,7 +118,7 @@ def enumerate_batch(
         lower: l, a number, or shape (n,) for all problems, or (m, n).
         upper: u, likewise.
         device: Warp device; that of A if A is a wp.array, else the default device.
-        out: memory for the result, say the last one.
+        out: memory for the result, such as the last result.
 
     Returns:
         The solutions and their active sets.

@@ -41,29 +41,29 @@ class FischerNewton(Settings):
     natural residual; two-sided rows take psi(a, -psi(-y, d (u - x))) ([Book] eq. 1.48), rows without bounds y. The step solves
     J dx = -f with J = diag(p d) +
     diag(q) A: divided by q it is the shifted system (A + D) dx = -f / q, D = d p / q, which multigrid preconditions on grids. The merit
-    f.f / 2 may not exceed the largest of the last ones. Iterates need not obey the bounds; what is returned as solved does.
+    f.f / 2 may not exceed the largest of the last ones. Iterates may violate the bounds; a converged result does not.
 
     Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host, in units in which A is equilibrated
-    symmetrically and b is near 1, and what is returned is within the bounds. `safeguard` makes them a chain: at most 30 steps
+    symmetrically and b is near 1, and the result is within the bounds. `safeguard` makes them a chain: at most 30 steps
     (J'J + nu I)^-1 J'f with nu = 1e-6 min(1, ||f||) on the penalized map, searched nonmonotonically, the gradient where that is no
     descent; then two homotopies on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. There is no pivoting method inside.
 
     `linear_iterations` counts preconditioned iterations on the finest grid, factorizations where A is dense.
 
     Args:
-        kink: what stands for the derivative at a kink: "random", "zero", "perturbation" or "approximation" (see `Kink`).
+        kink: derivative at a kink: "random", "zero", "perturbation" or "approximation" (see `Kink`).
         fischer_weight: lambda, the weight of the Fischer-Burmeister function in the penalized map, in
             (0, 1]; 1 is the plain map. None: 0.95 for dense matrices, 1 for others, where the penalty made the steps
             grow with the grid (ball obstacle, 65^2 to 1025^2: 6 to 11 steps with 0.95, 6 to 7 with 1).
         safeguard: False: monotone Armijo search along the projected path, and an end with NON_DESCENT or LOCAL_MINIMUM where that
-            fails: the book's method. True: what is described above.
+            fails: the book's method. True: as described above.
         precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single": the iterate rounded to float32 too.
         warm_start: steps of gradient descent on the same map before the first Newton step.
         monotone_cycles: projected multigrid cycles of a cold start on a grid.
         eta: each linear solve reduces its residual by this factor.
-        max_linear_iterations: the most iterations of one linear solve.
+        max_linear_iterations: maximum number of iterations of one linear solve.
         memory: merits that a safeguarded search remembers.
-        cycle: how multigrid cycles go.
+        cycle: settings of multigrid cycles.
 
     Example:
         >>> import numpy as np, warp_lcp as wl

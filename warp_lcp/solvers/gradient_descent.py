@@ -24,7 +24,7 @@ LONGEST = 1e6  # length tried
 @renamed(share="fischer_weight")
 @dataclass(frozen=True, kw_only=True)
 class GradientDescent(Settings):
-    """Descend on the merit function f.f / 2 of a reformulation.
+    """Gradient descent on the merit function f.f / 2 of a reformulation.
 
     [Book] 2.4.4, eq. 2.199, algorithm 13.
 
@@ -58,11 +58,11 @@ class GradientDescent(Settings):
     precision: PrecisionName = "double"
 
     def init(self, problem: LCP) -> DescentWorkspace:
-        """Return memory for the problem, any operator's."""
+        """Return a workspace, for any operator."""
         return DescentWorkspace(problem, self)
 
     def step(self, problem: LCP, work: DescentWorkspace, x: wp.array[Any]) -> Step:
-        """Go down along the projected path of the gradient once."""
+        """Take one gradient step along the projected path."""
         return work.descend(x)
 
 

@@ -62,7 +62,7 @@ class IncrementalPivoting(Settings):
         return PivotingWorkspace(problem)
 
     def step(self, problem: LCP, work: PivotingWorkspace, x: wp.array[Any]) -> Step:
-        """Make a block of pivots."""
+        """Take a block of pivots."""
         done = work.pivot(pivots_of(self.pivots_per_step, len(work.data.b)))
         return work.result("pivots", done)
 

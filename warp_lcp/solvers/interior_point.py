@@ -99,8 +99,8 @@ class InteriorPoint(Settings):
         monotone_cycles: projected multigrid cycles of a cold start on a grid, from which the path is joined where it is near.
         predictor_eta: the predictor's linear solve reduces its residual by this factor.
         eta: the same of the corrector, and of the book's step.
-        max_linear_iterations: the most iterations of one linear solve.
-        cycle: how multigrid cycles go.
+        max_linear_iterations: maximum number of iterations of one linear solve.
+        cycle: settings of multigrid cycles.
 
     Example:
         >>> import numpy as np, warp_lcp as wl

@@ -213,7 +213,7 @@ class Lemke(Settings):
         covering_vectors: random covering vectors tried after a ray, >= 1.
     """
 
-    needs: ClassVar[str] = "n <= 4096; sure of an end for copositive-plus and P-matrices"
+    needs: ClassVar[str] = "n <= 4096; terminates for copositive-plus and P-matrices"
     most_unknowns: ClassVar[int] = 4096  # the basis and its inverse take 134 MB each, four times that with boxes everywhere
 
     pivots_per_step: Count | None = None
@@ -229,7 +229,7 @@ class Lemke(Settings):
         return LemkeWorkspace(problem, self.covering_vectors)
 
     def step(self, problem: LCP, work: LemkeWorkspace, x: wp.array[Any]) -> Step:
-        """Make a block of pivots."""
+        """Take a block of pivots."""
         done = work.pivot(pivots_of(self.pivots_per_step, len(work.data.b)))
         return work.result("pivots", done)
 

@@ -73,7 +73,7 @@ class MinimumMapNewton(Settings):
     bounds if the residual would exceed the largest of the last `memory` ones. On a large sparse matrix, an active set that creeps all the
     same is moved by a problem on coarse points if A is nearly a diagonally dominant M-matrix; other symmetric A whose linear solves are
     slow get conjugate gradients within the bounds (MPRGP). Converges on a grid in a few steps; on other matrices A should be a P-matrix.
-    Where it is not, free blocks may be singular and steps lead nowhere: dense and sparse problems then go on by interior-point steps where
+    Where it is not, free blocks may be singular and steps fail: dense and sparse problems then continue by interior-point steps if
     A is not symmetric, as in linear programs, and by the proximal-point iteration, whose problems have A + eps D: a P-matrix if A is
     positive semi-definite, skew, or any other P0-matrix. Where that gains nothing either, the status says so: STAGNATED, NON_DESCENT, or
     INFEASIBLE if a linear program proves it.
@@ -82,15 +82,15 @@ class MinimumMapNewton(Settings):
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
         monotone_cycles: projected cycles of a cold start on a grid; twice as many, on aggregates, where a large sparse matrix is nearly a
             diagonally dominant M-matrix, six times from 65,536 unknowns on.
-        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs. On a grid it ends earlier if
-            an iterate calls other unknowns free; elsewhere it goes on to the factor's square once the active set has settled.
-        max_linear_iterations: the most conjugate-gradient iterations of one step.
-        backtracks: halvings of a step before it is given up.
-        memory: residuals that a step may fall back to.
-        cycle: how multigrid cycles go.
+        eta: each linear solve reduces its residual by this factor, or to the accuracy still needed. On a grid it ends earlier if
+            the free set of an iterate changes; elsewhere it continues to the factor's square once the active set has settled.
+        max_linear_iterations: maximum number of conjugate-gradient iterations of one step.
+        backtracks: maximum number of halvings of a step.
+        memory: number of last residuals whose maximum a step may not exceed (nonmonotone search).
+        cycle: settings of multigrid cycles.
         direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200 unknowns or a bandwidth up to 3: what
             `default_method` chooses there. The steps above take over where these lead nowhere.
-        safeguard: True: what is described above. False: the book's method alone, its Newton steps with Armijo's monotone search from the
+        safeguard: True: as described above. False: the book's method alone, its Newton steps with Armijo's monotone search from the
             first to the last, and NON_DESCENT where no share of a step lowers the residual, as on some contacts ([Book] fig. C.2b).
     """
 
@@ -112,7 +112,7 @@ class MinimumMapNewton(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.direct and not self.safeguard:
-            raise ValueError("direct = True: goes on by safeguarded steps, and cannot be combined with safeguard = False")
+            raise ValueError("direct = True: needs safeguarded steps and cannot be combined with safeguard = False")
 
     def init(self, problem: LCP) -> NewtonWorkspace | GridNewtonWorkspace | DirectNewtonWorkspace:
         """Return a workspace.

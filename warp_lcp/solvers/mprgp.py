@@ -58,7 +58,7 @@ class MPRGP(Settings):
     Unknowns at a bound are held. While the part of the residual on them, the chopped gradient, is small against the free part
     (||beta||^2 <= Gamma^2 phi~'phi), a step of conjugate gradients on the free set, preconditioned there by one multigrid cycle, is
     projected: x = clip(x - alpha p). If that meets no bound it was plain conjugate gradients and the direction is carried on; else the
-    preconditioner is rebuilt for the new set and the direction starts anew. When the chopped gradient is large, a step along it releases
+    preconditioner is rebuilt for the new set and the direction is reset. When the chopped gradient is large, a step along it releases
     unknowns. Dostal's expansion by a half step and a fixed step is replaced by the projected step: it needed over 8 times the work of a
     linear solve, this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
 
@@ -73,7 +73,7 @@ class MPRGP(Settings):
         monotone_cycles: projected cycles of a cold start on a grid.
         gamma: Gamma > 0, how large the chopped gradient may be; larger: bounds are left later.
         patience: steps without a new least energy before monotone cycles are taken on a grid.
-        cycle: how multigrid cycles go.
+        cycle: settings of multigrid cycles.
     """
 
     needs: ClassVar[str] = "A symmetric, positive semi-definite"
@@ -91,7 +91,9 @@ class MPRGP(Settings):
             ValueError: A is not symmetric, or has a negative diagonal entry.
         """
         if not problem.A.symmetric:
-            raise ValueError("A is not symmetric: MPRGP minimizes an energy that only a symmetric A has; take MinimumMapNewton or Lemke")
+            raise ValueError(
+                "A is not symmetric: MPRGP minimizes an energy that exists only for a symmetric A; use MinimumMapNewton or Lemke"
+            )
         work = MPRGPWorkspace(problem, self)
         negative = np.count_nonzero(Diagonal(problem, work.residual).values() < 0)
         if negative:

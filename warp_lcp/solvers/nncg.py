@@ -47,7 +47,7 @@ class NNCG(Settings):
     """
 
     supports: ClassVar = (Relaxes, HasRows)
-    needs: ClassVar[str] = "what ProjectedSOR needs"
+    needs: ClassVar[str] = "as for ProjectedSOR"
     affine_bounds: ClassVar[bool] = True
 
     direction: Direction = "forward"

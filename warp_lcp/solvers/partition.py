@@ -57,7 +57,7 @@ def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
     wrong = count != (problem.unknown.numpy() == 1)
     if wrong.any():
         at = int(np.flatnonzero(wrong[place])[0])
-        raise ValueError(f"blocks hold {count[place[at]]} times index {at}, expected {int(problem.unknown.numpy()[place[at]] == 1)}")
+        raise ValueError(f"blocks hold index {at} {count[place[at]]} times, expected {int(problem.unknown.numpy()[place[at]] == 1)}")
     return found
 
 
@@ -204,4 +204,4 @@ def block_problem(whole: LCP, x: wp.array[Any], rows: np.ndarray) -> Block:
         return GridBlock(whole, x, rows)
     if has(whole.A, HasRows):
         return MatrixBlock(whole, x, rows)
-    raise ValueError(f"{type(whole.A).__name__} cannot be taken apart: blocks need {described(HasRows, HasBlocks)}")
+    raise ValueError(f"{type(whole.A).__name__} cannot be split into blocks, which need {described(HasRows, HasBlocks)}")

@@ -61,9 +61,9 @@ class Penalty(Settings):
         rho: stiffness of the springs in units of d, without units; 1e6 suffices for tolerances down to about 1e-6 of the residual.
         precision: "mixed": x float64, corrections float32 on grids; "double"; or "single": x rounded to float32 as well.
         monotone_cycles: projected multigrid cycles of a cold start on a grid.
-        eta: each linear solve reduces its residual by this factor, its square where V has stayed, or to what the solve still needs.
-        max_linear_iterations: the most iterations of one linear solve.
-        cycle: how multigrid cycles go.
+        eta: each linear solve reduces its residual by this factor, its square where V has stayed, or to the accuracy still needed.
+        max_linear_iterations: maximum number of iterations of one linear solve.
+        cycle: settings of multigrid cycles.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -88,7 +88,7 @@ class Penalty(Settings):
         return PenaltyWorkspace(problem, self)
 
     def step(self, problem: LCP, work: PenaltyWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a step of policy iteration."""
+        """Take a monotone cycle (cold start), else a step of policy iteration."""
         if work.cycles_left > 0:
             work.cycles_left -= 1
             return work.monotone_step()

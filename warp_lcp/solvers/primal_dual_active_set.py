@@ -38,20 +38,20 @@ class PrimalDualActiveSet(Settings):
     With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it is above, else free: y_i = 0 there. This
     is MinimumMapNewton's step without search or projection, and shares its implementation. Started anywhere it ends after finitely many
     steps if A is an M-matrix;
-    on other P-matrices it may cycle. A set that comes again without a smaller residual is a cycle: then dense problems go on by
+    on other P-matrices it may cycle. If a set recurs without a smaller residual, dense problems continue by
     least-index principal pivoting (Murty; with bounds Judice and Pires), which is finite for every P-matrix but may be slow; others by
-    MinimumMapNewton's safeguarded steps. Where a free block is singular, which no P-matrix has, dense and sparse problems go on by the
+    MinimumMapNewton's safeguarded steps. If a free block is singular (never in a P-matrix), dense and sparse problems continue by the
     proximal-point iteration. Cold, the first steps on a grid are projected multigrid cycles.
 
-    `linear_iterations` counts what MinimumMapNewton's does; a least-index pivot counts one.
+    `linear_iterations` counts as in MinimumMapNewton; a least-index pivot counts one.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well. Dense
             problems are solved in float64.
         monotone_cycles: projected cycles of a cold start on a grid; see MinimumMapNewton for sparse matrices.
-        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs.
-        max_linear_iterations: the most conjugate-gradient iterations of one step.
-        cycle: how multigrid cycles go.
+        eta: each linear solve reduces its residual by this factor, or to the accuracy that the whole solve still needs.
+        max_linear_iterations: maximum number of conjugate-gradient iterations of one step.
+        cycle: settings of multigrid cycles.
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
@@ -65,21 +65,21 @@ class PrimalDualActiveSet(Settings):
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
     def as_newton(self) -> MinimumMapNewton:
-        """Return the method whose steps take over on operators that are not dense."""
+        """Return the MinimumMapNewton method for operators that are not dense."""
         return MinimumMapNewton(**{f.name: getattr(self, f.name) for f in fields(self)})
 
     def init(self, problem: LCP) -> ActiveSetWorkspace:
         """Return a workspace.
 
         Raises:
-            ValueError: what MinimumMapNewton raises.
+            ValueError: as in MinimumMapNewton.
         """
         return ActiveSetWorkspace(problem, self.as_newton())
 
     def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a full step.
 
-        After a cycle the step keeps what is safe.
+        After a recurring set the step is safeguarded.
         """
         return work.step(x)
 

@@ -151,7 +151,7 @@ class GridSystem(GuardedSystem):
         source, target = self._A.stencil, self.hierarchy.finest.stencil.d
         if self._weight is None:
             if shift is not None:
-                raise ValueError("shift: make the system with shifted=True")
+                raise ValueError("shift: construct the system with shifted=True")
             self.hierarchy.hold(source.d, free)
             self.hierarchy.rebuild_changed()
         else:

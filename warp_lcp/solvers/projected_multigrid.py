@@ -25,18 +25,18 @@ class ProjectedMultigrid(Settings):
 
     Cold, the first step is a projected (monotone) cycle, which moves whole aggregates on and off their bounds. Then each step evaluates
     y = A x + b in float64, takes the unknowns that sit at a bound with y of the right sign out of the hierarchy (they are *truncated*),
-    preconditions -y by one linear cycle on the rest, makes the correction conjugate to what is left of the last direction, and projects
+    preconditions -y by one linear cycle on the rest, makes the correction conjugate to the remainder of the last direction, and projects
     the step onto the bounds. There are no inner tolerances: without bounds this is preconditioned conjugate gradients with a true
     residual, and the same code is the linear solver. Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`): where it falls evenly
     while the free set moves, a contact's boundary creeps by a layer of cells a step, and a monotone cycle follows; where `patience` steps
     set no new least energy, monotone cycles follow, twice as many each time. Where cycles are slow (channels a cell wide, coefficients that
-    are random over decades), the solve goes on by `MinimumMapNewton` on the grid's matrix, unless ranks share it.
+    are random over decades), the solve continues by `MinimumMapNewton` on the grid's matrix, if it is not distributed over ranks.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
         monotone_cycles: projected cycles of a cold start.
         patience: steps without a new least energy before monotone cycles are taken.
-        cycle: how multigrid cycles go.
+        cycle: settings of multigrid cycles.
     """
 
     supports: ClassVar = (HasStencil, HasColumns)
@@ -59,12 +59,12 @@ class ProjectedMultigrid(Settings):
         if has(problem.A, HasStencil):
             if not problem.A.symmetric:
                 raise ValueError(
-                    "A is not symmetric: ProjectedMultigrid descends an energy, which such a problem has not; take MinimumMapNewton"
+                    "A is not symmetric: ProjectedMultigrid minimizes an energy, which exists only for a symmetric A; use MinimumMapNewton"
                 )
             return MultigridWorkspace(problem, problem.A, self)
         terms = grid_and_low_rank(problem.A)
         if terms is None:
-            raise ValueError("A is not symmetric: ProjectedMultigrid needs symmetric columns of low rank; take MinimumMapNewton")
+            raise ValueError("A is not symmetric: ProjectedMultigrid needs a symmetric low-rank part; use MinimumMapNewton")
         return CoupledWorkspace(problem, *terms, self)
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:

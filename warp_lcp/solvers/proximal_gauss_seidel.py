@@ -54,7 +54,7 @@ FOLLOW = RowPass(
 
 @dataclass(frozen=True, kw_only=True)
 class ProximalGaussSeidel(Settings):
-    """Gauss-Seidel sweeps of proximal maps for contacts with circular friction cones.
+    """Gauss-Seidel sweeps of proximal maps: contacts with circular friction cones.
 
     [Book] 1.1.4, 1.3.5; Erleben 2017.
 
@@ -75,7 +75,7 @@ class ProximalGaussSeidel(Settings):
         accelerate: whether sweeps are accelerated; plain ones took more than three times as many for 1,000 spheres in a box.
         check_every: sweeps from one look at the residual to the next; a step of the method, so that limits are met in multiples of it.
         wait: sweeps without progress after which r-factors shrink.
-        shrink: what they are multiplied by.
+        shrink: factor by which they shrink.
     """
 
     problems: ClassVar = FrictionalContact
@@ -87,7 +87,7 @@ class ProximalGaussSeidel(Settings):
     shrink: Share = 0.7
 
     def init(self, problem: FrictionalContact) -> ContactWorkspace:
-        """Return a workspace: contacts by colors, and their sweeps, recorded."""
+        """Return a workspace: contacts by color, and recorded sweeps."""
         return ContactWorkspace(problem, self)
 
     def step(self, problem: FrictionalContact, work: ContactWorkspace, x: wp.array[Any]) -> Step:

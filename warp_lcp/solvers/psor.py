@@ -22,7 +22,7 @@ Direction = Literal[tuple(DIRECTIONS)]
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectedSOR(Settings):
-    """Projected successive over-relaxation: solve each scalar problem in turn.
+    """Projected successive over-relaxation (PSOR); omega = 1: Gauss-Seidel.
 
     [Book] 2.2.1, eq. 2.52.
 
@@ -71,7 +71,7 @@ class ProjectedSOR(Settings):
             object.__setattr__(self, "permutation", tuple(int(i) for i in self.permutation))
         super().__post_init__()
         if self.permutation is not None and self.order != "natural":
-            raise ValueError(f"permutation: is an order itself, and cannot be combined with order = {self.order!r}")
+            raise ValueError(f"permutation: cannot be combined with order = {self.order!r}")
 
     def init(self, problem: LCP) -> SORWorkspace:
         """Return a workspace.
@@ -158,7 +158,9 @@ def grid_omega(problem: LCP, *, singular: bool) -> float:
 
 
 def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
-    """Return a relaxation factor: Young's 2 / (1 + sqrt(1 - rho^2)).
+    """Return an estimate of the best relaxation factor omega (Young).
+
+    2 / (1 + sqrt(1 - rho^2)).
 
     rho = 1 - lambda_min(D^-1 A) is the spectral radius of Jacobi's method, estimated by Lanczos' method. The formula is exact for
     equations in two colors (grids), and a guide elsewhere. Only the free unknowns count in the end: where many are held at bounds, the

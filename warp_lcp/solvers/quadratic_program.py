@@ -32,7 +32,7 @@ class QuadraticProgram(Settings):
     Args:
         tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The loop's criteria are checked on
             the natural residual whatever PIQP says.
-        max_iterations: the most iterations of PIQP, >= 1.
+        max_iterations: maximum number of iterations of PIQP, >= 1.
     """
 
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096 unless sparse; the extra `peers`"
@@ -51,7 +51,9 @@ class QuadraticProgram(Settings):
         if importlib.util.find_spec("piqp") is None:
             raise ImportError("QuadraticProgram needs PIQP: pip install 'warp-lcp[peers]' (or pip install piqp)")
         if not problem.A.symmetric:
-            raise ValueError("A is not symmetric: QuadraticProgram needs it to be, y = A x + b is the gradient of no quadratic otherwise")
+            raise ValueError(
+                "A is not symmetric: QuadraticProgram needs it to be; otherwise y = A x + b is not the gradient of a quadratic function"
+            )
         if sparse_matrix(problem) is None:
             check_size(problem, "QuadraticProgram", self.most_unknowns)
         work = QuadraticProgramWorkspace(problem)
@@ -59,7 +61,7 @@ class QuadraticProgram(Settings):
         return work
 
     def step(self, problem: LCP, work: QuadraticProgramWorkspace, x: wp.array[Any]) -> Step:
-        """Solve the quadratic program as a whole."""
+        """Solve the whole quadratic program."""
         return work.result("quadratic program", work.minimize(self.tolerance, self.max_iterations))
 
 

@@ -55,7 +55,7 @@ class Methods(dict[str, type[Any]]):
         """Return a method of contacts, or refuse a name that no method has."""
         if name in CONTACTS:
             return CONTACTS[name]
-        raise KeyError(f"no method is called {name!r}: {self.nearest(name)}")
+        raise KeyError(f"no such method: {name!r}; {self.nearest(name)}")
 
     def nearest(self, name: object) -> str:
         """Return `did you mean ...?` for initials, class names and synonyms, else `settings.nearest`."""

@@ -35,7 +35,7 @@ def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, 
     if free is not None:
         unknown &= layout.load(free, wp.uint8, "free").numpy() != 0
     if not unknown.any():
-        raise ValueError("free: holds no unknown")
+        raise ValueError("free: selects no unknown")
     field, image, nothing = (layout.zeros(wp.float64) for _ in range(3))
 
     def product(v: np.ndarray) -> np.ndarray:

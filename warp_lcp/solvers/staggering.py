@@ -21,9 +21,9 @@ from warp_lcp.solvers.sweep import Contraction
 
 @dataclass(frozen=True, kw_only=True)
 class Staggering(Settings):
-    """Staggering: solve the blocks of a problem in turn, the others held fixed.
+    """Staggering: solve the blocks of a problem in turn, each by its own method.
 
-    Each block has its own method ([Book] 2.2.4).
+    The other blocks are held fixed ([Book] 2.2.4).
 
     Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: a block Gauss-Seidel method, which converges for symmetric
     positive definite A. Bounds affine in x are constants of the block while it is solved, so that any method may solve it: normal
@@ -33,8 +33,8 @@ class Staggering(Settings):
         blocks: for each block flat indices into a field of the problem's shape, together all unknowns, each once; or a number of blocks
             of consecutive unknowns.
         solvers: a method for each block; MinimumMapNewton for all if empty, one for all if it is a single one, in a list or not.
-        eta: each solve of a block reduces its residual by this factor, or to what the whole one needs.
-        max_block_iterations: the most steps in a block.
+        eta: each solve of a block reduces its residual by this factor, or to the accuracy that the whole problem needs.
+        max_block_iterations: maximum number of steps in a block.
     """
 
     supports: ClassVar = (HasRows, HasBlocks)

@@ -39,8 +39,8 @@ class SubspaceMinimization(Settings):
 
     A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free set stays ([Book] eq. 2.98). Each solve
     is inexact, as far as the whole one still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the residual
-    falls, up to `backtracks` times; if neither falls, x stays what the sweeps made of it. The book takes full steps, whose "jaggyness"
-    (fig. 2.10) is what this cures; `backtracks = -1` does as the book does.
+    falls, up to `backtracks` times; if neither falls, x is left as after the sweeps. The book takes full steps, whose "jaggyness"
+    (fig. 2.10) this avoids; `backtracks = -1` takes full steps as the book does.
 
     Bounds may be affine in x: they are constants of each linear solve; held unknowns then move with their bounds, and only the residual
     judges the step, as there is no energy. With friction the residual may have to rise first: `backtracks = -1` solves a stack of 10 boxes
@@ -52,15 +52,15 @@ class SubspaceMinimization(Settings):
         sweeps: of each step, >= 1.
         solves: on the free set, of each step, at most; >= 1.
         omega: relaxation factor of the sweeps, in (0, 2).
-        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs.
-        max_linear_iterations: the most iterations of one linear solve.
+        eta: each linear solve reduces its residual by this factor, or to the accuracy that the whole solve still needs.
+        max_linear_iterations: maximum number of iterations of one linear solve.
         backtracks: halvings of a correction; -1 takes all corrections as they come.
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
-        cycle: how multigrid cycles go.
+        cycle: settings of multigrid cycles.
     """
 
     supports: ClassVar = (Relaxes, HasRows)
-    needs: ClassVar[str] = "what ProjectedSOR needs; regular principal blocks (dense: least squares otherwise)"
+    needs: ClassVar[str] = "as for ProjectedSOR; regular principal blocks (dense: least squares otherwise)"
     preconditioned: ClassVar[bool] = True
     affine_bounds: ClassVar[bool] = True
 
