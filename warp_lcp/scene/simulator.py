@@ -46,7 +46,7 @@ class DistributedSimulator(Protocol):
 
 @functools.cache
 def entry_points(group: str) -> metadata.EntryPoints:
-    """Return the entry points of a group; the search of all packages, 5 ms, is done once."""
+    """Return the entry points of a group; packages are searched once a process."""
     return metadata.entry_points(group=group)
 
 
