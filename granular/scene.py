@@ -60,8 +60,8 @@ class SandDomain(Domain):
     )
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell",
-        description="cut-cell: surfaces of solids cut cells; voxel: solids fill whole cells and cannot move; stresses use whole "
-        'cells if a solid moves, an axis is periodic or solver.method = "interleaved-sweeps"',
+        description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move; "
+        'whole cells to stresses if a solid moves, an axis is periodic or solver.method = "interleaved-sweeps"',
     )
     periodic: list[bool] | None = Field(default=None, description="periodic axes, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
 
@@ -72,10 +72,10 @@ class MaterialTable(Table):
     renamed: ClassVar = {"angle_of": "friction_angle_test"}
     name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="material of the defaults")
     friction_angle: Angle | None = Field(
-        default=None, description="slope at which running sand stops [degrees], see friction_angle_test; default: by name"
+        default=None, description="slope at which running sand stops [degrees]; default: by name"
     )
-    density: Positive | None = Field(default=None, description="density at the densest packing, air included [kg/m^3]; default: by name")
-    max_fraction: Share | None = Field(default=None, description="volume fraction of grains at the densest packing; default: by name")
+    density: Positive | None = Field(default=None, description="bulk density at the densest packing [kg/m^3]; default: by name")
+    max_fraction: Share | None = Field(default=None, description="largest volume fraction of grains; default: by name")
     wall_friction: WallFriction | None = Field(
         default=None, description=f"friction coefficient of walls and solids: {FRICTIONS}; default: by name"
     )
@@ -86,20 +86,19 @@ class MaterialTable(Table):
     tensile_strength: NonNegative = Field(default=0.0, description="tensile strength at dense packing [Pa]")
     friction_angle_test: FrictionAngleTest = Field(
         default="repose",
-        description="test of friction_angle: repose, the slope where layers stop, or plane-strain or triaxial-compression of soils",
+        description="test of friction_angle: repose (slope where layers stop), plane-strain, triaxial-compression",
     )
 
 
 class Friction(Table):
     """[friction]: shear strength of sand.
 
-    With `dynamic_angle`, friction grows with the shear rate: mu(I) [Jop, Forterre & Pouliquen 2006]. The density of a
-    grain is `material.density` / `material.max_fraction`. Glass beads of 0.53 mm have 20.9 and 32.76 degrees. An
-    iteration of the solve takes up to 1.4 times as long.
+    With `dynamic_angle`, friction [grows with the shear rate](sand.md#the-angle-of-friction). Glass beads of 0.53 mm
+    have 20.9 and 32.76 degrees. An iteration of the solve takes up to 1.4 times as long.
     """
 
     model: Literal["cone", "box"] = Field(
-        default="cone", description="cone: isotropic; box: of Narain et al. 2010, layers flow on slopes where they should rest"
+        default="cone", description="cone: isotropic; box: Narain et al. 2010, layers flow where they should rest"
     )
     dynamic_angle: Angle | None = Field(default=None, description="friction angle at high shear rates [degrees]")
     grain_size: Positive | None = Field(default=None, description="grain diameter [m], with dynamic_angle")
@@ -127,13 +126,13 @@ class SandSolver(Table):
 
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
     method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
-        default="accelerated-projection", description="interleaved-sweeps: the textbook method, several times slower"
+        default="accelerated-projection", description="accelerated-projection, or interleaved-sweeps: several times slower"
     )
     tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(
-        default=1e-3, description="root mean square residual of the stresses [rho g dx]"
+        default=1e-3, description="root mean square residual [rho g dx]"
     )
-    max_iterations: int = Field(default=600, ge=10, description="iterations before a step accepts the stresses as they are")
-    precision: Literal["single"] = Field(default="single", description="precision of the stresses; residuals are double")
+    max_iterations: int = Field(default=600, ge=10, description="after these the step accepts the stresses")
+    precision: Literal["single"] = Field(default="single", description="of the stresses; residuals are double")
 
 
 class SandProperties(MaterialProperties):
