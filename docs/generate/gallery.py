@@ -32,7 +32,7 @@ HEAD = """# Gallery
 
 <!-- Written by docs/generate/gallery.py from runs of the scenes; do not edit. -->
 
-All built-in scenes. `warp-lcp scenes` lists them. To run and draw one:
+All built-in scenes. To run and draw one:
 
 ```sh
 warp-lcp run dam-break --set output.surface=true
@@ -42,7 +42,8 @@ warp-lcp render out/dam-break --sheet
 `output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `--set domain.resolution=128` refines.
 `warp-lcp check NAME` estimates memory.
 
-Run times are of one core of a shared {device}, {date}; bodies alone on an AMD EPYC. A first run also compiles for some seconds.
+Run times are of one core of a shared {device},
+{date}; bodies alone on an AMD EPYC.
 """
 
 
@@ -102,7 +103,7 @@ def show(name: str, work: Path) -> dict[str, Any]:
 def entry(name: str, figures: dict[str, Any]) -> str:
     """Return what the page says of a scene."""
     about = tomllib.loads(scene_text(name))["scene"]
-    description = about["description"][0].upper() + about["description"][1:]
+    description = about["description"][0].upper() + about["description"][1:].partition(" (")[0]
     return f"## {name}\n\n![{name}](gallery/{name}.webp)\n\n{description}. {figures['seconds']:.0f} s.\n"
 
 

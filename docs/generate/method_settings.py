@@ -1,4 +1,4 @@
-"""Writes docs/settings.md from the annotations of methods: `python docs/generate/method_settings.py`."""
+"""Writes docs/api/settings.md from the annotations of methods: `python docs/generate/method_settings.py`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 import warp_lcp as wl
 from warp_lcp.settings import ranges, rule
 
-PAGE = Path(__file__).parents[1] / "settings.md"
+PAGE = Path(__file__).parents[1] / "api" / "settings.md"
 COMMON = 3  # from this number of methods on, a setting that they share is in the common list
 HEAD = """# Settings of methods
 
 <!-- Written by docs/generate/method_settings.py from the classes; do not edit. -->
 
-Defaults and allowed values; [Solvers](api/solvers.md) explains them. Other values raise a `ValueError` that names the setting and
+Defaults and allowed values; [Solvers](solvers.md) explains them. Other values raise a `ValueError` that names the setting and
 its range.
 """
 ALSO = "- [common](#common-settings): "
