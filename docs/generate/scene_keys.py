@@ -61,9 +61,8 @@ Units are SI, angles are in degrees, y is up. Vectors have an entry per axis. Ke
 Unknown keys are refused; the message names the nearest key.
 """
 
-STEPS = """Steps end exactly at frames. They also end where a source or drain starts or stops, or a solid's velocity jumps. A step
-does not end there within a quarter of a step of its start or of a frame, or if another such time follows within it. The inflow
-of a source is exact anyway.
+STEPS = """Steps end exactly at frames. They also end where a source or drain starts or stops or a solid's velocity jumps, unless the step
+would be shorter than a quarter.
 """
 
 DOMAIN = """Material may leave `separating` walls. It slides along `free-slip` walls and sticks to `sticky` ones, which need
@@ -92,7 +91,7 @@ refused. `warp-lcp check` and `run` report repairs:
 
 - Vertices closer than a millionth of the mesh's size are merged. Repeated triangles and those without area are dropped.
 - Triangles that disagree with their neighbors are flipped. So are inside-out parts, except walls of hollows.
-- Intersecting and nested parts stay; such a mesh cannot be a rigid body. It is refused if more than 1 % is inside out.
+- Intersecting and nested parts stay; such a mesh cannot be a rigid body. A mesh is refused if more than 1 % is inside out.
 """
 
 MOVING = """## Motions
@@ -125,7 +124,7 @@ CONTACTS = """## Bodies alone
 
 LIMITS = """## Limits
 
-- At most 8192 cells along an axis. Sides are whole numbers of cells.
+- At most 8192 cells along an axis. Sides must be whole numbers of cells.
 - A scene has one kind of sand, and its walls are `separating`. Liquids may differ in viscosity, not in density.
 - `narrow_band` and `output.forces` are for liquids only.
 - Periodic axes are for sand without rigid bodies, sources, drains, reseeding or `[density_correction]`.
