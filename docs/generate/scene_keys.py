@@ -44,11 +44,6 @@ resolution = 64
 shape = "box"
 min = [0.0, 0.0]
 max = [0.5, 0.8]
-
-[[solid]]
-shape = "sphere"
-center = [1.3, 0.2]
-radius = 0.1
 ```
 
 ```sh
@@ -86,12 +81,10 @@ SHAPED = """## Shapes
 A shape has a `shape` and its keys, all of them required:
 """
 
-MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside, its winding number is positive. Open and one-sided surfaces are
-refused. `warp-lcp check` and `run` report repairs:
-
-- Vertices closer than a millionth of the mesh's size are merged. Repeated triangles and those without area are dropped.
-- Triangles that disagree with their neighbors are flipped. So are inside-out parts, except walls of hollows.
-- Intersecting and nested parts stay; such a mesh cannot be a rigid body. A mesh is refused if more than 1 % is inside out.
+MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside, its winding number is positive. Vertices closer than a millionth of
+its size are merged, triangles without area are dropped, and triangles and parts that are inside out are flipped; `warp-lcp check`
+and `run` report this. Intersecting and nested parts stay, but such a mesh cannot be a rigid body. Open and one-sided surfaces are
+refused, and those of which more than 1 % stays inside out.
 """
 
 MOVING = """## Motions
@@ -129,7 +122,6 @@ LIMITS = """## Limits
 - `narrow_band` and `output.forces` are for liquids only.
 - Periodic axes are for sand without rigid bodies, sources, drains, reseeding or `[density_correction]`.
 - A solid is moved by `motion` or is a rigid body, not both. Neither works with `solids = "voxel"`.
-- `name` has at most 60 letters, digits, `-`, `_`, `.` and spaces.
 """
 
 
