@@ -93,8 +93,8 @@ class MaterialTable(Table):
 class Friction(Table):
     """[friction]: shear strength of sand.
 
-    With `dynamic_angle`, friction [grows with the shear rate](sand.md#the-angle-of-friction). Glass beads of 0.53 mm
-    have 20.9 and 32.76 degrees. An iteration of the solve takes up to 1.4 times as long.
+    With `dynamic_angle`, friction grows with the shear rate: mu(I) [Jop, Forterre & Pouliquen 2006]. Glass beads of
+    0.53 mm have 20.9 and 32.76 degrees. An iteration of the solve takes up to 1.4 times as long.
     """
 
     model: Literal["cone", "box"] = Field(

@@ -94,7 +94,7 @@ class Domain(Table):
 
     later: ClassVar = {"periodic": frozenset({True})}
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
-    size: list[Positive] = Field(min_length=2, max_length=3, description="[x, y] or [x, y, z] [m]; omitted with spacing")
+    size: list[Positive] = Field(min_length=2, max_length=3, description="sides [m]: [x, y] or [x, y, z]; omitted with spacing")
     resolution: int = Field(ge=2, le=MOST_CELLS, description="cells along the longest side; omitted with spacing")
     spacing: Positive | None = Field(default=None, description="cell size [m], instead of size and resolution")
     dimension: Literal[2, 3] | None = Field(default=None, description="number of axes, with spacing; default: 3")
