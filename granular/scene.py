@@ -61,7 +61,7 @@ class SandDomain(Domain):
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell",
         description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move; "
-        'whole cells to stresses if a solid moves, an axis is periodic or solver.method = "interleaved-sweeps"',
+        'stresses treat solids as whole cells if one moves, an axis is periodic or solver.method = "interleaved-sweeps"',
     )
     periodic: list[bool] | None = Field(default=None, description="periodic axes, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
 
@@ -81,7 +81,7 @@ class MaterialTable(Table):
     )
     cohesion: NonNegative = Field(
         default=0.0,
-        description="cohesion [Pa]: shear strength without pressure, over cos(friction_angle) unless friction_angle_test is repose",
+        description="cohesion [Pa]: shear strength at zero pressure; with other tests than repose, divided by cos(friction_angle)",
     )
     tensile_strength: NonNegative = Field(default=0.0, description="tensile strength at dense packing [Pa]")
     friction_angle_test: FrictionAngleTest = Field(

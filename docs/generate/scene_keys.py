@@ -56,8 +56,8 @@ Units are SI, angles are in degrees, y is up. Vectors have an entry per axis. Ke
 Unknown keys are refused; the message names the nearest key.
 """
 
-STEPS = """Steps end exactly at frames. They also end where a source or drain starts or stops or a solid's velocity jumps, but not
-within a quarter of a step of its start.
+STEPS = """Steps end exactly at frames. They also end when a source or drain starts or stops, or a solid's velocity jumps, if that leaves
+at least a quarter of the step.
 """
 
 DOMAIN = """Material may leave `separating` walls. It slides along `free-slip` walls and sticks to `sticky` ones, which need

@@ -56,7 +56,7 @@ class JointTable(Table):
     solids: list[int] = Field(
         min_length=1,
         max_length=2,
-        description="numbers of [[solid]] tables, from 0: a rigid body, and a body or solid; one number: in space",
+        description="numbers of [[solid]] tables, from 0: a body, and a body or solid; one number: held in space",
     )
     anchor: Vector = Field(description="anchor in the initial pose [m]")
     axis: Vector | None = Field(default=None, description="axis of a hinge in 3-D; z in 2-D")
@@ -109,7 +109,7 @@ class JointTable(Table):
 class TargetTable(Table):
     """[[target]]: path of a point of a body. Inverse kinematics moves the bodies, without forces and contacts.
 
-    Each body needs a hinge in which it comes first; hinges form trees that hang on what stands.
+    Each body must be the first body of a hinge; hinges form trees.
     """
 
     solid: int = Field(ge=0, description="number of the body among the [[solid]] tables, from 0")
