@@ -49,9 +49,7 @@ class Viscosity(Table):
     """[viscosity]: viscous liquid; off without the table."""
 
     value: float = Field(gt=0, le=1e9, allow_inf_nan=False, description="dynamic viscosity [Pa s]: water 0.001, honey 10")
-    slip_length: float = Field(
-        default=0.0, ge=0, allow_inf_nan=True, description='slip length of "separating" and "sticky" walls [m]'
-    )
+    slip_length: float = Field(default=0.0, ge=0, allow_inf_nan=True, description='slip length of "separating" and "sticky" walls [m]')
 
 
 class SurfaceTensionSettings(Table):

@@ -71,9 +71,7 @@ class MaterialTable(Table):
 
     renamed: ClassVar = {"angle_of": "friction_angle_test"}
     name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="material of the defaults")
-    friction_angle: Angle | None = Field(
-        default=None, description="slope at which running sand stops [degrees]; default: by name"
-    )
+    friction_angle: Angle | None = Field(default=None, description="slope at which running sand stops [degrees]; default: by name")
     density: Positive | None = Field(default=None, description="bulk density at the densest packing [kg/m^3]; default: by name")
     max_fraction: Share | None = Field(default=None, description="largest volume fraction of grains; default: by name")
     wall_friction: WallFriction | None = Field(
@@ -85,8 +83,7 @@ class MaterialTable(Table):
     )
     tensile_strength: NonNegative = Field(default=0.0, description="tensile strength at dense packing [Pa]")
     friction_angle_test: FrictionAngleTest = Field(
-        default="repose",
-        description="test of friction_angle: repose (slope where layers stop), plane-strain, triaxial-compression",
+        default="repose", description="test of friction_angle: repose (slope where layers stop), plane-strain, triaxial-compression"
     )
 
 
@@ -128,9 +125,7 @@ class SandSolver(Table):
     method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
         default="accelerated-projection", description="accelerated-projection, or interleaved-sweeps: several times slower"
     )
-    tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(
-        default=1e-3, description="root mean square residual [rho g dx]"
-    )
+    tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(default=1e-3, description="root mean square residual [rho g dx]")
     max_iterations: int = Field(default=600, ge=10, description="after these the step accepts the stresses")
     precision: Literal["single"] = Field(default="single", description="of the stresses; residuals are double")
 

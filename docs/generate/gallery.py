@@ -40,7 +40,6 @@ warp-lcp render out/dam-break --sheet
 ```
 
 `output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `--set domain.resolution=128` refines.
-`warp-lcp check NAME` estimates memory.
 
 Run times are of one core of a shared {device},
 {date}; bodies alone on an AMD EPYC.

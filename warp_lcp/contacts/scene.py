@@ -31,8 +31,7 @@ class ContactSolver(Table):
 
     preset: PresetName | None = Field(default=None, description="not for bodies alone")
     method: Literal[DEFAULT, *BOXED, *STEWART_TRINKLE, *CONE] = Field(
-        default=DEFAULT,
-        description=f"solver of contacts; with joints {JOINTED}, unless given",
+        default=DEFAULT, description=f"solver of contacts; with joints {JOINTED}, unless given"
     )
     directions: int = Field(
         default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle in 3-D, even"

@@ -56,9 +56,7 @@ class Shape(Table):
     if TYPE_CHECKING:
         shape: str  # of the file's key; each kind of shape has a value of its own
     translate: Vector | None = Field(default=None, description="translation [m]")
-    rotate: Angles | None = Field(
-        default=None, description="rotation [degrees]: a number in 2-D, [x, y, z] in 3-D"
-    )
+    rotate: Angles | None = Field(default=None, description="rotation [degrees]: a number in 2-D, [x, y, z] in 3-D")
     about: Vector | None = Field(default=None, description="fixed point of scale and rotate [m]; default: the origin")
     scale: Positive = Field(default=1.0, description="scale factor")
     invert: bool = Field(default=False, description="fill the outside")
@@ -235,11 +233,9 @@ class SolidProperties(Shape):
     )
     motion: Motion | None = Field(default=None, description="prescribed motion; default: at rest")
     mass: float | None = Field(default=None, ge=1e-18, description="mass of a rigid body [kg; kg/m in 2-D]")
-    density: float | None = Field(default=None, ge=1e-18, description="density of a rigid body [kg/m^3], instead of mass")
+    density: float | None = Field(default=None, ge=1e-18, description="density of a rigid body, instead of mass [kg/m^3]")
     velocity: Vector | None = Field(default=None, description="initial velocity of a body [m/s]; default: 0")
-    angular_velocity: Angles | None = Field(
-        default=None, description="initial [degrees/s]: a number in 2-D, [x, y, z] in 3-D; default: 0"
-    )
+    angular_velocity: Angles | None = Field(default=None, description="initial [degrees/s]: a number in 2-D, [x, y, z] in 3-D; default: 0")
     friction: WallFriction | None = Field(
         default=None,
         description=f"friction coefficient against sand, bodies and walls: {FRICTIONS}; "
