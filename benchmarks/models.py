@@ -281,8 +281,8 @@ def price_list(records: list[Record]) -> Mapping[str, Any]:
 
 
 def overview(records: Sequence[Record]) -> Table:
-    """Return the prices of all models side by side: what each adds to a step, as a share of `base`, and to memory."""
-    columns = {"fluids 3d": "liquid, 3-D", "fluids 2d": "liquid, 2-D", "granular 3d": "sand, 3-D", "granular 2d": "sand, 2-D"}
+    """Return the prices of all models in 3-D: what each adds to a step, as a share of `base`, and to memory."""
+    columns = {"fluids 3d": "liquid", "granular 3d": "sand"}
     priced = {record.name: record for record in records if ": " in record.name}
     names = list(dict.fromkeys(name.split(": ")[1] for name in priced))
     rows = []

@@ -37,28 +37,26 @@ class Pressure(Table):
     """[pressure]: pressure model and free surface."""
 
     model: Literal["incompressible", "unilateral"] = Field(
-        default="incompressible", description="incompressible: constant volume; unilateral: no suction, liquid separates freely"
+        default="incompressible", description="incompressible, or unilateral: no suction, liquid separates freely"
     )
     surface: Literal["ghost-fluid", "voxel"] = Field(
-        default="ghost-fluid", description="ghost-fluid: free surface between cell centers, second order; voxel: on cell faces"
+        default="ghost-fluid", description="ghost-fluid: between cell centers; voxel: on cell faces"
     )
-    smoothing: int = Field(default=0, ge=0, le=8, description="binomial filter passes over the level set of a ghost-fluid surface")
+    smoothing: int = Field(default=0, ge=0, le=8, description="filter passes over a ghost-fluid surface")
 
 
 class Viscosity(Table):
     """[viscosity]: viscous liquid; off without the table."""
 
-    value: float = Field(gt=0, le=1e9, allow_inf_nan=False, description="dynamic viscosity [Pa s]: water 0.001, honey 10, tar 10000")
-    slip_length: float = Field(
-        default=0.0, ge=0, allow_inf_nan=True, description='slip length of "separating" and "sticky" walls [m]; 0: no slip'
-    )
+    value: float = Field(gt=0, le=1e9, allow_inf_nan=False, description="dynamic viscosity [Pa s]: water 0.001, honey 10")
+    slip_length: float = Field(default=0.0, ge=0, allow_inf_nan=True, description='slip length of "separating" and "sticky" walls [m]')
 
 
 class SurfaceTensionSettings(Table):
     """[surface_tension]: tension of the free surface; off without the table."""
 
     coefficient: Positive = Field(description="surface tension [N/m]; water 0.072")
-    contact_angle: float = Field(default=90.0, ge=0, le=180, description="contact angle in the liquid [degrees]; above 90 walls repel it")
+    contact_angle: float = Field(default=90.0, ge=0, le=180, description="in the liquid [degrees]; above 90 walls repel it")
 
 
 class LiquidScene(ParticleScene):

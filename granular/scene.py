@@ -63,8 +63,8 @@ class SandDomain(Domain):
     )
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell",
-        description="cut-cell: surfaces of solids cut cells; voxel: solids fill whole cells and cannot move; stresses use whole "
-        'cells if a solid moves, an axis is periodic or solver.method = "interleaved-sweeps"',
+        description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move; "
+        'stresses treat solids as whole cells if one moves, an axis is periodic or solver.method = "interleaved-sweeps"',
     )
     periodic: list[bool] | None = Field(default=None, description="periodic axes, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
 
@@ -84,7 +84,7 @@ class MaterialTable(Table):
     )
     cohesion: NonNegative = Field(
         default=0.0,
-        description="cohesion [Pa]: shear strength without pressure, over cos(friction_angle) unless friction_angle_test is repose",
+        description="cohesion [Pa]: shear strength at zero pressure; with other tests than repose, divided by cos(friction_angle)",
     )
     tensile_strength: NonNegative = Field(default=0.0, description="tensile strength at dense packing [Pa]")
     friction_angle_test: FrictionAngleTest = Field(
@@ -96,13 +96,12 @@ class MaterialTable(Table):
 class Friction(Table):
     """[friction]: shear strength of sand.
 
-    With `dynamic_angle`, friction grows with the shear rate: mu(I) [Jop, Forterre & Pouliquen 2006]. The density of a
-    grain is `material.density` / `material.max_fraction`. Glass beads of 0.53 mm have 20.9 and 32.76 degrees. An
-    iteration of the solve takes up to 1.4 times as long.
+    With `dynamic_angle`, friction grows with the shear rate: mu(I) [Jop, Forterre & Pouliquen 2006]. Glass beads of
+    0.53 mm have 20.9 and 32.76 degrees. An iteration of the solve takes up to 1.4 times as long.
     """
 
     model: Literal["cone", "box"] = Field(
-        default="cone", description="cone: isotropic; box: of Narain et al. 2010, layers flow on slopes where they should rest"
+        default="cone", description="cone: isotropic; box: Narain et al. 2010, layers flow where they should rest"
     )
     dynamic_angle: Angle | None = Field(default=None, description="friction angle at high shear rates [degrees]")
     grain_size: Positive | None = Field(default=None, description="grain diameter [m], with dynamic_angle")
@@ -130,13 +129,11 @@ class SandSolver(Table):
 
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
     method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
-        default="accelerated-projection", description="interleaved-sweeps: the textbook method, several times slower"
+        default="accelerated-projection", description="accelerated-projection, or interleaved-sweeps: several times slower"
     )
-    tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(
-        default=1e-3, description="root mean square residual of the stresses [rho g dx]"
-    )
-    max_iterations: int = Field(default=600, ge=10, description="iterations before a step accepts the stresses as they are")
-    precision: Literal["single"] = Field(default="single", description="precision of the stresses; residuals are double")
+    tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(default=1e-3, description="root mean square residual [rho g dx]")
+    max_iterations: int = Field(default=600, ge=10, description="after these the step accepts the stresses")
+    precision: Literal["single"] = Field(default="single", description="of the stresses; residuals are double")
 
 
 class SandProperties(MaterialProperties):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,12 @@ def files() -> dict[str, Path]:
 
 
 def table() -> str:
-    """Return the table: a row for each piece of work, a column for each machine, milliseconds with iterations."""
+    """Return the table: a row for each piece of work that two machines did, a column for each machine, milliseconds with iterations."""
     machines: dict[str, dict[str, Any]] = {}
     for name, path in files().items():
         machines[name] = {record.pop("name"): record for record in json.loads(path.read_text())}
-    rows = list(dict.fromkeys(work for records in machines.values() for work in records if work != "machine"))
+    count = Counter(work for records in machines.values() for work in records if work != "machine")
+    rows = [work for work, times in count.items() if times > 1]
     lines = [f"| ms | {' | '.join(machines)} |", f"|---|{'---|' * len(machines)}"]
     lines += [f"| {work} | {' | '.join(_cell(records.get(work)) for records in machines.values())} |" for work in sorted(rows, key=_order)]
     dates = [f"{name}: {records['machine']['hardware']['device']}, {records['machine']['date']}" for name, records in machines.items()]

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import subprocess
 import sys
 import tomllib
@@ -33,18 +32,17 @@ HEAD = """# Gallery
 
 <!-- Written by docs/generate/gallery.py from runs of the scenes; do not edit. -->
 
-All built-in scenes. `warp-lcp scenes` lists them. To run and draw one:
+All built-in scenes. To run and draw one:
 
 ```sh
 warp-lcp run dam-break --set output.surface=true
 warp-lcp render out/dam-break --sheet
 ```
 
-`output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `warp-lcp check NAME` estimates run time
-and memory; `--set domain.resolution=128` refines.
+`output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `--set domain.resolution=128` refines.
 
-Below each picture: run time, peak memory (the program alone takes {base} MB), particles at the start. Measured on one core of a
-shared {device}, {date}; bodies alone on an AMD EPYC. A first run also compiles for some seconds.
+Run times are of one core of a shared {device},
+{date}; bodies alone on an AMD EPYC.
 """
 
 
@@ -104,15 +102,13 @@ def show(name: str, work: Path) -> dict[str, Any]:
 def entry(name: str, figures: dict[str, Any]) -> str:
     """Return what the page says of a scene."""
     about = tomllib.loads(scene_text(name))["scene"]
-    size = re.match(r"\d+ (particles|rigid bodies)", figures["note"])
-    description = about["description"][0].upper() + about["description"][1:]
-    took = f"{figures['seconds']:.0f} s, {figures['megabytes']} MB, {size[0] if size else ''}"
-    return f"## {name}\n\n![{name}](gallery/{name}.webp)\n\n{description}. {took}.\n"
+    description = about["description"][0].upper() + about["description"][1:].partition(" (")[0]
+    return f"## {name}\n\n![{name}](gallery/{name}.webp)\n\n{description}. {figures['seconds']:.0f} s.\n"
 
 
 def page(figures: dict[str, Any]) -> str:
     """Return the page."""
-    head = HEAD.format(device=figures["device"], date=figures["date"], base=figures["program megabytes"])
+    head = HEAD.format(device=figures["device"], date=figures["date"])
     return "\n".join([head, *(entry(name, figures["scenes"][name]) for name in scene_names())])
 
 
@@ -124,7 +120,6 @@ def main() -> None:
     asked = parser.parse_args()
     figures = json.loads(FIGURES.read_text()) if FIGURES.is_file() else {"scenes": {}}
     figures |= {"device": cpu_model(), "date": date.today().isoformat()}
-    figures["program megabytes"] = round(measured([sys.executable, "-c", "import warp as wp, fluids; wp.init()"]) / 2**20)
     for name in asked.scene or scene_names():
         figures["scenes"][name] = show(name, asked.work)
         print(name, figures["scenes"][name], flush=True)

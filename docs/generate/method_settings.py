@@ -1,4 +1,4 @@
-"""Writes docs/settings.md from the annotations of methods: `python docs/generate/method_settings.py`."""
+"""Writes docs/api/settings.md from the annotations of methods: `python docs/generate/method_settings.py`."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from typing import Any
 import warp_lcp as wl
 from warp_lcp.settings import ranges, rule
 
-PAGE = Path(__file__).parents[1] / "settings.md"
-COMMON = 3  # methods with the same row from which on it stands in the table of common settings
+PAGE = Path(__file__).parents[1] / "api" / "settings.md"
+COMMON = 3  # from this number of methods on, a setting that they share is in the common list
 HEAD = """# Settings of methods
 
 <!-- Written by docs/generate/method_settings.py from the classes; do not edit. -->
 
-Allowed values and defaults. Other values raise a `ValueError` that names the setting, the value and the range.
-[Solvers](api/solvers.md) explains the settings.
+Defaults and allowed values; [Solvers](solvers.md) explains them. Other values raise a `ValueError` that names the setting and
+its range.
 """
-ALSO = "and [common](#common-settings) "
+ALSO = "- [common](#common-settings): "
 
 
 def rows(kind: type[Any]) -> dict[str, str]:
-    """Return the settings of a class as rows of a table, by name."""
+    """Return the settings of a class as items of a list, by name."""
     allowed, default, found = ranges(kind), kind(), {}
     for name in (field.name for field in dataclasses.fields(kind)):
         words = rule(allowed[name]).replace("an integer", "integer").replace("a finite number", "finite")
-        found[name] = f"| `{name}` | {words} | `{getattr(default, name)!r}` |"
-    return found | {"cycle": "| `cycle` | `CycleSettings` | [CycleSettings](#cyclesettings) |"} if "cycle" in found else found
+        found[name] = f"- `{name}` = `{getattr(default, name)!r}`, {words}"
+    return found | {"cycle": "- `cycle`: [CycleSettings](#cyclesettings)"} if "cycle" in found else found
 
 
 def section(title: str, lines: list[str], also: list[str]) -> str:
-    """Return a table, and the names of settings that stand in the common one."""
-    table = ["| setting | must be | default |", "|---|---|---|", *lines, ""] if lines else []
+    """Return a list, and the names of settings that are in the common one."""
     names = ", ".join(f"`{name}`" for name in also)
-    return "\n".join(["", f"## {title}", "", *table, *([(ALSO if lines else "") + names, ""] if also else [])]) if lines or also else ""
+    items = [*lines, *([ALSO + names] if also else [])]
+    return "\n".join(["", f"## {title}", "", *items, ""]) if items else ""
 
 
 def page() -> str:

@@ -1,42 +1,77 @@
-"""Runs the notebooks' cells, without Jupyter, and keeps what they print: `python docs/generate/notebook_outputs.py`."""
+"""Runs the notebooks' cells, without Jupyter, and stores their output: `python docs/generate/notebook_outputs.py [NAME]...`."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import io
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("*.ipynb"))
+DOTS = 80  # per inch of a picture
 
 
-def printed(notebook: dict[str, Any]) -> list[str]:
-    """Run the code cells one after the other in one name space; return what each printed."""
+def code_cells(notebook: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the cells of code."""
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def printed(notebook: dict[str, Any], pictures: list[list[bytes]] | None = None) -> list[str]:
+    """Run the code cells one after the other in one name space; return the text that each prints.
+
+    Args:
+        notebook: as read from its file.
+        pictures: gets the PNG files of each cell's Matplotlib figures, if given.
+    """
     names: dict[str, Any] = {}
     texts = []
-    for number, cell in enumerate(notebook["cells"]):
-        if cell["cell_type"] == "code":
-            stream = io.StringIO()
-            with contextlib.redirect_stdout(stream):
-                exec(compile("".join(cell["source"]), f"cell {number}", "exec"), names)
-            texts.append(stream.getvalue())
+    for number, cell in enumerate(code_cells(notebook)):
+        stream = io.StringIO()
+        with contextlib.redirect_stdout(stream):
+            exec(compile("".join(cell["source"]), f"cell {number}", "exec"), names)
+        texts.append(stream.getvalue())
+        if pictures is not None:
+            pictures.append(drawn(names["plt"]))
     return texts
 
 
+def drawn(plt: Any) -> list[bytes]:
+    """Return the open figures as PNG files, and close them."""
+    found = []
+    for figure in map(plt.figure, plt.get_fignums()):
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=DOTS, bbox_inches="tight", metadata={"Software": None})
+        found.append(file.getvalue())
+    plt.close("all")
+    return found
+
+
 def kept(notebook: dict[str, Any]) -> list[str]:
-    """Return what the notebook holds as printed by its code cells."""
-    cells = (cell for cell in notebook["cells"] if cell["cell_type"] == "code")
-    return ["".join("".join(output["text"]) for output in cell["outputs"]) for cell in cells]
+    """Return the printed text that each code cell holds."""
+    return ["".join("".join(output.get("text", "")) for output in cell["outputs"]) for cell in code_cells(notebook)]
+
+
+def outputs(text: str, pictures: list[bytes], alt: str) -> list[dict[str, Any]]:
+    """Return the outputs of a cell as a notebook holds them."""
+    lines = text.splitlines(keepends=True)
+    shown = [{"image/png": base64.b64encode(picture).decode(), "text/plain": [alt]} for picture in pictures]
+    return [
+        *([{"name": "stdout", "output_type": "stream", "text": lines}] if lines else []),
+        *({"data": data, "metadata": {}, "output_type": "display_data"} for data in shown),
+    ]
 
 
 if __name__ == "__main__":
-    for file in NOTEBOOKS:
-        notebook = json.loads(file.read_text())
-        texts = iter(printed(notebook))
-        for cell in notebook["cells"]:
-            if cell["cell_type"] == "code":
-                text = next(texts)
-                lines = text.splitlines(keepends=True)
-                cell["outputs"] = [{"name": "stdout", "output_type": "stream", "text": lines}] if lines else []
-        file.write_text(json.dumps(notebook, indent=1) + "\n")
+    import matplotlib
+
+    matplotlib.use("agg")
+    for path in NOTEBOOKS:
+        if not sys.argv[1:] or path.stem in sys.argv[1:]:
+            content = json.loads(path.read_text())
+            images: list[list[bytes]] = []
+            for cell, text, found in zip(code_cells(content), printed(content, images), images, strict=True):
+                cell["outputs"] = outputs(text, found, cell["metadata"].get("alt", ""))
+            path.write_text(json.dumps(content, indent=1) + "\n")

@@ -14,7 +14,6 @@ END = "<!-- end of figures -->"
 COLUMNS = {  # heading of a column: bounds and size of its records
     "walls, 256^3": ("walls", "256^3"),
     "everywhere, 256^3": ("everywhere", "256^3"),
-    "everywhere, 1024^2": ("everywhere", "1024^2"),
 }
 LINEAR = "linear solve"
 

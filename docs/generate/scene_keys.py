@@ -44,11 +44,6 @@ resolution = 64
 shape = "box"
 min = [0.0, 0.0]
 max = [0.5, 0.8]
-
-[[solid]]
-shape = "sphere"
-center = [1.3, 0.2]
-radius = 0.1
 ```
 
 ```sh
@@ -57,16 +52,12 @@ warp-lcp run column.toml --set time.cfl=1.0    # overrides a key
 warp-lcp schema                                # JSON, for editors
 ```
 
-- Units are SI, angles are in degrees, y is up. Vectors have an entry per axis.
-- Keys are optional unless marked *required*. Unknown keys are refused; the message names the nearest key.
-
-[Get started](tutorial.md) builds scenes step by step. [Liquids](liquids.md), [sand](sand.md) and [rigid bodies](bodies.md)
-explain the models.
+Units are SI, angles are in degrees, y is up. Vectors have an entry per axis. Keys are optional unless marked *required*.
+Unknown keys are refused; the message names the nearest key.
 """
 
-STEPS = """Steps end exactly at frames. They also end where a source or drain starts or stops, or a solid's velocity jumps, unless
-that is within a quarter of a step of the step's start or of a frame, or another such time follows within the step. The inflow of a
-source is exact anyway.
+STEPS = """Steps end exactly at frames. They also end when a source or drain starts or stops, or a solid's velocity jumps, if that leaves
+at least a quarter of the step.
 """
 
 DOMAIN = """Material may leave `separating` walls. It slides along `free-slip` walls and sticks to `sticky` ones, which need
@@ -80,10 +71,9 @@ MATERIAL = """## Material, sources and drains
 
 PLACED = """### Placing a shape
 
-A shape is moved by `scale`, `rotate` and `translate`, in this order. 2-D angles are counterclockwise. In 3-D a shape is rotated about the
-fixed axes x, then y, then z.
-
-**`rotate` and `scale` are about the origin**, not about the shape's center, unless `about` gives another point.
+A shape is moved by `scale`, `rotate` and `translate`, in this order. **`rotate` and `scale` are about the origin**, not about
+the shape's center; `about` gives another point. 2-D angles are counterclockwise; in 3-D a shape is rotated about the fixed axes
+x, then y, then z.
 """
 
 SHAPED = """## Shapes
@@ -91,24 +81,22 @@ SHAPED = """## Shapes
 A shape has a `shape` and its keys, all of them required:
 """
 
-MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside is where its winding number is positive. Open and
-one-sided surfaces are refused. `warp-lcp check` and `run` report repairs:
-
-- Vertices closer than a millionth of the mesh's size are merged. Repeated triangles and those without area are dropped.
-- Triangles that disagree with their neighbors are flipped, as are parts that are inside out, except walls of hollows.
-- Intersections and parts inside other parts stay. Such a mesh cannot be a rigid body. It is refused if more than 1 % is inside out.
+MESHES = """A mesh is a closed surface, in 2-D its cut by z = 0. Inside, its winding number is positive. Vertices closer than a millionth of
+its size are merged, triangles without area are dropped, and triangles and parts that are inside out are flipped; `warp-lcp check`
+and `run` report this. Intersecting and nested parts stay, but such a mesh cannot be a rigid body. Open and one-sided surfaces are
+refused, and those of which more than 1 % stays inside out.
 """
 
 MOVING = """## Motions
 
-`motion = { kind = "...", ... }` prescribes the motion of a solid over time, from where its shape is placed. Angles of
-`keyframes` are in the order of [`rotate`](#placing-a-shape), about axes through `center`.
+`motion = { kind = "...", ... }` moves a solid from where its shape is placed. Angles of `keyframes` are in the order of
+[`rotate`](#placing-a-shape), about axes through `center`.
 """
 
 BODIES = """## Rigid bodies
 
-A `[[solid]]` with `mass` or `density` is a [rigid body](bodies.md): gravity, the material and other bodies move it. It must start apart
-from walls and other solids. A 2-D mass is that of a meter of depth.
+A `[[solid]]` with `mass` or `density` is a [rigid body](bodies.md). It must start apart from walls and other solids. A 2-D mass is
+that of a meter of depth.
 """
 
 LIQUID = """## Liquid
@@ -118,24 +106,22 @@ LIQUID = """## Liquid
 
 SAND = """## Sand
 
-`scene.simulator = "granular"`. See [sand](sand.md).
+`scene.simulator = "granular"`. See [sand](sand.md). `solver.preset` is that of liquids.
 """
 
 CONTACTS = """## Bodies alone
 
-`scene.simulator = "contacts"`: walls, gravity and `[[solid]]`s, at least one of them a rigid body, see
-[bodies without a material](bodies.md#without-a-material). There are no presets, and no frames of particles, cells
-or surfaces.
+`scene.simulator = "contacts"`: walls, gravity and `[[solid]]`s, at least one of them a rigid body. See
+[bodies without a material](bodies.md#without-a-material). There are no presets and no frames of material.
 """
 
 LIMITS = """## Limits
 
-- At most 8192 cells along an axis. Sides are whole numbers of cells.
+- At most 8192 cells along an axis. Sides must be whole numbers of cells.
 - A scene has one kind of sand, and its walls are `separating`. Liquids may differ in viscosity, not in density.
 - `narrow_band` and `output.forces` are for liquids only.
 - Periodic axes are for sand without rigid bodies, sources, drains, reseeding or `[density_correction]`.
 - A solid is moved by `motion` or is a rigid body, not both. Neither works with `solids = "voxel"`.
-- `name` has at most 60 letters, digits, `-`, `_`, `.` and spaces.
 """
 
 
@@ -343,6 +329,8 @@ def page() -> str:
     parts += ["## Particles\n", "Of liquids and sand.\n", *(section(name, tables[name]) for name in SAMPLED), LIQUID]
     parts += [section(name, definition) for name, definition in tables.items() if name not in (*SHARED, *SAMPLED)]
     parts += [*(section(f"[{name}]", definition) for name, definition in lists_of(liquid).items()), SAND]
+    own = {key: prop for key, prop in of_sand["solver"]["properties"].items() if tables["solver"]["properties"].get(key) != prop}
+    of_sand["solver"] = {**of_sand["solver"], "properties": own}
     parts += [section(name, definition) for name, definition in of_sand.items() if name not in (*SHARED, *SAMPLED)]
     parts += [CONTACTS, section("solver", of_bodies["solver"])]
     parts += [section(f"[{name}]", definition) for name, definition in lists_of(alone).items()]

@@ -6,6 +6,7 @@ themselves, without a script, with the font that comes along.
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 import re
@@ -24,14 +25,20 @@ LITERAL = re.compile(r"(<(pre|code|math)\b.*?</\2>|<[^>]*>)", flags=re.S)
 POWER = re.compile(r"(?<=[\w)\]|])\^(?:\(([^)]*)\)|(-1/2|-?\d+(?:\.\d+)?|[a-z]\b))")
 
 
-def page_of_notebook(text: str) -> str:
-    """Return a notebook as Markdown: its text, its code and what the code printed."""
-    parts = []
+def page_of_notebook(text: str, name: str) -> tuple[str, dict[str, bytes]]:
+    """Return a notebook as Markdown, with its text, code, printed text and pictures, and these pictures by their file names."""
+    parts, pictures = [], {}
     for cell in json.loads(text)["cells"]:
         source = "".join(cell["source"])
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
-        parts.extend("```text\n" + "".join(output["text"]).rstrip("\n") + "\n```" for output in cell.get("outputs", ()))
-    return "\n\n".join(parts) + "\n"
+        for output in cell.get("outputs", ()):
+            if output["output_type"] == "stream":
+                parts.append("```text\n" + "".join(output["text"]).rstrip("\n") + "\n```")
+            else:
+                file = f"{name}-{len(pictures) + 1}.png"
+                pictures[file] = base64.b64decode(output["data"]["image/png"])
+                parts.append(f"![{''.join(output['data']['text/plain'])}]({file})")
+    return "\n\n".join(parts) + "\n", pictures
 
 
 def outside_links(text: str) -> set[str]:
@@ -51,7 +58,10 @@ def on_files(files: Any, config: Any) -> Any:
     docs = Path(config.docs_dir)
     root = Path(config.config_file_path).parent
     for notebook in sorted(docs.glob("*.ipynb")):
-        files.append(File.generated(config, f"{notebook.stem}.md", content=page_of_notebook(notebook.read_text())))
+        page, pictures = page_of_notebook(notebook.read_text(), notebook.stem)
+        files.append(File.generated(config, f"{notebook.stem}.md", content=page))
+        for picture, content in pictures.items():
+            files.append(File.generated(config, picture, content=content))
     files.append(File.generated(config, FONT, abs_src_path=str(distribution("ziamath").locate_file(f"ziamath/fonts/{FONT}"))))
     wanted = set().union(*(outside_links(page.read_text()) for page in docs.glob("*.md")))
     wanted |= set(re.findall(r"(benchmarks/\S+\.md|[A-Z]+\.md)", json.dumps(config.nav)))

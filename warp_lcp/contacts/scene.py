@@ -39,7 +39,7 @@ class ContactSolver(Table):
         default=4, ge=2, le=64, multiple_of=2, description="sides of the friction cone of Stewart and Trinkle in 3-D, even"
     )
     tolerance: Share = Field(default=1e-5, description="residual, relative to that of no impulses")
-    max_iterations: Count = Field(default=600, description="iterations before a step accepts the impulses as they are")
+    max_iterations: Count = Field(default=600, description="after these the step accepts the impulses")
     precision: PrecisionName = Field(default="double", description="double only")
 
 
@@ -53,7 +53,7 @@ class ContactOutput(Output):
 class JointTable(Table):
     """[[joint]]: connects two bodies at a point, or a body with space. Bodies of a joint do not collide."""
 
-    kind: JointKind = Field(description="ball: rotation about the anchor; hinge: rotation about an axis through it; fixed: no rotation")
+    kind: JointKind = Field(description="ball: turns about the anchor; hinge: about an axis; fixed: not")
     solids: list[int] = Field(
         min_length=1,
         max_length=2,
@@ -62,7 +62,7 @@ class JointTable(Table):
     anchor: Vector = Field(description="anchor in the initial pose [m]")
     axis: Vector | None = Field(default=None, description="axis of a hinge in 3-D; z in 2-D")
     limits: list[float] | None = Field(
-        default=None, min_length=2, max_length=2, description="least and largest angle of a hinge, 0 in the initial pose [degrees]"
+        default=None, min_length=2, max_length=2, description="least and largest angle of a hinge [degrees], initially 0"
     )
     motor_speed: float | None = Field(default=None, description="target speed of the motor of a hinge [degrees/s]")
     motor_torque: Positive | None = Field(default=None, description="largest torque of the motor [N m]")
@@ -112,13 +112,13 @@ class JointTable(Table):
 class TargetTable(Table):
     """[[target]]: path of a point of a body. Inverse kinematics moves the bodies, without forces and contacts.
 
-    Each body needs a hinge in which it comes first; hinges form trees that hang on what stands.
+    Each body must be the first body of a hinge; hinges form trees.
     """
 
-    solid: int = Field(ge=0, description="number of the rigid body among the [[solid]] tables, from 0")
-    point: Vector = Field(description="point of the body in its initial pose [m]")
+    solid: int = Field(ge=0, description="number of the body among the [[solid]] tables, from 0")
+    point: Vector = Field(description="point of the body, initial pose [m]")
     times: list[float] = Field(min_length=1, description="increasing [s]")
-    places: list[Vector] = Field(min_length=1, description="places of the point at these times, on straight lines between them [m]")
+    places: list[Vector] = Field(min_length=1, description="its places at these times [m], straight lines between")
 
     def complaints(self, dimension: int, solids: Sequence[Any]) -> list[Complaint]:
         """Return what is wrong with the target among these solids in a scene of 2 or 3 dimensions."""

@@ -48,7 +48,7 @@ class Reseed(Table):
 
 
 class NarrowBandSettings(Table):
-    """[particles.narrow_band]: particles, in frames too, only near the surface; off without the table."""
+    """[particles.narrow_band]: particles only near the surface; off without the table."""
 
     width: float = Field(default=4.0, ge=3, description="cells below the surface that hold particles")
 
@@ -57,10 +57,10 @@ class ParticleSettings(Table):
     """[particles]: sampling of the material, transfers between particles and grid."""
 
     per_axis: int = Field(default=2, ge=1, le=4, description="particles per cell edge at the start")
-    transfer: Literal["apic", "flip", "pic"] = Field(default="apic", description="transfer; flip is livelier and noisier, pic damps")
-    flip_ratio: Part = Field(default=0.95, description="share of FLIP with transfer flip; the rest is PIC")
-    jitter: Part = Field(default=0.25, description="random displacement at the start [particle distances]")
-    seed: CountOrZero = Field(default=2015, description="seed of the random displacements")
+    transfer: Literal["apic", "flip", "pic"] = Field(default="apic", description="apic, flip (livelier, noisier) or pic (damps)")
+    flip_ratio: Part = Field(default=0.95, description="share of FLIP; the rest is PIC")
+    jitter: Part = Field(default=0.25, description="random initial displacement [particle distances]")
+    seed: CountOrZero = Field(default=2015, description="seed of jitter")
     reseed: Reseed | None = None
     narrow_band: NarrowBandSettings | None = None
 
@@ -71,12 +71,12 @@ class ParticleSettings(Table):
 
 
 class DensityCorrectionSettings(Table):
-    """[density_correction]: moves particles apart in cells that are too dense; without the table, once about 0.1 % of a liquid is."""
+    """[density_correction]: moves particles out of overfull cells; without the table, once these hold 0.1 % of a liquid."""
 
     every: CountOrZero = Field(default=1, description="steps between corrections; 0: off")
     tolerance: Share = Field(default=1e-2, description="relative residual")
     max_density: float | None = Field(
-        default=None, gt=0, le=2, description="largest density of a cell [density at rest]; default: 1 + 0.1 / particles.per_axis"
+        default=None, gt=0, le=2, description="largest relative density of a cell; default: 1 + 0.1 / particles.per_axis"
     )
 
     def largest(self, per_axis: int) -> float:

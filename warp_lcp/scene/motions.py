@@ -99,7 +99,7 @@ class SinusoidMotion(PrescribedMotion):
     kind: Literal["sinusoid"] = "sinusoid"
     period: Positive = Field(description="period [s]")
     amplitude: Vector | None = Field(default=None, description="amplitude of the translation along each axis [m]")
-    phase: float = Field(default=0.0, description="phase [degrees]; 0: in the middle at time 0, -90: at rest at one end")
+    phase: float = Field(default=0.0, description="[degrees]; at time 0, 0 is the middle, -90 an end")
     angle: float | None = Field(default=None, description="amplitude of the rotation [degrees]")
     center: Vector | None = Field(default=None, description=CENTER)
     axis: Axis | None = Field(default=None, description=AXIS)
@@ -135,9 +135,9 @@ class KeyframesMotion(PrescribedMotion):
     kind: Literal["keyframes"] = "keyframes"
     times: list[float] = Field(min_length=2, description="increasing times [s]")
     translate: list[Vector] | None = Field(default=None, description="translation at each time [m]")
-    rotate: list[Angles] | None = Field(default=None, description="rotation at each time [degrees]: one angle in 2-D, [x, y, z] in 3-D")
+    rotate: list[Angles] | None = Field(default=None, description="rotation at each time [degrees]: a number in 2-D, [x, y, z] in 3-D")
     center: Vector | None = Field(default=None, description="fixed point of the rotation [m]")
-    interpolation: Literal["linear", "smooth"] = Field(default="linear", description="smooth: at rest at the ends, no jumps of velocity")
+    interpolation: Literal["linear", "smooth"] = Field(default="linear", description="linear, or smooth: no jumps of velocity")
 
     def to_motion(self, dimension: int) -> motion.Motion:
         """Return shift and turn over time."""

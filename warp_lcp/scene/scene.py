@@ -44,7 +44,7 @@ def _tolerance(value: Any) -> Any:
 
 Tolerance = Annotated[Share | Literal["auto"], BeforeValidator(_tolerance, json_schema_input_type=Share | Literal["auto"])]
 
-PRESET_KEY = "defaults of time step, tolerance and others by accuracy"
+PRESET_KEY = "set of defaults by accuracy"
 
 LONGEST_NAME = 60  # characters; file systems take 255 bytes, and a letter has up to four
 NAME_RULE = f'must be a name of at most {LONGEST_NAME} letters, digits, "-", "_", "." and spaces, without a dot or space at its ends'
@@ -77,7 +77,7 @@ class Time(Table):
     """[time]: duration, frames and steps."""
 
     duration: Positive = Field(description="simulated time [s]")
-    frames_per_second: Positive = Field(default=30.0, description="frames per simulated second [1/s]")
+    frames_per_second: Positive = Field(default=30.0, description="frames per simulated second")
     cfl: float = Field(default=2.0, ge=1e-3, description="Courant number, usually 1 to 4")
     dt_max: Positive = Field(default=0.02, description="longest step [s]")
     dt_min: Positive = Field(default=1e-6, description="shortest step from cfl or retries [s]")
@@ -103,15 +103,15 @@ class Domain(Table):
 
     later: ClassVar = {"periodic": frozenset({True})}
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
-    size: list[Positive] = Field(min_length=2, max_length=3, description="sides [m], [x, y] or [x, y, z]; omitted with spacing")
+    size: list[Positive] = Field(min_length=2, max_length=3, description="sides [m]: [x, y] or [x, y, z]; omitted with spacing")
     resolution: int = Field(ge=2, le=MOST_CELLS, description="cells along the longest side; omitted with spacing")
     spacing: Positive | None = Field(default=None, description="cell size [m] of an unbounded domain, instead of size and resolution")
     dimension: Literal[2, 3] | None = Field(default=None, description="number of axes, with spacing; default: 3")
-    wall: Wall = Field(default="separating", description="boundary condition on the domain's walls")
+    wall: Wall = Field(default="separating", description="boundary condition")
     solids: Literal["cut-cell", "voxel"] = Field(
-        default="cut-cell", description="cut-cell: surfaces of solids cut cells; voxel: solids fill whole cells and cannot move"
+        default="cut-cell", description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move"
     )
-    open: list[Literal[SIDES]] = Field(default_factory=list, description="sides without a wall, where material leaves")
+    open: list[Literal[SIDES]] = Field(default_factory=list, description="sides where material leaves")
     follow: bool = Field(default=True, description="grid around the material only; false: the whole domain")
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
 
@@ -153,9 +153,9 @@ class Solver(Table):
     """[solver]: solution of the complementarity problem of each step."""
 
     preset: PresetName | None = Field(default=None, description=PRESET_KEY)
-    method: GridMethod = Field(default="projected-multigrid", description="projected-multigrid is the fastest")
-    tolerance: Tolerance = Field(default=1e-4, description='relative residual; "auto": a tenth of the error of the time step')
-    precision: PrecisionName = Field(default="mixed", description="precision of the method")
+    method: GridMethod = Field(default="projected-multigrid", description="the default is the fastest")
+    tolerance: Tolerance = Field(default=1e-4, description='relative residual; "auto": follows the time step')
+    precision: PrecisionName = Field(default="mixed", description="precision")
     max_iterations: Count = Field(default=100, description="iterations before the step fails")
 
 
@@ -164,19 +164,19 @@ class Output(Table):
 
     particles: bool = Field(default=True, description="frames of particles")
     grid: bool = Field(default=True, description="frames of cells")
-    surface: bool = Field(default=False, description="frames of the surface: closed triangles, 2-D: segments")
+    surface: bool = Field(default=False, description="frames of the surface")
     surface_resolution: int | None = Field(
         default=None, ge=1, le=8, description="surface points per cell edge; default: particles.per_axis"
     )
     surface_smoothing: float = Field(default=1.5, ge=0.5, le=10, description="kernel width of the surface [particle distances]")
-    surface_ply: bool = Field(default=False, description="surfaces as PLY files too, for Blender and others")
+    surface_ply: bool = Field(default=False, description="surfaces also as PLY files")
     format: FrameFormat = Field(default="vtu", description="format of frames")
-    grid_format: Literal["vtu", "vti"] = Field(default="vtu", description="format of frames of cells; vti is smaller and faster")
+    grid_format: Literal["vtu", "vti"] = Field(default="vtu", description="format of cells")
     volume: bool = Field(default=False, description="level set and density as NanoVDB files, 3-D")
-    diagnostics: bool = Field(default=True, description="log of volume and divergence (liquid), yielding and dissipation (sand)")
-    forces: bool = Field(default=False, description="forces.csv: force and torque of a liquid on each solid per step")
+    diagnostics: bool = Field(default=True, description="log volume and divergence; sand: yielding and dissipation")
+    forces: bool = Field(default=False, description="forces.csv: force and torque of a liquid on each solid")
     checkpoint_every: CountOrZero = Field(default=50, description="steps between checkpoints; 0: unlimited")
-    checkpoint_minutes: Positive | None = Field(default=None, description="longest real time between checkpoints [min]")
+    checkpoint_minutes: Positive | None = Field(default=None, description="real time between checkpoints [min]")
     checkpoints_kept: Count = Field(default=3, description="number of checkpoints kept")
 
 

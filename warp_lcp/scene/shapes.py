@@ -58,12 +58,10 @@ class Shape(Table):
     if TYPE_CHECKING:
         shape: str  # of the file's key; each kind of shape has a value of its own
     translate: Vector | None = Field(default=None, description="translation [m]")
-    rotate: Angles | None = Field(
-        default=None, description="rotation about the origin or about [degrees]: one angle in 2-D, [x, y, z] in 3-D"
-    )
+    rotate: Angles | None = Field(default=None, description="rotation [degrees]: a number in 2-D, [x, y, z] in 3-D")
     about: Vector | None = Field(default=None, description="fixed point of scale and rotate [m]; default: the origin")
     scale: Positive = Field(default=1.0, description="scale factor")
-    invert: bool = Field(default=False, description="outside of the shape instead of inside")
+    invert: bool = Field(default=False, description="fill the outside")
 
     @abstractmethod
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
@@ -213,7 +211,7 @@ class MeshTable(Shape):
     """Interior of a closed triangle surface; in 2-D its cut by the plane z = 0."""
 
     shape: Literal["mesh"] = "mesh"
-    file: str = Field(min_length=1, description=f"OBJ, STL or PLY file, or a built-in mesh, such as {BUILTIN}torus")
+    file: str = Field(min_length=1, description=f"OBJ, STL or PLY file, or built-in, such as {BUILTIN}torus")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the inside of the mesh."""
@@ -233,26 +231,24 @@ class SolidProperties(Shape):
     """
 
     rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
-    wall: Wall | None = Field(default=None, description="boundary condition on its surface; default: domain.wall")
+    wall: Wall | None = Field(default=None, description="boundary condition; default: domain.wall")
     slip_length: float | None = Field(
         default=None,
         ge=0,
         allow_inf_nan=True,
-        description="slip length of a viscous liquid on it [m], inf: free slip; default: viscosity.slip_length",
+        description="slip length of viscous liquid [m]; inf: free slip; default: viscosity.slip_length",
     )
     motion: Motion | None = Field(default=None, description="prescribed motion; default: at rest")
     mass: float | None = Field(default=None, ge=1e-18, description="mass of a rigid body [kg; kg/m in 2-D]")
     density: float | None = Field(default=None, ge=1e-18, description="density of a rigid body, instead of mass [kg/m^3]")
-    velocity: Vector | None = Field(default=None, description="initial velocity of a rigid body [m/s]; default: 0")
-    angular_velocity: Angles | None = Field(
-        default=None, description="initial angular velocity of a rigid body [degrees/s]: a number in 2-D, [x, y, z] in 3-D; default: 0"
-    )
+    velocity: Vector | None = Field(default=None, description="initial velocity of a body [m/s]; default: 0")
+    angular_velocity: Angles | None = Field(default=None, description="initial [degrees/s]: a number in 2-D, [x, y, z] in 3-D; default: 0")
     friction: WallFriction | None = Field(
         default=None,
         description=f"friction coefficient against sand, bodies and walls: {FRICTIONS}; "
         f"default: domain.friction, in liquids {BODY_FRICTION:g}",
     )
-    restitution: Part = Field(default=0.0, description="coefficient of restitution of a rigid body")
+    restitution: Part = Field(default=0.0, description="coefficient of restitution")
     drag: NonNegative | None = Field(default=None, description="drag coefficient c_f in a liquid; default: wall_drag.coefficient")
 
     @property
@@ -371,9 +367,9 @@ class Schedule(Table):
 class SourceProperties(Schedule, Shape):
     """Properties of a source besides its shape."""
 
-    velocity: Vector = Field(description="velocity of the inflow [m/s]")
+    velocity: Vector = Field(description="inflow velocity [m/s]")
     viscosity: float | None = Field(
-        default=None, gt=0, le=1e9, allow_inf_nan=False, description="viscosity of the inflow [Pa s]; default: viscosity.value"
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="viscosity [Pa s]; default: viscosity.value"
     )
 
     def complaints(self, dimension: int) -> list[Complaint]:
