@@ -107,7 +107,7 @@ class RigidBody:
     @property
     def angular_velocity(self) -> np.ndarray:
         """Angular velocity in the world's axes [rad/s], shape (3,)."""
-        return cast(np.ndarray, spins(self.rotation, self.properties.inverse_inertia, self.angular_momentum))
+        return spins(self.rotation, self.properties.inverse_inertia, self.angular_momentum)
 
     @property
     def inertia(self) -> np.ndarray:
