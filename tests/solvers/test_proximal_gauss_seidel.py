@@ -144,8 +144,12 @@ def test_bits_are_those_of_one_thread():
     assert len(found) == 1
 
 
-def test_it_is_found_by_its_name():
-    assert wl.METHODS["proximal-gauss-seidel"] is wl.ProximalGaussSeidel
+def test_it_is_listed_and_refuses_other_problems():
+    assert ("proximal-gauss-seidel", wl.ProximalGaussSeidel) in wl.METHODS.items()
+    problem = wl.LCP(np.eye(2), -np.ones(2))
+    with pytest.raises(ValueError, match="ProximalGaussSeidel takes problems of the class FrictionalContact: this is a LCP"):
+        wl.solve(problem, "proximal-gauss-seidel")
+    assert "proximal-gauss-seidel" not in wl.recommend(problem).alternatives
 
 
 def test_contacts_of_a_color_share_no_body():
