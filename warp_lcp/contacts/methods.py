@@ -84,12 +84,13 @@ class MethodOfChoice:
         return ContactImpulses(impulses, float(result.relative_residual), result.iterations)
 
     def _in_cones(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
-        """Return the impulses in the circular cones; tolerances are relative to no impulses, as those of the other models."""
+        """Return the impulses in the circular cones; tolerances are relative to no impulses, as those of the other models.
+
+        Contacts do not yield here. Where they are redundant (J'z = 0), as in jammed packings, e > 0 makes the impulses unique, but a sweep
+        changes their part along z by e / B only: the residual |e r| would take 1 / YIELDS sweeps. Sweeps without e need no unique impulses.
+        """
         p = problem
-        yields = p.yields()[1].reshape(p.b.shape)
-        cones = wl.FrictionalContact(
-            p.first, p.second, p.one, p.other, p.b, p.friction, p.bodies, yields=yields, device=self._device
-        )  # fmt: skip
+        cones = wl.FrictionalContact(p.first, p.second, p.one, p.other, p.b, p.friction, p.bodies, device=self._device)
         assert self._cone is not None
         stopping = replace(self._stopping, rtol=0.0, atol=self._stopping.rtol * cones.reference)
         result = wl.solve(cones, self._cone(), stopping=stopping, x0=start)
