@@ -25,16 +25,7 @@ from warp_lcp.material import density_correction
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.settings import OrInfinite, SettingError, Settings, checked, ranges, renamed_method, rule
 
-KINDS = [
-    *wl.METHODS.values(),
-    wl.ProximalGaussSeidel,
-    wl.StoppingCriteria,
-    wl.CycleSettings,
-    AlgebraicSettings,
-    PetscActiveSet,
-    InverseKinematics,
-    Plant,
-]
+KINDS = [*wl.METHODS.values(), wl.StoppingCriteria, wl.CycleSettings, AlgebraicSettings, PetscActiveSet, InverseKinematics, Plant]
 KINDS = [kind for kind in [*KINDS, *SAND.values()] if dataclasses.fields(kind)]
 NUMBERS = [None, True, "1", [1.0], 1j, math.nan, -math.inf, np.float64("nan"), np.bool_(True), np.ones(2)]  # that are none
 

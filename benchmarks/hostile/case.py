@@ -15,11 +15,12 @@ import scipy.io
 import scipy.sparse
 
 import warp_lcp as wl
+from warp_lcp.problem.protocol import families
 
 Bounds = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 CONVERGED, INFEASIBLE, REFUSED, EXCEPTION = "CONVERGED", "INFEASIBLE", "REFUSED", "EXCEPTION"
 # Methods that take any matrix, or refuse it in a ValueError, which is no fault.
-NAMED = tuple(sorted(set(wl.METHODS) - {"projected-multigrid", "direct-enumeration"}))
+NAMED = tuple(sorted(name for name, cls in wl.METHODS.items() if "dense" in families(cls) and name != "direct-enumeration"))
 GRID_METHODS = ("projected-multigrid", "minimum-map-newton", "mprgp", "psor", "interior-point")
 
 

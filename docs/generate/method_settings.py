@@ -40,7 +40,7 @@ def section(title: str, lines: list[str], also: list[str]) -> str:
 
 def page() -> str:
     """Return the page."""
-    methods = {kind.__name__: rows(kind) for kind in (*wl.METHODS.values(), wl.ProximalGaussSeidel)}
+    methods = {kind.__name__: rows(kind) for kind in wl.METHODS.values()}
     count = Counter(line for found in methods.values() for line in found.values())
     common = [line for line, times in count.items() if times >= COMMON]
     names = Counter(line.split("`")[1] for line in common)

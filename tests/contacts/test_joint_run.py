@@ -161,7 +161,7 @@ def done(*arguments: object) -> str:
     return result.stdout
 
 
-@pytest.mark.parametrize("name", ["gears", "motor-arm", "reach", "snake"])
+@pytest.mark.parametrize("name", ["gear-pyramid", "gears", "motor-arm", "reach", "snake"])
 def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
     """meshio opens them, the log has residual and iterations, an image is drawn, and `scenes` lists them."""
     assert "joints" in done("check", name, "--device", "cpu")
@@ -176,6 +176,33 @@ def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
     assert set(np.unique(mesh.point_data["body"])) == set(range(shown))
     done("render", tmp_path / "run", "--frame", 1, "--size", "320x240")
     assert (tmp_path / "run" / "images" / "frame_000001.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("limit", [2.0, 60.0])
+def test_an_arch_is_held_up_by_the_limits_of_its_hinges(limit: float) -> None:
+    """It sags until six of them have reached them, then stands. Loose hinges let it fall."""
+    scene = loaded("arched-snake")
+    simulation = made(scene.model_copy(update={"joint": [j.model_copy(update={"limits": [-limit, limit]}) for j in scene.joint]}))
+    for _ in range(15):
+        row = simulation.step(0.01)
+    angles = np.array([value for key, value in row.items() if key.endswith("_angle")])
+    top = simulation.bodies.bodies.position[4, 1]
+    assert len(angles) == 8 and np.abs(angles).max() < limit + 1e-4
+    assert (row["max_speed"] < 1e-5) == (limit == 2.0)
+    assert ((np.abs(np.abs(angles) - 2.0) < 1e-3).sum() == 6) == (limit == 2.0)
+    assert (top > 1.10) == (limit == 2.0)
+
+
+@pytest.mark.slow
+def test_a_pyramid_of_gears_settles_between_its_posts() -> None:
+    """At rest, row on row, and as symmetric as it began: gears of a row push outward, those of the middle stay there."""
+    simulation = made(loaded("gear-pyramid"))
+    for _ in range(60):
+        row = simulation.step(0.01)
+    x, y = simulation.bodies.bodies.position[::3, :2].T  # of the first bar of each gear
+    assert row["max_speed"] < 1e-5
+    np.testing.assert_allclose(x + x[[2, 1, 0, 4, 3, 5]], 2.08, atol=0.02)
+    assert (np.diff([y[:3].mean(), y[3:5].mean(), y[5]]) > 0.4).all()
 
 
 @pytest.mark.slow
@@ -195,7 +222,7 @@ def test_a_gear_turns_one_with_twice_its_teeth_half_as_fast() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "apart"), [("motor-arm", 1e-6), ("snake", 1e-5)])
+@pytest.mark.parametrize(("name", "apart"), [("arched-snake", 1e-6), ("gear-pyramid", 1e-6), ("motor-arm", 1e-6), ("snake", 1e-5)])
 def test_built_in_scenes_run_to_their_ends(name: str, apart: float) -> None:
     scene = loaded(name)
     simulation = made(scene)

@@ -6,11 +6,12 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.problem.protocol import families
 from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.solvers.registry import METHODS
 
 RIGHT = {wl.SolveStatus.CONVERGED}
-DENSE = sorted(name for name, method in METHODS.items() if name != "projected-multigrid")
+DENSE = sorted(name for name, method in METHODS.items() if "dense" in families(method))
 CRITERIA = wl.StoppingCriteria(rtol=1e-6, max_iterations=3000, patience=300)
 
 

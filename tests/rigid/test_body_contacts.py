@@ -165,7 +165,7 @@ def test_a_ball_rolls_down_a_slope():
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_an_overlap_is_removed_without_speed(dimension):
     bodies = bodies_of([box([0.4, 0.0], [0.6, 0.1], dimension)], dimension)
-    bodies.bodies[0].position[1] -= 2e-3
+    bodies.bodies.position[0, 1] -= 2e-3
     energies = run(bodies, 0.5)
     assert energies.max() < 1e-12
     assert bodies.bodies[0].position[1] == pytest.approx(0.05, abs=5e-6)
@@ -389,5 +389,5 @@ def test_a_side_of_an_axis_without_an_end_stops_the_run():
     run(bodies, 0.06)
     assert bodies.trouble([1.0, 1.0], ()) is None
     assert "periodic x axis" in bodies.trouble([1.0, 1.0], (0,))
-    bodies.bodies[0].momentum[0] = np.inf
+    bodies.bodies.momentum[0, 0] = np.inf
     assert "not finite" in bodies.trouble([1.0, 1.0], ())

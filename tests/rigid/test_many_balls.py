@@ -4,10 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from warp_lcp.grid.solids import Sphere
-from warp_lcp.rigid.contact_detection import ContactDetection, Place, between, close_pairs
+from warp_lcp.grid.motion import Pose
+from warp_lcp.grid.solids import Box, Sphere
+from warp_lcp.rigid.body import BodyStates, RigidBody
+from warp_lcp.rigid.contact_detection import ContactDetection, Place, between, close_pairs, on_plane
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contacts import SAME_PLACE, ContactMemory
+from warp_lcp.rigid.mass_properties import MassProperties
+from warp_lcp.rigid.obstacles import Obstacle
 
 
 def test_close_pairs_are_those_that_overlap():
@@ -25,13 +29,21 @@ def turned(rng):
     return np.linalg.qr(rng.standard_normal((3, 3)))[0]
 
 
+def placed(positions, rng):
+    """Bodies turned at random, with their centers of mass at some positions."""
+    unit = MassProperties(mass=1.0, center=np.zeros(3), inertia=np.eye(3))
+    bodies = BodyStates([RigidBody(unit, name=f"body {i}") for i in range(len(positions))])
+    bodies.position[:], bodies.rotation[:] = positions, [turned(rng) for _ in positions]
+    return bodies
+
+
 def test_balls_touch_where_each_two_of_them_do():
     """Pair by pair by the distance to the other one; two have the same center."""
     rng, n = np.random.default_rng(3), 25
     shapes = [ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3) for _ in range(n)]
     at = rng.uniform(0.0, 1.2, (n, 3))
     at[7] = at[3]
-    bodies = [SimpleNamespace(rotation=turned(rng), position=p, properties=SimpleNamespace(center=np.zeros(3))) for p in at]
+    bodies = placed(at, rng)
     ways = rng.uniform(0.0, 0.02, n)
     found = ContactDetection(bodies, shapes, (), 3).find(0.0, ways, np.zeros(0), 0.01)
     places = [Place(body.rotation, body.position) for body in bodies]
@@ -40,10 +52,11 @@ def test_balls_touch_where_each_two_of_them_do():
         for j in range(i):
             points = between(shapes[i], places[i], shapes[j], places[j], 0.01 + ways[i] + ways[j], 3)
             expected |= {(i, j): points} if len(points) else {}
-    assert [(pair.first, pair.second) for pair in found] == list(expected) and len(expected) > 20 and (7, 3) in expected
-    for pair in found:
-        for name in ("point", "normal", "gap"):
-            np.testing.assert_allclose(getattr(pair.points, name), getattr(expected[pair.first, pair.second], name), atol=1e-12)
+    assert list(zip(found.first.tolist(), found.second.tolist(), strict=True)) == list(expected)
+    assert len(expected) > 20 and (7, 3) in expected
+    for name in ("point", "normal", "gap"):
+        each = np.concatenate([getattr(points, name) for points in expected.values()])
+        np.testing.assert_allclose(getattr(found.points, name), each, atol=1e-12)
 
 
 class Touching(SimpleNamespace):
@@ -57,7 +70,7 @@ def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         n, k, m = (int(count) for count in rng.integers((1, 1, 1), (5, 30, 30)))
-        bodies = [SimpleNamespace(position=rng.standard_normal(3), rotation=turned(rng)) for _ in range(n)]
+        bodies = placed(rng.standard_normal((n, 3)), rng)
         contacts = Touching(
             first=rng.integers(0, n, k), second=rng.integers(0, n + 1, k), point=rng.standard_normal((k, 3)).round(1),
             size=np.full(k, rng.uniform(0, 40)), frames=rng.standard_normal((k, 3, 3)), wall=np.zeros((k, 3)),
@@ -75,3 +88,23 @@ def test_impulses_come_back_to_the_nearest_contact_of_the_same_two():
             np.testing.assert_allclose(start[c], contacts.frames[c] @ old[nearest, 5:] if known else 0.0, atol=1e-14)
             recalled += known
     assert recalled > 20
+
+
+def test_balls_touch_planes_where_each_of_them_does():
+    """Body by body and plane by plane, with a box among the balls and an obstacle that has moved."""
+    rng, n = np.random.default_rng(8), 12
+    shapes = [ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=float(rng.uniform(0.1, 0.3))), 3) for _ in range(n)]
+    shapes[4] = ContactShape.of(Box(lower=[-0.2, -0.1, -0.3], upper=[0.2, 0.1, 0.3]), 3)
+    bodies, normals = placed(rng.uniform(-0.3, 0.5, (n, 3)), rng), turned(rng)
+    still = SimpleNamespace(pose=lambda time: Pose(rotation=np.eye(3), translation=np.array([0.0, 0.1, 0.0])))
+    planes = Obstacle(name="planes", points=rng.uniform(-0.3, 0.0, (3, 3)), normals=normals, motion=still)
+    ways = rng.uniform(0.0, 0.02, n)
+    found = ContactDetection(bodies, shapes, (planes,), 3, every=True).find(0.0, ways, np.full(1, 0.01))
+    found, expected = found.where(found.obstacle == 0), []
+    for i, body in enumerate(bodies):
+        for point, normal in zip(planes.points + 0.1 * np.eye(3)[1], normals, strict=True):
+            touch = on_plane(shapes[i], Place(body.rotation, body.position), point, normal, 0.01 + ways[i])
+            expected += [(i, *touch.point[k], *touch.normal[k], touch.gap[k]) for k in range(len(touch))]
+    assert len({i for i, *_ in expected}) > 5 and 4 in found.first and (found.second == n).all()
+    rows = np.column_stack([found.first, found.points.point, found.points.normal, found.points.gap])
+    np.testing.assert_allclose(rows, expected, atol=1e-12)

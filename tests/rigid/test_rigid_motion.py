@@ -1,12 +1,14 @@
 """Free motion of a body: what is kept, what a fine reference says, and that poses are those of advance."""
 
+from copy import copy
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid.motion import Motion
-from warp_lcp.rigid.body import BodyMotion, RigidBody
+from warp_lcp.rigid.body import BodyMotion, BodyStates, RigidBody, orthonormal
 from warp_lcp.rigid.mass_properties import MassProperties
 
 CENTER = np.array([0.3, -0.2, 0.7])
@@ -160,3 +162,34 @@ def test_a_state_is_restored_bit_for_bit():
 def test_coefficients_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         body(**bad)
+
+
+def test_bodies_of_one_array_move_as_each_does_alone():
+    """Bit for bit, whatever the others do: some of them need more rounds of the fixed point, one does not turn at all."""
+    rng = np.random.default_rng(41)
+    spin = [np.zeros(3), *rng.normal(size=(4, 3)) * [[0.1], [1.0], [10.0], [40.0]]]
+    alone = [body(np.diag(rng.uniform(1.0, 3.0, 3)), angular_velocity=w, velocity=rng.normal(size=3)) for w in spin]
+    together = BodyStates([copy(one) for one in alone])
+    impulses, ways = rng.normal(size=(5, 6)), 0.1 * rng.normal(size=(5, 6))
+    for dt in (0.02, 0.03):
+        for one, impulse, way in zip(alone, impulses, ways, strict=True):
+            one.push(impulse)
+            one.advance(dt)
+            one.shift(way)
+        together.push(impulses)
+        together.advance(dt)
+        together.shift(ways)
+    assert np.array_equal(together.values, [one.values for one in alone])
+    assert np.array_equal(together.velocities(), [one.velocities(3) for one in alone])
+    together[2].position = CENTER  # a body writes its row
+    assert np.array_equal(together.position[2], CENTER)
+
+
+def test_rotations_off_by_rounding_become_the_nearest_ones():
+    """Against the singular value decomposition, whose U V' is the nearest orthogonal matrix."""
+    rng = np.random.default_rng(6)
+    off = Rotation.random(50, rng=rng).as_matrix() + 1e-9 * rng.normal(size=(50, 3, 3))
+    u, _, vt = np.linalg.svd(off)
+    near = orthonormal(off)
+    np.testing.assert_allclose(near, u @ vt, rtol=0.0, atol=1e-14)  # which has rounding of its own
+    np.testing.assert_allclose(near @ near.swapaxes(1, 2), np.broadcast_to(np.eye(3), near.shape), rtol=0.0, atol=2e-15)

@@ -9,6 +9,8 @@ import scipy.sparse
 import warp_lcp as wl
 from drawn_contacts import FAMILIES, drawn
 from oracle import lemke
+from warp_lcp.contacts.methods import MethodOfChoice
+from warp_lcp.rigid.contact_problem import ContactProblem
 from warp_lcp.solvers.proximal_gauss_seidel import colors
 
 TIGHT = {"rtol": 0.0, "max_iterations": 3000, "patience": 3000}
@@ -144,8 +146,12 @@ def test_bits_are_those_of_one_thread():
     assert len(found) == 1
 
 
-def test_it_is_found_by_its_name():
-    assert wl.METHODS["proximal-gauss-seidel"] is wl.ProximalGaussSeidel
+def test_it_is_listed_and_refuses_other_problems():
+    assert ("proximal-gauss-seidel", wl.ProximalGaussSeidel) in wl.METHODS.items()
+    problem = wl.LCP(np.eye(2), -np.ones(2))
+    with pytest.raises(ValueError, match="ProximalGaussSeidel takes problems of the class FrictionalContact: this is a LCP"):
+        wl.solve(problem, "proximal-gauss-seidel")
+    assert "proximal-gauss-seidel" not in wl.recommend(problem).alternatives
 
 
 def test_contacts_of_a_color_share_no_body():
@@ -237,3 +243,23 @@ def test_wrong_contacts_are_named(change, message):
         wl.FrictionalContact(**given | change, bodies=1)
     with pytest.raises(ValueError, match="takes problems of the class FrictionalContact"):
         wl.solve(wl.LCP(np.eye(2), np.ones(2)), wl.ProximalGaussSeidel())
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_redundant_contacts_of_a_pressed_packing_do_not_stall(seed):
+    """Rows that depend on each other leave impulses that no body feels; contacts that yield make these unique, and sweeps crawl."""
+    p, tolerance, most = drawn("spheres", seed, friction=0.3, ratio=1.0), 1e-8, 800
+    press = np.zeros((p.bodies, 6))
+    press[-4:, 1] = -1.0  # onto the layer on top
+    b = p.b + (p.jacobian @ press.ravel()).reshape(p.b.shape)
+    assert np.linalg.matrix_rank(p.jacobian.toarray()) < p.b.size
+    problem = ContactProblem(p.first, p.second, p.one, p.other, b, p.friction, p.bodies)
+    method = MethodOfChoice("proximal-gauss-seidel", directions=4, tolerance=tolerance, most=most, device="cpu")
+    found = method(problem, np.zeros_like(b))
+    cones = wl.FrictionalContact(p.first, p.second, p.one, p.other, b, p.friction, p.bodies)
+    assert method.status is wl.SolveStatus.CONVERGED and found.iterations < most
+    assert cones.residual(found.impulses) <= tolerance * cones.reference
+    e = problem.yields()[1].reshape(b.shape)
+    yielding = wl.FrictionalContact(p.first, p.second, p.one, p.other, b, p.friction, p.bodies, yields=e)
+    stopping = wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most)
+    assert wl.solve(yielding, wl.ProximalGaussSeidel(), stopping=stopping).relative_residual > 10 * tolerance

@@ -20,6 +20,7 @@ from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, sol
 from warp_lcp.cli.suites import benchmarks, suite_names
 from warp_lcp.distributed.watchdog import LIMIT
 from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.problem.protocol import families
 from warp_lcp.render.viewer import check_window
 from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.run.check import check_memory, check_scene, start
@@ -68,7 +69,7 @@ def _suites_alike(incomplete: str) -> list[str]:
 
 
 def _methods_alike(incomplete: str) -> list[str]:
-    return _begin_alike(incomplete, METHODS)
+    return _begin_alike(incomplete, [name for name, method in METHODS.items() if families(method)])
 
 
 SceneArgument = Annotated[

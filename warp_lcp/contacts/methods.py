@@ -13,7 +13,7 @@ import warp_lcp as wl
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.rigid.contacts import jacobian
-from warp_lcp.solvers.registry import CONTACTS, METHODS
+from warp_lcp.solvers.registry import METHODS
 
 DEFAULT = "sweeps-and-newton"  # of `warp_lcp.rigid.contact_problem`: what bodies in liquids and in sand are solved by
 JOINTED = "lemke"  # in its place where there are joints, which are equations: sweeps are slow at them, pivots exact
@@ -36,10 +36,11 @@ STEWART_TRINKLE: dict[str, Callable[[ContactSystem], Any]] = {
     "interior-point": lambda s: wl.InteriorPoint(precision="double"),
     "primal-dual-active-set": lambda s: wl.PrimalDualActiveSet(),
 }
-CONE: dict[str, Callable[[], Any]] = {**CONTACTS}  # the circular cone itself, bodies instead of a matrix
+# the circular cone itself, bodies instead of a matrix
+CONE: dict[str, Callable[[], Any]] = {"proximal-gauss-seidel": wl.ProximalGaussSeidel}
 # of inverse kinematics, whose problems have small dense matrices and no blocks
 KINEMATIC = ("lemke", "fischer-newton", "minimum-map-newton", "interior-point", "primal-dual-active-set", "nncg", "psor")
-assert {*BOXED, *STEWART_TRINKLE} <= METHODS.keys()
+assert {*BOXED, *STEWART_TRINKLE, *CONE} <= METHODS.keys()
 
 
 class MethodOfChoice:
@@ -83,12 +84,13 @@ class MethodOfChoice:
         return ContactImpulses(impulses, float(result.relative_residual), result.iterations)
 
     def _in_cones(self, problem: ContactProblem, start: np.ndarray) -> ContactImpulses:
-        """Return the impulses in the circular cones; tolerances are relative to no impulses, as those of the other models."""
+        """Return the impulses in the circular cones; tolerances are relative to no impulses, as those of the other models.
+
+        Contacts do not yield here. Where they are redundant (J'z = 0), as in jammed packings, e > 0 makes the impulses unique, but a sweep
+        changes their part along z by e / B only: the residual |e r| would take 1 / YIELDS sweeps. Sweeps without e need no unique impulses.
+        """
         p = problem
-        yields = p.yields()[1].reshape(p.b.shape)
-        cones = wl.FrictionalContact(
-            p.first, p.second, p.one, p.other, p.b, p.friction, p.bodies, yields=yields, device=self._device
-        )  # fmt: skip
+        cones = wl.FrictionalContact(p.first, p.second, p.one, p.other, p.b, p.friction, p.bodies, device=self._device)
         assert self._cone is not None
         stopping = replace(self._stopping, rtol=0.0, atol=self._stopping.rtol * cones.reference)
         result = wl.solve(cones, self._cone(), stopping=stopping, x0=start)

@@ -109,7 +109,7 @@ class ContactSimulation:
 
     def _row(self, dt: float, status: str) -> dict[str, float | int | str | None]:
         bodies, solved = self.bodies, self.bodies.contacts > 0 or bool(self.bodies.joints)
-        momentum = np.sum([body.momentum for body in bodies.bodies], axis=0)
+        momentum = bodies.bodies.momentum.sum(axis=0)
         energy = bodies.potential_energy(self.gravity) + 0.5 * dt * float(momentum @ self.gravity)  # back by half a step
         own: dict[str, float | int | str | None] = {
             "kinetic_energy": bodies.kinetic_energy(),

@@ -111,7 +111,7 @@ class ContactStepper:
         r, iterations, residual, status = np.zeros(len(system.q)), 0, 0.0, SolveStatus.CONVERGED
         if r.size:
             r, iterations, residual, status = self._solve(assembly)
-        moving = np.flatnonzero(~world.fixed)
+        moving = np.flatnonzero(~world.fixed).tolist()
         impulses = (assembly.J.T @ r).reshape(-1, 6)
         for i in moving:
             world.bodies[i].accelerate(np.array(world.gravity), dt)

@@ -10,8 +10,8 @@ import scipy.sparse
 
 from warp_lcp.gallery.contact_models import ContactSystem
 from warp_lcp.grid.solids import Box, Sphere
-from warp_lcp.rigid.body import RigidBody
-from warp_lcp.rigid.contact_detection import ContactDetection
+from warp_lcp.rigid.body import BodyStates, RigidBody
+from warp_lcp.rigid.contact_detection import NONE, ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import ContactSolve
 from warp_lcp.rigid.contacts import Contacts
@@ -61,7 +61,7 @@ class World:
     friction: float = 0.5
     gravity: tuple[float, float, float] = GRAVITY
     ignored: frozenset[tuple[int, int]] = frozenset()
-    bodies: list[RigidBody] = field(init=False)
+    bodies: BodyStates = field(init=False)
     fixed: np.ndarray = field(init=False)
     contact_solve: ContactSolve = field(init=False)
     size: float = field(init=False)
@@ -74,14 +74,14 @@ class World:
             raise ValueError("solids is empty: expected at least one body")
         self.fixed = np.isposinf(self.mass)
         made = [_made(solid, 1.0 if m == FIXED else m) for solid, m in zip(self.solids, self.mass, strict=True)]
-        self.bodies = [RigidBody(properties, name=f"body {i}", friction=self.friction) for i, (properties, _) in enumerate(made)]
+        self.bodies = BodyStates([RigidBody(p, name=f"body {i}", friction=self.friction) for i, (p, _) in enumerate(made)])
         shapes = [shape for _, shape in made]
         self.contact_solve = ContactSolve(ContactDetection(self.bodies, shapes, self.obstacles, 3, every=True))
         self.size = min(shape.reach(properties.center) for properties, shape in made)
 
     def velocities(self) -> np.ndarray:
         """Return velocities, linear and angular, of the bodies [m/s, rad/s], shape (n, 6)."""
-        return np.array([body.velocities(3) for body in self.bodies])
+        return self.bodies.velocities()
 
     def contacts(self, dt: float = 0.0, *, margin: float | None = None) -> Contacts:
         """Return the current contacts, or those possible within dt [s].
@@ -97,8 +97,9 @@ class World:
         n, ignored = len(self.bodies), self.ignored | {hinge.pair for hinge in self.hinges}
         still = np.append(self.fixed, True)
         found = self.contact_solve.detection.find(0.0, np.full(n, way), np.full(len(self.obstacles), near + way), near)
-        found = [f for f in found if (f.second, f.first) not in ignored and not (still[f.first] and still[f.second])]
-        found.sort(key=lambda f: (f.obstacle is None, f.second, f.first))
+        found = found.without(ignored)
+        found = found.where(~(still[found.first] & still[found.second]))
+        found = found.where(np.lexsort((found.first, found.second, found.obstacle == NONE)))
         return self.contact_solve.assembled(found, 0.0, 1.0, None)
 
     def assemble(self, dt: float, *, rate: float = 0.2) -> Assembly:

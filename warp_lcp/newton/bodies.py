@@ -11,7 +11,7 @@ import numpy as np
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.newton.shapes import rotation_of
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.rigid.body import BodyMotion, RigidBody
+from warp_lcp.rigid.body import BodyMotion, BodyStates, RigidBody
 from warp_lcp.rigid.mass_properties import MassProperties
 
 
@@ -35,7 +35,7 @@ class WorldBodies(RigidBodies):
         self._origin, self._geometries = origin, list(shapes.values())
         self._placed = model.body_q.numpy()[self.indices].astype(np.float64)
         self._turned = [rotation_of(q[3:]) for q in self._placed]
-        self.bodies = [RigidBody(properties, name=model.body_label[body]) for body, properties in self._properties(model)]
+        self.bodies = BodyStates([RigidBody(p, name=model.body_label[body]) for body, p in self._properties(model)])
         self.numbers = list(range(first, first + len(self.bodies)))
         self.motions = [BodyMotion(body) for body in self.bodies]
         self.refresh(model)
@@ -50,6 +50,7 @@ class WorldBodies(RigidBodies):
         self.prescribed = kinematic | (model.body_inv_mass.numpy()[self.indices] == 0.0)
         for body, (_, properties) in zip(self.bodies, self._properties(model), strict=True):
             body.properties = properties
+        self.bodies = BodyStates(self.bodies)  # with the masses
         self._com = model.body_com.numpy()[self.indices].astype(np.float64)
 
     def asked(self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, dt: float) -> np.ndarray:
@@ -113,14 +114,13 @@ class WorldBodies(RigidBodies):
         self._before = None
         for body, impulse in zip(self.bodies, self.impulses, strict=True):
             impulse += body.given
-            body.release()
-            body.advance(dt)
+        self.bodies.release()
+        self.bodies.advance(dt)
 
     def restore_step(self) -> None:
         """Undo `begin_step`, if a step has begun."""
         if self._before is not None:
-            for body, state in zip(self.bodies, self._before, strict=True):
-                body.restore(state)
+            self.bodies.restore(self._before)
             self._before = None
 
     def trouble(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
@@ -135,8 +135,7 @@ class WorldBodies(RigidBodies):
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`."""
         self._before = None
-        for body, values in zip(self.bodies, state["bodies"], strict=True):
-            body.restore(values)
+        self.bodies.restore(np.asarray(state["bodies"]))
 
     def _properties(self, model: Any) -> list[tuple[int, MassProperties]]:
         """Return mass, center and inertia of each body as the model places it, those of a unit ball where it has none."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warp_lcp.grid.solids import Geometry
-from warp_lcp.rigid.body import BodyMotion, RigidBody
+from warp_lcp.rigid.body import STATE, BodyMotion, BodyStates, RigidBody
 from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import Contacts, ContactSolve, ImpulseSolver, sweeps_and_newton
@@ -16,7 +16,6 @@ from warp_lcp.rigid.joints import Joint
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.outline import BodySurface, body_surface
 
-STATE = 20  # numbers of a body's state
 OUTSIDE = 3.0  # times a body's reach: where its center lies when it has left
 IN_PLANE = ("x", "y", "vx", "vy", "angle", "spin")
 IN_SPACE = ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")
@@ -88,8 +87,8 @@ class RigidBodies:
         joints: Sequence[Joint] = (),
     ) -> None:
         """Prepare the shapes for contact, and check that bodies start apart."""
-        self.bodies, self.numbers, self.dimension = list(bodies), list(numbers), dimension
-        self.motions = [BodyMotion(body) for body in bodies]
+        self.bodies, self.numbers, self.dimension = BodyStates.of(bodies), list(numbers), dimension
+        self.motions = [BodyMotion(body) for body in self.bodies]
         self._geometries = list(geometries)
         self.shapes = [ContactShape.of(geometry, dimension) for geometry in geometries]
         self._solve = ContactSolve(ContactDetection(self.bodies, self.shapes, obstacles, dimension), solver, joints)
@@ -122,15 +121,12 @@ class RigidBodies:
         """
         self.restore_step()
         gravity = np.asarray(gravity, dtype=np.float64)
-        for body in self.bodies:
-            body.time = time
+        self.bodies.time[:] = time
         states, gone = self._states(), self.gone()
         contacts = self._solve.find(time, dt, gravity, gone)
         approach = self._solve.approach(contacts)
-        for number, body in enumerate(self.bodies):
-            body.release()
-            if not gone[number]:
-                body.accelerate(gravity, kick_dt)
+        self.bodies.release()
+        self.bodies.momentum[~gone] += (self.bodies.mass * kick_dt)[~gone, None] * gravity
         before = self._solve.bounce(contacts, approach, dt, kick_dt, gravity)
         free = self._momenta()
         impulses = self._solve.push_apart(contacts, dt=dt, kick_dt=kick_dt)
@@ -149,9 +145,9 @@ class RigidBodies:
         if begun is None:
             raise RuntimeError("solve_contacts: call begin_step first")
         impulses = begun.impulses
-        if any(body.given.any() for body in self.bodies):
-            for body, momenta in zip(self.bodies, begun.free, strict=True):
-                body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
+        if self.bodies.given.any():
+            momenta = begun.free + self.bodies.given
+            self.bodies.momentum[:], self.bodies.angular_momentum[:] = momenta[:, :3], momenta[:, 3:]
             impulses = self._solve.push_apart(begun.contacts, begun.impulses, dt=begun.dt, kick_dt=begun.kick_dt)
             self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = replace(begun, impulses=impulses, settled=True)
@@ -172,12 +168,11 @@ class RigidBodies:
         self._solve.memory.keep(begun.contacts, begun.impulses, self.bodies)
         self.contacts = len(begun.contacts)
         ways = self._solve.separation(begun.contacts, dt, begun.detour)
-        for number, body in enumerate(self.bodies):
-            body.release()
-            body.advance(dt)
-            for way in (begun.detour, ways):
-                if way is not None and way[number].any():
-                    body.shift(way[number])
+        self.bodies.release()
+        self.bodies.advance(dt)
+        for way in (begun.detour, ways):
+            if way is not None:
+                self.bodies.shift(way)
         self._begun = None
 
     def gone(self) -> np.ndarray:
@@ -185,7 +180,7 @@ class RigidBodies:
         size, sides = self.exits
         beyond = np.zeros(len(self.bodies), dtype=bool)
         for axis, length in enumerate(size):
-            at = np.array([body.position[axis] for body in self.bodies])
+            at = self.bodies.position[:, axis]
             beyond |= bool(sides >> 2 * axis & 1) & (at < 0.0) | bool(sides >> 2 * axis + 1 & 1) & (at > length)
         return beyond
 
@@ -193,19 +188,18 @@ class RigidBodies:
         """Remove bodies that have crossed an open side; they rest outside."""
         size, sides = self.exits
         for number in np.flatnonzero(self.gone()):
-            body, way = self.bodies[number], OUTSIDE * self.shapes[number].reach(self.bodies[number].properties.center)
-            body.momentum, body.angular_momentum = np.zeros(3), np.zeros(3)
+            position, way = self.bodies.position[number], OUTSIDE * self._solve.reach[number]
+            self.bodies.momentum[number], self.bodies.angular_momentum[number] = 0.0, 0.0
             for axis, length in enumerate(size):
-                if sides >> 2 * axis & 1 and body.position[axis] < 0.0:
-                    body.position[axis] = -way
-                if sides >> 2 * axis + 1 & 1 and body.position[axis] > length:
-                    body.position[axis] = length + way
+                if sides >> 2 * axis & 1 and position[axis] < 0.0:
+                    position[axis] = -way
+                if sides >> 2 * axis + 1 & 1 and position[axis] > length:
+                    position[axis] = length + way
 
     def restore_step(self) -> None:
         """Undo `begin_step`, if a step has begun."""
         if self._begun is not None:
-            for body, state in zip(self.bodies, self._begun.states, strict=True):
-                body.restore(state)
+            self.bodies.restore(self._begun.states)
             self._begun = None
 
     def trouble(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
@@ -217,10 +211,11 @@ class RigidBodies:
             size: of the domain [m].
             endless: axes without an end, at whose sides solids must be alike.
         """
-        for body, shape, motion in zip(self.bodies, self.shapes, self.motions, strict=True):
-            if not np.isfinite(body.state()).all():
-                return f"{body.name} has a velocity that is not finite"
-            points = motion.pose(body.time).apply(shape.points) if len(endless) else shape.points
+        finite = np.isfinite(self._states()).all(axis=1)
+        if not finite.all():
+            return f"{self.bodies[int(finite.argmin())].name} has a velocity that is not finite"
+        for body, shape, motion in zip(self.bodies, self.shapes, self.motions, strict=True) if len(endless) else ():
+            points = motion.pose(body.time).apply(shape.points)
             for axis in endless:
                 if points[:, axis].min() - shape.radius < 0.0 or points[:, axis].max() + shape.radius > size[axis]:
                     return f"{body.name} has reached a side of the periodic {'xyz'[axis]} axis, which rigid bodies cannot cross"
@@ -233,17 +228,18 @@ class RigidBodies:
             span: time to look ahead [s].
             gravity: its size [m/s^2].
         """
-        gone = self.gone()
-        speeds = [body_speed(body, shape) for body, shape, out in zip(self.bodies, self.shapes, gone, strict=True) if not out]
-        return max(speeds) + span * gravity if speeds else 0.0
+        six, there = self.bodies.velocities(), ~self.gone()
+        speeds = np.linalg.norm(six[:, :3], axis=1) + np.linalg.norm(six[:, 3:], axis=1) * self._solve.reach
+        return float(speeds[there].max()) + span * gravity if there.any() else 0.0
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy [J; J/m in 2-D]."""
-        return sum(body.kinetic_energy for body in self.bodies)
+        six = self.bodies.velocities()
+        return 0.5 * float((self.bodies.momentum * six[:, :3]).sum() + (self.bodies.angular_momentum * six[:, 3:]).sum())
 
     def potential_energy(self, gravity: np.ndarray) -> float:
         """Return the potential energy [J; J/m in 2-D], 0 at the origin."""
-        return sum(body.potential_energy(gravity) for body in self.bodies)
+        return -float(self.bodies.mass @ (self.bodies.position @ gravity))
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the state, for a bitwise identical continuation."""
@@ -265,8 +261,7 @@ class RigidBodies:
     def _take(self, state: Mapping[str, np.ndarray]) -> None:
         self._solve.memory.restore(state.get("body_contacts", np.zeros((0, 8))))
         self._solve.joint_impulses = np.array(state.get("joint_impulses", 0.0 * self._solve.joint_impulses), dtype=np.float64)
-        for body, values in zip(self.bodies, np.asarray(state["bodies"], dtype=np.float64), strict=True):
-            body.restore(values)
+        self.bodies.restore(np.asarray(state["bodies"], dtype=np.float64))
 
     def columns(self) -> tuple[str, ...]:
         """Return the log columns: position, velocity and rotation of each body.
@@ -304,14 +299,12 @@ class RigidBodies:
 
     def row(self) -> dict[str, float | int]:
         """Return the values of the log columns."""
-        values: list[float] = []
-        for body in self.bodies:
-            spin = np.degrees(body.angular_velocity)
-            if self.dimension == 2:
-                values += [*body.position[:2], *body.velocity[:2], np.degrees(body.angle), spin[2]]
-            else:
-                values += [*body.position, *body.velocity, *spin]
-        numbers = [float(value) for value in values]
+        bodies, six = self.bodies, self.bodies.velocities()
+        six[:, 3:] = np.degrees(six[:, 3:])
+        columns = [bodies.position, six]
+        if self.dimension == 2:
+            columns = [bodies.position[:, :2], six[:, :2], np.degrees(bodies.angle)[:, None], six[:, 5:]]
+        numbers = np.concatenate(columns, axis=1).ravel().tolist()
         gone = [int(self.gone().sum())] if self.exits[1] else []
         return dict(zip(self.columns(), [*numbers, self.contacts, float(self.contact_residual), *gone, *self._joint_row()], strict=True))
 
@@ -333,12 +326,7 @@ class RigidBodies:
         return BodySurface.joined(placed)
 
     def _states(self) -> np.ndarray:
-        return np.array([body.state() for body in self.bodies])
+        return self.bodies.values[:, :STATE].copy()
 
     def _momenta(self) -> np.ndarray:
-        return np.array([np.concatenate([body.momentum, body.angular_momentum]) for body in self.bodies])
-
-
-def body_speed(body: RigidBody, shape: ContactShape) -> float:
-    """Return the largest current speed of a point of a body [m/s]."""
-    return float(np.linalg.norm(body.velocity) + np.linalg.norm(body.angular_velocity) * shape.reach(body.properties.center))
+        return np.concatenate([self.bodies.momentum, self.bodies.angular_momentum], axis=1)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from typing import cast
+from collections.abc import Sequence
+from copy import copy
+from typing import cast, overload
 
 import numpy as np
 
@@ -12,8 +13,36 @@ from warp_lcp.rigid.mass_properties import MassProperties
 from warp_lcp.settings import NonNegative, Part, checked
 
 SAME_TURN = 1e-15  # [rad]: half a step's turn that no longer changes
-SMALL_TURN = 1e-5  # [rad]: its third power is nothing beside 1
 MOST_ROUNDS = 60  # of the fixed point; a step turns a body by far less than a radian, and each round by a factor of that less
+STATE, VALUES = 20, 26  # numbers of a body's state, and with the impulses given
+POSITION, ROTATION, MOMENTUM, SPINNING = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 18)  # where in the state
+ANGLE, TIME, GIVEN = 18, 19, slice(20, 26)
+CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)  # v @ CROSS: entries of the matrix of v x
+AXES = [0, 1, 2]
+PLANAR = [0, 1, 5]  # vx, vy, wz among the six
+
+
+def _part(columns: slice, shape: tuple[int, ...] = (-1,)) -> property:
+    """Return the property of a vector or matrix in a body's values: read as a copy, written by assignment."""
+
+    def read(body: RigidBody) -> np.ndarray:
+        part = body.values[columns].reshape(shape).copy()
+        part.flags.writeable = False
+        return part
+
+    def write(body: RigidBody, new: np.ndarray) -> None:
+        body.values[columns] = np.ravel(new)
+
+    return property(read, write)
+
+
+def _number(column: int) -> property:
+    """Return the property of a number in a body's values."""
+
+    def write(body: RigidBody, new: float) -> None:
+        body.values[column] = new
+
+    return property(lambda body: float(body.values[column]), write)
 
 
 class RigidBody:
@@ -30,6 +59,8 @@ class RigidBody:
         angular_velocity: at the start [rad/s], shape (3,).
 
     Attributes:
+        values: everything that changes but `hold`, shape (26,); a row of `BodyStates` for a body of several. What the attributes below
+            return is a copy, not to be written to; assign a new value.
         position: of the center of mass [m], shape (3,).
         rotation: from where the scene placed it, shape (3, 3).
         momentum: [kg m/s], shape (3,).
@@ -56,12 +87,19 @@ class RigidBody:
         """Place the body where the scene does."""
         self.friction, self.restitution = checked("friction", friction, NonNegative), checked("restitution", restitution, Part)
         self.properties, self.name = properties, name
-        self.position, self.rotation = properties.center.copy(), np.eye(3)
+        self.values = np.zeros(VALUES)
+        self.position, self.rotation = properties.center, np.eye(3)
         self.momentum = properties.mass * _three(velocity)
         self.angular_momentum = properties.inertia @ _three(angular_velocity)
-        self.angle, self.time = 0.0, 0.0
         self.hold: np.ndarray | None = None
-        self.given = np.zeros(6)
+
+    position = _part(POSITION)
+    rotation = _part(ROTATION, (3, 3))
+    momentum = _part(MOMENTUM)
+    angular_momentum = _part(SPINNING)
+    angle = _number(ANGLE)
+    time = _number(TIME)
+    given = _part(GIVEN)
 
     @property
     def velocity(self) -> np.ndarray:
@@ -71,7 +109,7 @@ class RigidBody:
     @property
     def angular_velocity(self) -> np.ndarray:
         """Angular velocity in the world's axes [rad/s], shape (3,)."""
-        return self._spin(self.rotation)
+        return spins(self.rotation, self.properties.inverse_inertia, self.angular_momentum)
 
     @property
     def inertia(self) -> np.ndarray:
@@ -147,44 +185,26 @@ class RigidBody:
 
     def advance(self, dt: float) -> None:
         """Move along the velocities for dt [s]; momenta are constant."""
-        self.position, self.rotation = self.after(dt)
-        self.angle += dt * float(self.angular_velocity[2])
-        self.time += dt
+        advance_states(self.values[None], np.array([self.properties.mass]), self.properties.inverse_inertia, dt)
 
     def shift(self, way: np.ndarray) -> None:
         """Move by a small displacement (m, rad), shape (k,), without velocity."""
-        six = in_space(way)
-        self.position = self.position + six[:3]
-        self.rotation = rotation_by(six[3:]) @ self.rotation
-        self.angle += float(six[5])
+        shift_states(self.values[None], in_space(way)[None])
 
     def after(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [m] and rotation after dt [s] at the present momenta.
-
-        The turn is about the angular velocity in the middle of the step, whose inertia is that of half the turn (the implicit midpoint
-        rule on rotations): angular momentum is kept exactly, and the energy of a free rotation does not drift, as the rule is its own
-        inverse backwards in time.
-        """
-        half = 0.5 * dt * self.angular_velocity
-        for _ in range(MOST_ROUNDS):
-            before = half
-            half = 0.5 * dt * self._spin(rotation_by(half) @ self.rotation)
-            if np.abs(half - before).max() <= SAME_TURN:
-                break
-        u, _, vt = np.linalg.svd(rotation_by(2.0 * half) @ self.rotation)  # the nearest rotation: rounding does not pile up
-        return self.position + dt * self.velocity, u @ vt
+        """Return position [m] and rotation after dt [s] at the present momenta."""
+        later = copy(self)
+        later.values = self.values.copy()
+        later.advance(dt)
+        return later.position, later.rotation
 
     def state(self) -> np.ndarray:
         """Return the complete state, shape (20,)."""
-        return np.concatenate(
-            [self.position, self.rotation.ravel(), self.momentum, self.angular_momentum, [self.angle, self.time]]
-        )  # fmt: skip
+        return self.values[:STATE].copy()
 
     def restore(self, state: np.ndarray) -> None:
         """Restore `state`; no contact holds the body."""
-        self.position, self.rotation = state[:3].copy(), state[3:12].reshape(3, 3).copy()
-        self.momentum, self.angular_momentum = state[12:15].copy(), state[15:18].copy()
-        self.angle, self.time = float(state[18]), float(state[19])
+        self.values[:STATE] = state
         self.release()
 
     def momenta(self) -> tuple[np.ndarray, ...]:
@@ -199,9 +219,85 @@ class RigidBody:
         """Reset contacts that hold the body and the impulses received."""
         self.hold, self.given = None, np.zeros(6)
 
-    def _spin(self, rotation: np.ndarray) -> np.ndarray:
-        """Return R I^-1 R' L [rad/s]."""
-        return cast(np.ndarray, rotation @ (self.properties.inverse_inertia @ (rotation.T @ self.angular_momentum)))
+
+class BodyStates(Sequence[RigidBody]):
+    """Several bodies with their states in one array: loops over all of them are NumPy's.
+
+    Args:
+        bodies: whose states become rows of the array, so that a body belongs to one `BodyStates`, the last one made of it.
+
+    Attributes:
+        values: of all bodies, shape (n, 26); the views of it below have shapes (n, 3), (n, 3, 3), (n,) and (n, 6).
+        mass: [kg], shape (n,), as the bodies have it when this is made.
+        center: centers of mass as the scene places them [m], shape (n, 3).
+        inverse_inertia: as the scene places them [1/(kg m^2)], shape (n, 3, 3).
+    """
+
+    def __init__(self, bodies: Sequence[RigidBody]) -> None:
+        self._bodies = tuple(bodies)
+        self.values = np.array([body.values for body in bodies]).reshape(-1, VALUES)
+        for body, row in zip(self._bodies, self.values, strict=True):
+            body.values = row
+        each = [body.properties for body in bodies]
+        self.mass = np.array([properties.mass for properties in each])
+        self.center = np.array([properties.center for properties in each]).reshape(-1, 3)
+        self.inverse_inertia = np.array([properties.inverse_inertia for properties in each]).reshape(-1, 3, 3)
+        self.position, self.momentum, self.angular_momentum = (self.values[:, part] for part in (POSITION, MOMENTUM, SPINNING))
+        self.rotation, self.given = self.values[:, ROTATION].reshape(-1, 3, 3), self.values[:, GIVEN]
+        self.angle, self.time = self.values[:, ANGLE], self.values[:, TIME]
+
+    @classmethod
+    def of(cls, bodies: Sequence[RigidBody]) -> BodyStates:
+        """Return bodies with their states in one array: themselves if they have one."""
+        return bodies if isinstance(bodies, cls) else cls(bodies)
+
+    def __len__(self) -> int:
+        """Return the number of bodies."""
+        return len(self._bodies)
+
+    @overload
+    def __getitem__(self, number: int) -> RigidBody: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> tuple[RigidBody, ...]: ...
+
+    def __getitem__(self, number: int | slice) -> RigidBody | tuple[RigidBody, ...]:
+        """Return a body, or several."""
+        return self._bodies[number]
+
+    def copied(self) -> BodyStates:
+        """Return copies of the bodies, to try a motion."""
+        return BodyStates([copy(body) for body in self])
+
+    def velocities(self) -> np.ndarray:
+        """Return velocities of centers of mass and angular velocities [m/s, rad/s], shape (n, 6)."""
+        spin = spins(self.rotation, self.inverse_inertia, self.angular_momentum)
+        return np.concatenate([self.momentum / self.mass[:, None], spin], axis=1)
+
+    def push(self, impulses: np.ndarray) -> None:
+        """Add impulses and those of torque [N s, N m s], shape (n, k), whatever holds the bodies."""
+        six = in_space(impulses)
+        self.momentum += six[:, :3]
+        self.angular_momentum += six[:, 3:]
+
+    def advance(self, dt: float) -> None:
+        """Move all bodies along their velocities for dt [s]."""
+        advance_states(self.values, self.mass, self.inverse_inertia, dt)
+
+    def shift(self, ways: np.ndarray) -> None:
+        """Move bodies by small ways (m, rad), shape (n, k), without a velocity."""
+        shift_states(self.values, in_space(ways))
+
+    def restore(self, states: np.ndarray) -> None:
+        """Continue from states, shape (n, 20), held by nothing."""
+        self.values[:, :STATE] = states
+        self.release()
+
+    def release(self) -> None:
+        """Forget what holds the bodies and what they were given."""
+        self.given[:] = 0.0
+        for body in self:
+            body.hold = None
 
 
 class BodyMotion:
@@ -225,43 +321,83 @@ class BodyMotion:
         return Pose.about(center, rotation, position - center)
 
     def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s].
-
-        The body's point x moves at turn x + shift now.
-        """
-        turn = _cross(*self.body.angular_velocity)
+        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s]: the body's point x moves at turn x + shift now."""
+        turn = cross_matrix(self.body.angular_velocity)
         return turn, self.body.velocity - turn @ self.body.position
 
 
-AXES = [0, 1, 2]
-PLANAR = [0, 1, 5]  # vx, vy, wz among the six
-
-
 def in_space(values: np.ndarray) -> np.ndarray:
-    """Return a vector of three (2-D) or six entries as one of six."""
-    if len(values) == 6:
-        return np.asarray(values, dtype=np.float64)
-    six = np.zeros(6)
-    six[PLANAR] = values
+    """Return velocities, impulses or ways of three (2-D) or six entries, shape (..., k), as ones of six."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.shape[-1] == 6:
+        return values
+    six = np.zeros((*values.shape[:-1], 6))
+    six[..., PLANAR] = values
     return six
 
 
-def rotation_by(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix of a rotation by |vector| [rad] about a vector.
+def spins(rotation: np.ndarray, inverse_inertia: np.ndarray, momentum: np.ndarray) -> np.ndarray:
+    """Return angular velocities R I^-1 R' L [rad/s] of rotations R and angular momenta L, shape (..., 3)."""
+    return np.asarray(rotation @ (inverse_inertia @ (rotation.swapaxes(-1, -2) @ momentum[..., None])))[..., 0]
 
-    Not SciPy's `Rotation.from_rotvec`: the results of runs depend on the last bits.
+
+def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.ndarray, dt: float) -> None:
+    """Move bodies along their velocities for dt [s]; `values` are updated.
+
+    A turn is about the angular velocity in the middle of the step, whose inertia is that of half the turn (the implicit midpoint
+    rule on rotations): angular momentum is kept exactly, and the energy of a free rotation does not drift, as the rule is its own
+    inverse backwards in time. With w = R I^-1 R' L it is the fixed point of h <- dt/2 w(exp(h) R), found for each body by itself.
+
+    Args:
+        values: rows of `RigidBody.values`, shape (n, 26).
+        mass: [kg], shape (n,).
+        inverse_inertia: shape (n, 3, 3), or (3, 3) for all.
+        dt: time [s].
     """
-    x, y, z = vector.tolist()
-    angle = math.sqrt(x * x + y * y + z * z)
-    K = _cross(x, y, z)
-    if angle < SMALL_TURN:
-        return cast(np.ndarray, np.eye(3) + K + 0.5 * K @ K)
-    return cast(np.ndarray, np.eye(3) + math.sin(angle) / angle * K + 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 * K @ K)
+    R, L = values[:, ROTATION].reshape(-1, 3, 3), values[:, SPINNING]
+    inverse = np.broadcast_to(inverse_inertia, R.shape)
+    half, left = 0.5 * dt * spins(R, inverse, L), np.arange(len(R))
+    for _ in range(MOST_ROUNDS):
+        before = half[left]
+        half[left] = 0.5 * dt * spins(rotation_by(before) @ R[left], inverse[left], L[left])
+        left = left[~(np.abs(half[left] - before).max(axis=1) <= SAME_TURN)]
+        if not len(left):
+            break
+    turned = orthonormal(rotation_by(2.0 * half) @ R)
+    values[:, POSITION] += dt * (values[:, MOMENTUM] / mass[:, None])
+    values[:, ROTATION] = turned.reshape(-1, 9)
+    values[:, ANGLE] += dt * spins(turned, inverse, L)[:, 2]
+    values[:, TIME] += dt
 
 
-def _cross(x: float, y: float, z: float) -> np.ndarray:
-    """Return the matrix of the cross product with a vector."""
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def shift_states(values: np.ndarray, ways: np.ndarray) -> None:
+    """Move bodies by small ways (m, rad), shape (n, 6), without a velocity; `values`, shape (n, 26), are updated."""
+    values[:, POSITION] += ways[:, :3]
+    values[:, ROTATION] = (rotation_by(ways[:, 3:]) @ values[:, ROTATION].reshape(-1, 3, 3)).reshape(-1, 9)
+    values[:, ANGLE] += ways[:, 5]
+
+
+def orthonormal(rotation: np.ndarray) -> np.ndarray:
+    """Return the rotations nearest to matrices that rounding has moved off them, shape (..., 3, 3).
+
+    R (3 - R'R) / 2 is Newton's step to the polar factor of R (Newton-Schulz): |R'R - 1| = d becomes 3/4 d^2, which is below rounding.
+    """
+    return np.asarray(0.5 * rotation @ (3.0 * np.eye(3) - rotation.swapaxes(-1, -2) @ rotation))
+
+
+def rotation_by(vector: np.ndarray) -> np.ndarray:
+    """Return matrices of turns by |v| [rad] about vectors v, shape (..., 3): SciPy's `Rotation.from_rotvec` to rounding.
+
+    With K x = v x x that is 1 + sin(a) / a K + (sin(a/2) / (a/2))^2 K^2 / 2, a = |v|.
+    """
+    angle = np.sqrt(np.square(vector).sum(axis=-1))[..., None, None] / np.pi
+    K = cross_matrix(vector)  # np.sinc(x) = sin(pi x) / (pi x)
+    return np.asarray(np.eye(3) + np.sinc(angle) * K + (0.5 * np.sinc(0.5 * angle) ** 2 * K) @ K)
+
+
+def cross_matrix(vector: np.ndarray) -> np.ndarray:
+    """Return the matrices of the cross product with vectors, shape (..., 3)."""
+    return (vector @ CROSS).reshape(*vector.shape, 3)
 
 
 def _three(vector: np.ndarray | None) -> np.ndarray:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from warp_lcp.grid.motion import Motion, Pose
-from warp_lcp.rigid.body import RigidBody
+from warp_lcp.grid.motion import Pose
+from warp_lcp.rigid.body import BodyStates, RigidBody
 from warp_lcp.rigid.box_contacts import OrientedBox, box_box
 from warp_lcp.rigid.contact_shape import ON_SURFACE, ContactShape
 from warp_lcp.rigid.obstacles import Obstacle
@@ -21,6 +21,7 @@ SAME = 1e-6  # of a shape's size: points of contact this close are one
 LOWER = 20.0  # so many times the gap must a point be farther from the others to count more than one with less
 MUCH_LOWER = 200.0  # for those that come on top where others lie lower: what a round rim rests on is not what it may tip over
 MORE = 2  # of these, at most
+NONE = -1  # in the place of an obstacle: it is a body
 LEVEL = 1e-4  # of the smaller shape's size: gaps that differ by less are of one height
 
 
@@ -202,39 +203,66 @@ def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.nd
         half: half their sides [m], shape (n, 3).
     """
     low, high = middle - half, middle + half
-    axis = int(np.ptp(middle, axis=0).argmax())
-    order = np.argsort(low[:, axis], kind="stable")
-    ends = np.searchsorted(low[order, axis], high[order, axis], side="right")  # who begins before a box ends, after itself
+    first, *others = np.argsort(-np.ptp(middle, axis=0), kind="stable").tolist()
+    order = np.argsort(low[:, first], kind="stable")
+    ends = np.searchsorted(low[order, first], high[order, first], side="right")  # who begins before a box ends, after itself
     after = ends - np.arange(len(order)) - 1
     one = np.repeat(np.arange(len(order)), after)
     other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(after) - after, after)
     one, other = order[one], order[other]
-    both = ((low[one] <= high[other]) & (low[other] <= high[one])).all(axis=1)
-    pairs = np.sort(np.stack([one[both], other[both]]), axis=0)
+    for axis in others:  # each leaves few of the pairs for the next
+        begin, end = np.ascontiguousarray(low[:, axis]), np.ascontiguousarray(high[:, axis])
+        both = (begin[one] <= end[other]) & (begin[other] <= end[one])
+        one, other = one[both], other[both]
+    pairs = np.sort(np.stack([one, other]), axis=0)
     pairs = pairs[:, np.lexsort(pairs)]
     return pairs[1], pairs[0]
 
 
 @dataclass(frozen=True, eq=False)
-class ContactPair:
-    """Contacts of a pair.
+class FoundContacts:
+    """Points at which bodies touch something, k of them.
 
     Args:
-        first: body that normals point into.
-        second: body that they come from; the number of bodies where that is none.
-        points: one at least.
-        obstacle: the second of the pair if it is not a body.
+        first: body that normals point into, shape (k,).
+        second: body that they come from; the number of bodies where that is none, shape (k,).
+        obstacle: number of the obstacle that they come from; NONE where that is a body, shape (k,).
+        points: where.
     """
 
-    first: int
-    second: int
+    first: np.ndarray
+    second: np.ndarray
+    obstacle: np.ndarray
     points: ContactPoints
-    obstacle: Obstacle | None = None
 
-    @property
-    def motion(self) -> Motion | None:
-        """Motion of the obstacle, or None."""
-        return None if self.obstacle is None else self.obstacle.motion
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.first)
+
+    def where(self, chosen: np.ndarray) -> FoundContacts:
+        """Return the contacts that are chosen, by a mask or their places."""
+        return FoundContacts(self.first[chosen], self.second[chosen], self.obstacle[chosen], self.points.where(chosen))
+
+    def without(self, pairs: Collection[tuple[int, int]]) -> FoundContacts:
+        """Return the contacts of other pairs than these, the smaller number first."""
+        if not pairs:
+            return self
+        count = 1 + max(int(self.second.max(initial=0)), *(high for _, high in pairs))
+        keys = [low * count + high for low, high in pairs]
+        return self.where(~np.isin(self.second * count + self.first, keys))
+
+    @classmethod
+    def of(cls, first: Any, second: Any, obstacle: int, points: Sequence[ContactPoints]) -> FoundContacts:
+        """Return the contacts of pairs that have some points each; first, second: shape (pairs,)."""
+        counts = [len(each) for each in points]
+        one, other = (np.repeat(np.asarray(side, dtype=np.int64), counts) for side in (first, second))
+        return cls(one, other, np.full(len(one), obstacle), ContactPoints.joined(points))
+
+    @classmethod
+    def joined(cls, several: Sequence[FoundContacts]) -> FoundContacts:
+        """Return several as one."""
+        first, second, obstacle = (np.concatenate([getattr(f, name) for f in several]) for name in ("first", "second", "obstacle"))
+        return cls(first, second, obstacle, ContactPoints.joined([found.points for found in several]))
 
 
 class ContactDetection:
@@ -256,15 +284,15 @@ class ContactDetection:
         dimension: int,
         every: bool = False,
     ) -> None:
-        self.bodies, self.shapes, self.obstacles, self.dimension, self._every = list(bodies), shapes, obstacles, dimension, every
-        self._center = np.array([body.properties.center for body in bodies])
+        self.bodies = BodyStates.of(bodies)
+        self.shapes, self.obstacles, self.dimension, self._every = shapes, obstacles, dimension, every
         self._middle = np.array([0.5 * (shape.low + shape.high) for shape in shapes])
         self._half = np.array([0.5 * (shape.high - shape.low) - shape.radius for shape in shapes])
         self._radius = np.array([shape.radius for shape in shapes])
         self._ball = np.array([shape.closed and len(shape.points) == 1 and not shape.boxes for shape in shapes])
 
-    def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> list[ContactPair]:
-        """Return the contacts of the bodies.
+    def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> FoundContacts:
+        """Return the contacts: obstacle by obstacle, then between bodies, pairs in order.
 
         Args:
             time: of the state [s].
@@ -272,27 +300,31 @@ class ContactDetection:
             brought: gap up to which a body that rests touches each obstacle [m].
             near: gap up to which bodies that rest touch each other [m].
         """
-        turns, at = (np.array([getattr(body, name) for body in self.bodies]) for name in ("rotation", "position"))
-        shifts = at - (turns @ self._center[:, :, None])[:, :, 0]
+        turns, at = self.bodies.rotation, self.bodies.position
+        shifts = at - (turns @ self.bodies.center[:, :, None])[:, :, 0]
         poses = [Place(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
         middle = (turns @ self._middle[:, :, None])[:, :, 0] + shifts
         half = (np.abs(turns) @ self._half[:, :, None])[:, :, 0] + self._radius[:, None]
-        found = []
-        for obstacle, more in zip(self.obstacles, brought, strict=True):
-            found += self._with_obstacle(obstacle, obstacle.pose(time), poses, middle, half, ways + more)
+        found = [
+            self._with_obstacle(number, obstacle.pose(time), poses, middle, half, ways + more)
+            for number, (obstacle, more) in enumerate(zip(self.obstacles, brought, strict=True))
+        ]
         first, second = close_pairs(middle, half + ways[:, None] + 0.5 * near)
         margins = near + ways[first] + ways[second]
         way = np.linalg.norm(middle[first] - middle[second], axis=1)
         balls = self._ball[first] & self._ball[second] & (way > ON_SURFACE * self._radius[second])
         touching = self._balls(first[balls], second[balls], middle, margins[balls])
-        for i, j, margin in zip(first[~balls].tolist(), second[~balls].tolist(), margins[~balls].tolist(), strict=True):
-            points = between(self.shapes[i], poses[i], self.shapes[j], poses[j], margin, self.dimension)
-            touching.append(ContactPair(i, j, self._kept(points, min(self.shapes[i].size, self.shapes[j].size))))
-        found += touching if balls.all() else sorted(touching, key=lambda pair: (pair.first, pair.second))
-        return [entry for entry in found if len(entry.points)]
+        if not balls.all():
+            first, second, margins, points = first[~balls], second[~balls], margins[~balls], []
+            for i, j, margin in zip(first.tolist(), second.tolist(), margins.tolist(), strict=True):
+                one, other = self.shapes[i], self.shapes[j]
+                points.append(self._kept(between(one, poses[i], other, poses[j], margin, self.dimension), min(one.size, other.size)))
+            touching = FoundContacts.joined([touching, FoundContacts.of(first, second, NONE, points)])
+            touching = touching.where(np.lexsort((touching.second, touching.first)))
+        return FoundContacts.joined([*found, touching])
 
-    def _balls(self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray) -> list[ContactPair]:
-        """Return the contacts of balls i with balls j, all at once: the point between them on the line of their centers."""
+    def _balls(self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray) -> FoundContacts:
+        """Return the contacts of balls i with balls j: the points between them on the lines of their centers."""
         way = centers[i] - centers[j]
         length = np.linalg.norm(way, axis=1)
         gap = length - self._radius[j] - self._radius[i]
@@ -300,30 +332,48 @@ class ContactDetection:
         i, j, gap = i[near], j[near], gap[near]
         normal = way[near] / length[near, None]
         point = centers[i] - (self._radius[i] + 0.5 * gap)[:, None] * normal
-        each = zip(i.tolist(), j.tolist(), range(len(i)), strict=True)
-        return [ContactPair(a, b, ContactPoints(point[t : t + 1], normal[t : t + 1], gap[t : t + 1])) for a, b, t in each]
+        return FoundContacts(i, j, np.full(len(i), NONE), ContactPoints(point, normal, gap))
 
     def _kept(self, points: ContactPoints, size: float) -> ContactPoints:
         return points if self._every else spread(points, size, self.dimension)
 
     def _with_obstacle(
-        self, obstacle: Obstacle, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
-    ) -> list[ContactPair]:
+        self, number: int, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
+    ) -> FoundContacts:
         """Return where bodies touch an obstacle."""
-        shape, n, pairs = obstacle.shape, len(poses), []
+        shape, n = self.obstacles[number].shape, len(poses)
         if shape is None:
-            points, normals = there.apply(obstacle.points), obstacle.normals @ there.rotation.T
-            heights = middle @ normals.T - (points * normals).sum(axis=1) - half @ np.abs(normals).T
-            for i in np.flatnonzero((heights <= margins[:, None]).any(axis=1)).tolist():
-                mine, chosen = self.shapes[i], np.flatnonzero(heights[i] <= margins[i])
-                each = [self._kept(on_plane(mine, poses[i], points[m], normals[m], margins[i]), mine.size) for m in chosen]
-                pairs.append(ContactPair(i, n, ContactPoints.joined(each), obstacle))
-        else:
-            near = np.ones(n, dtype=bool)
-            if shape.closed:
-                center, reach = there.apply(0.5 * (shape.low + shape.high)), np.abs(there.rotation) @ (0.5 * (shape.high - shape.low))
-                near = (np.abs(middle - center) - half - reach).max(axis=1) <= margins
-            for i in np.flatnonzero(near).tolist():
-                touch = between(self.shapes[i], poses[i], shape, there, float(margins[i]), self.dimension)
-                pairs.append(ContactPair(i, n, self._kept(touch, min(self.shapes[i].size, shape.size)), obstacle))
-        return pairs
+            return self._with_planes(number, there, poses, middle, half, margins)
+        near = np.ones(n, dtype=bool)
+        if shape.closed:
+            center, reach = there.apply(0.5 * (shape.low + shape.high)), np.abs(there.rotation) @ (0.5 * (shape.high - shape.low))
+            near = (np.abs(middle - center) - half - reach).max(axis=1) <= margins
+        first, points = np.flatnonzero(near), []
+        for i in first.tolist():
+            touch = between(self.shapes[i], poses[i], shape, there, float(margins[i]), self.dimension)
+            points.append(self._kept(touch, min(self.shapes[i].size, shape.size)))
+        return FoundContacts.of(first, np.full(len(first), n), number, points)
+
+    def _with_planes(
+        self, number: int, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
+    ) -> FoundContacts:
+        """Return where bodies touch the planes of an obstacle: balls, each at one point, all at once."""
+        obstacle, n = self.obstacles[number], len(poses)
+        points, normals = there.apply(obstacle.points), obstacle.normals @ there.rotation.T
+        heights = middle @ normals.T - (points * normals).sum(axis=1)
+        i, m = np.nonzero(heights - half @ np.abs(normals).T <= margins[:, None])
+        balls = self._ball[i]
+        gap = heights[i, m] - self._radius[i]
+        near = balls & (gap <= margins[i])
+        ball, gap, normal = i[near], gap[near], normals[m[near]]
+        touch = ContactPoints(middle[ball] - (self._radius[ball] + 0.5 * gap)[:, None] * normal, normal, gap)
+        found = FoundContacts(ball, np.full(len(ball), n), np.full(len(ball), number), touch)
+        if balls.all():
+            return found
+        i, m = i[~balls], m[~balls]
+        each = [
+            self._kept(on_plane(self.shapes[a], poses[a], points[b], normals[b], margins[a]), self.shapes[a].size)
+            for a, b in zip(i.tolist(), m.tolist(), strict=True)
+        ]
+        found = FoundContacts.joined([found, FoundContacts.of(i, np.full(len(i), n), number, each)])
+        return found.where(np.argsort(found.first, kind="stable"))

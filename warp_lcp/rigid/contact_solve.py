@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,8 +10,8 @@ import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rigid.body import AXES, PLANAR, RigidBody, in_space, rotation_by
-from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints, Place, between
+from warp_lcp.rigid.body import AXES, PLANAR, BodyStates, in_space, rotation_by
+from warp_lcp.rigid.contact_detection import NONE, ContactDetection, FoundContacts, Place, between
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, JointPart
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
@@ -60,6 +59,7 @@ class ContactSolve:
         memory: impulses of the last step.
         joint_rows: of the last step; None: there are no joints, or there was no step.
         joint_impulses: of these rows [N s, N m s], shape (m,).
+        reach: of each body's points from its center of mass [m], shape (n,).
     """
 
     def __init__(self, detection: ContactDetection, solver: ImpulseSolver = sweeps_and_newton, joints: Sequence[Joint] = ()) -> None:
@@ -69,13 +69,11 @@ class ContactSolve:
         self.joint_rows: JointRows | None = None
         self.joint_impulses = np.zeros(sum(joint.row_count(self.dimension) for joint in joints))
         bodies, shapes = self.bodies, detection.shapes
-        self._reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
+        self.reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
         self._friction = np.array([body.friction for body in bodies])
         self._bounce = np.array([body.restitution for body in bodies])
-        self._masses = np.array([body.properties.mass for body in bodies])
-        self._inverse_inertias = np.array([body.properties.inverse_inertia for body in bodies])
-        self._roots_of_inertias = np.linalg.cholesky(self._inverse_inertias)
+        self._roots_of_inertias = np.linalg.cholesky(bodies.inverse_inertia)
 
     def check_start(self, time: float) -> None:
         """Refuse bodies that overlap at the start.
@@ -84,13 +82,17 @@ class ContactSolve:
             ValueError: which, and with what.
         """
         nothing = np.zeros(len(self.bodies))
-        for found in self._apart(self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles)))):
-            name, deep = self.bodies[found.first].name, -float(found.points.gap.min())
-            if deep <= START_OVERLAP * self._size[found.first]:
-                continue
-            if found.obstacle is not None:
-                raise ValueError(f"{name} reaches {deep:.3g} m into {found.obstacle.name} at the start: they must lie apart")
-            raise ValueError(f"{name} overlaps {self.bodies[found.second].name} by {deep:.3g} m at the start: bodies must lie apart")
+        found = self._apart(self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles))))
+        overlapping = -found.points.gap > START_OVERLAP * self._size[found.first]
+        if not overlapping.any():
+            return
+        k = int(overlapping.argmax())
+        number, other, which = int(found.first[k]), int(found.second[k]), int(found.obstacle[k])
+        of_pair = (found.first == number) & (found.second == other) & (found.obstacle == which)
+        name, deep = self.bodies[number].name, -float(found.points.gap[of_pair].min())
+        if which != NONE:
+            raise ValueError(f"{name} reaches {deep:.3g} m into {self.detection.obstacles[which].name} at the start: they must lie apart")
+        raise ValueError(f"{name} overlaps {self.bodies[other].name} by {deep:.3g} m at the start: bodies must lie apart")
 
     def find(self, time: float, dt: float, gravity: np.ndarray, gone: np.ndarray | None = None) -> Contacts:
         """Return current contacts and those possible within the step.
@@ -102,15 +104,15 @@ class ContactSolve:
             gone: bodies that touch nothing, shape (n,); None: there are none.
         """
         falls = float(np.linalg.norm(gravity)) * dt
-        six = self._six()
+        six = self.bodies.velocities()
         speeds, spins = np.linalg.norm(six[:, :3], axis=1), np.linalg.norm(six[:, 3:], axis=1)
-        ways = AHEAD * dt * (speeds + spins * self._reach + falls)
+        ways = AHEAD * dt * (speeds + spins * self.reach + falls)
         brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
         near = NEAR * float(self._size.min())
         found = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
         if gone is not None and gone.any():
             out = np.append(gone, False)
-            found = [pair for pair in found if not (out[pair.first] or out[pair.second])]
+            found = found.where(~(out[found.first] | out[found.second]))
         return self.assembled(found, time, dt, gravity)
 
     def approach(self, contacts: Contacts) -> np.ndarray:
@@ -238,8 +240,7 @@ class ContactSolve:
         else:
             impulses, self.residual, self.iterations = self._solver(problem, start)
             pushes = contacts.on_bodies(impulses, len(self.bodies))
-        for body, push in zip(self.bodies, pushes, strict=True):
-            body.push(push)
+        self.bodies.push(pushes)
         return impulses
 
     def _hold_joints(
@@ -284,12 +285,11 @@ class ContactSolve:
                 found[joint] = self.joints[joint].motor_torque * float(self.joint_impulses[row] / rows.upper[row])
         return found
 
-    def _moved(self, pushes: np.ndarray, dt: float) -> list[RigidBody]:
+    def _moved(self, pushes: np.ndarray, dt: float) -> BodyStates:
         """Return the bodies where impulses, shape (n, q), let them be after dt [s]."""
-        moved = [copy(body) for body in self.bodies]
-        for body, push in zip(moved, pushes, strict=True):
-            body.push(push)
-            body.position, body.rotation = body.after(dt)
+        moved = self.bodies.copied()
+        moved.push(pushes)
+        moved.advance(dt)
         return moved
 
     def separation(self, contacts: Contacts, dt: float, detour: np.ndarray | None = None) -> np.ndarray | None:
@@ -365,23 +365,20 @@ class ContactSolve:
         roots = self._roots()
         return np.concatenate([roots, np.zeros((1, *roots.shape[1:]))])
 
-    def _apart(self, found: Sequence[ContactPair]) -> list[ContactPair]:
-        """Return the pairs that no joint holds together."""
-        return [pair for pair in found if (pair.second, pair.first) not in self._joined]
+    def _apart(self, found: FoundContacts) -> FoundContacts:
+        """Return the contacts of pairs that no joint holds together."""
+        return found.without(self._joined)
 
-    def assembled(self, found: Sequence[ContactPair], time: float, dt: float, gravity: np.ndarray | None) -> Contacts:
-        """Return the contacts with their rows.
-
-        Tangents are along the slip, or along gravity if that is given.
-        """
+    def assembled(self, found: FoundContacts, time: float, dt: float, gravity: np.ndarray | None) -> Contacts:
+        """Return the contacts with their rows; tangents are along the slip, or along gravity, if that is given."""
         falls, n, dim = 0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
-        counts = np.array([len(entry.points) for entry in found], dtype=int)
-        first, second = (np.repeat(np.array([getattr(entry, name) for entry in found], dtype=int), counts) for name in ("first", "second"))
-        touch = ContactPoints.joined([entry.points for entry in found])
-        point, normal, gap = touch.point, touch.normal, touch.gap
-        moved = np.concatenate([np.zeros((0, 3)), *(_carried(entry.motion, entry.points.point, time, dt) for entry in found)])
-        six = np.concatenate([self._six(), np.zeros((1, 6))])
-        at = np.array([body.position for body in self.bodies] + [np.zeros(3)])
+        first, second = found.first, found.second
+        point, normal, gap = found.points.point, found.points.normal, found.points.gap
+        moved = np.zeros_like(point)
+        for number, obstacle in enumerate(self.detection.obstacles):
+            if obstacle.motion is not None and (here := found.obstacle == number).any():
+                moved[here] = _carried(obstacle.motion, point[here], time, dt)
+        six, at = (np.pad(values, ((0, 1), (0, 0))) for values in (self.bodies.velocities(), self.bodies.position))
         mine, others = point - at[first], point - at[second]
         slip = six[first, :3] + np.cross(six[first, 3:], mine) - six[second, :3] - np.cross(six[second, 3:], others) - moved
         ways = () if gravity is None else ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, ALONG_SLIP * falls))
@@ -400,8 +397,7 @@ class ContactSolve:
         """Return how far points near the bodies go with an obstacle in a step [m]."""
         if motion is None:
             return 0.0
-        places = np.array([body.position for body in self.bodies])
-        return dt * float(np.linalg.norm(_carried(motion, places, time, dt), axis=1).max())
+        return dt * float(np.linalg.norm(_carried(motion, self.bodies.position, time, dt), axis=1).max())
 
     def _answer(self, pushes: np.ndarray) -> np.ndarray:
         """Return M^-1 times what acts on the bodies, shape (n, q) both."""
@@ -411,19 +407,12 @@ class ContactSolve:
     def _roots(self) -> np.ndarray:
         """Return G with G G' the inverse mass of each body, shape (n, q, q)."""
         roots = np.zeros((len(self.bodies), 6, 6))
-        roots[:, AXES, AXES] = 1.0 / np.sqrt(self._masses)[:, None]
-        roots[:, 3:, 3:] = np.array([body.rotation for body in self.bodies]) @ self._roots_of_inertias
+        roots[:, AXES, AXES] = 1.0 / np.sqrt(self.bodies.mass)[:, None]
+        roots[:, 3:, 3:] = self.bodies.rotation @ self._roots_of_inertias
         return roots if self.dimension == 3 else roots[:, PLANAR][:, :, PLANAR]
 
-    def _six(self) -> np.ndarray:
-        """Return velocities and angular velocities [m/s, rad/s], shape (n, 6)."""
-        R = np.array([body.rotation for body in self.bodies])
-        linear, angular = (np.array([getattr(body, name) for body in self.bodies]) for name in ("momentum", "angular_momentum"))
-        spin = R @ (self._inverse_inertias @ (R.swapaxes(1, 2) @ angular[:, :, None]))
-        return np.concatenate([linear / self._masses[:, None], spin[:, :, 0]], axis=1)
-
     def _velocities(self) -> np.ndarray:
-        six = self._six()
+        six = self.bodies.velocities()
         return six if self.dimension == 3 else six[:, PLANAR]
 
 
@@ -433,9 +422,7 @@ def _rows(arms: np.ndarray, frames: np.ndarray, dimension: int) -> np.ndarray:
     return both if dimension == 3 else both[:, :, PLANAR]
 
 
-def _carried(motion: Motion | None, points: np.ndarray, time: float, dt: float) -> np.ndarray:
+def _carried(motion: Motion, points: np.ndarray, time: float, dt: float) -> np.ndarray:
     """Return the mean velocities of points that a solid takes along in a step [m/s], shape (k, 3)."""
-    if motion is None:
-        return np.zeros_like(points)
     way = motion.pose(time + dt).after(motion.pose(time).inverse())
     return np.asarray((way.apply(points) - points) / dt)

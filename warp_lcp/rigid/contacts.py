@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
 
-from warp_lcp.rigid.body import RigidBody
+from warp_lcp.rigid.body import BodyStates
 
 SAME_PLACE = 0.05  # of a body's size: a contact this close to one of the last step starts from its impulse
 KEPT = 32  # contacts remembered for each body, at most
@@ -99,16 +99,13 @@ class ContactMemory:
         values = np.array(state, dtype=np.float64).reshape(-1, 8)
         self.values = values[values[:, 0] >= 0.0]
 
-    def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: Sequence[RigidBody]) -> None:
-        """Store impulses, shape (k, dimension)."""
+    def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: BodyStates) -> None:
+        """Remember impulses, shape (k, dimension)."""
         world = (impulses[:, None] @ contacts.frames)[:, 0]
         self.values = np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])[: self._most]
 
-    def recall(self, contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:
-        """Return impulses to start from, shape (k, dimension).
-
-        Those of the nearest contact of the same pair, each used once.
-        """
+    def recall(self, contacts: Contacts, bodies: BodyStates) -> np.ndarray:
+        """Return impulses to start from, shape (k, dimension): those of the nearest contact of the same two, once each."""
         start, old = np.zeros(contacts.wall.shape), self.values
         if not len(old) or not len(contacts):
             return start
@@ -132,10 +129,10 @@ def _least(group: np.ndarray, other: np.ndarray, way: np.ndarray) -> np.ndarray:
     return order[np.diff(group[order], prepend=-1) > 0]
 
 
-def _places(contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:
+def _places(contacts: Contacts, bodies: BodyStates) -> np.ndarray:
     """Return contacts in the axes of their first bodies [m], shape (k, 3)."""
-    at, turned = (np.array([getattr(body, name) for body in bodies]) for name in ("position", "rotation"))
-    return np.asarray(((contacts.point - at[contacts.first])[:, None] @ turned[contacts.first])[:, 0])
+    arms = contacts.point - bodies.position[contacts.first]
+    return np.asarray((arms[:, None] @ bodies.rotation[contacts.first])[:, 0])
 
 
 def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.ndarray, bodies: int) -> csr_array:

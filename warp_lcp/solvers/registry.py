@@ -2,8 +2,8 @@
 
 A new method is one file and one line here. Each class says in `supports` which capabilities it asks of an operator, any one of them (see
 `warp_lcp.problem.protocol`; nothing where every operator will do), and in `needs` what must hold of A ("symmetric", ...). A class that
-takes small problems only has `most_unknowns`; one whose problems are no `LCP` names their class as `problems`, and takes no operators: it
-stands in a table of its own; one that takes no upper bounds and no equations has `boxed = False`; one that ends with NEGATIVE_CURVATURE
+takes small problems only has `most_unknowns`; one whose problems are no `LCP` names their class as `problems` and takes no operators, so
+that `families` of it are none; one that takes no upper bounds and no equations has `boxed = False`; one that ends with NEGATIVE_CURVATURE
 where A is surely no P- and no semi-definite matrix has `definite = True`.
 """
 
@@ -46,15 +46,10 @@ ALSO = {
 
 
 class Methods(dict[str, type[Any]]):
-    """Methods by their names; an unknown one's KeyError says which is meant, or which there are.
-
-    Those listed are methods of linear complementarity problems; looked up by name, those of `CONTACTS` are found, too.
-    """
+    """Methods by their names; an unknown one's KeyError says which is meant, or which there are."""
 
     def __missing__(self, name: str) -> type[Any]:
-        """Return a method of contacts, or refuse a name that no method has."""
-        if name in CONTACTS:
-            return CONTACTS[name]
+        """Refuse a name that no method has."""
         raise KeyError(f"no such method: {name!r}; {self.nearest(name)}")
 
     def nearest(self, name: object) -> str:
@@ -67,7 +62,6 @@ class Methods(dict[str, type[Any]]):
         return nearest(word, self)
 
 
-CONTACTS: dict[str, type[Any]] = {"proximal-gauss-seidel": ProximalGaussSeidel}  # methods of `FrictionalContact`, no `LCP`
 METHODS = Methods(
     {
         "accelerated-projected-gradient": AcceleratedProjectedGradient,
@@ -85,6 +79,7 @@ METHODS = Methods(
         "primal-dual-active-set": PrimalDualActiveSet,
         "projected-jacobi": ProjectedJacobi,
         "projected-multigrid": ProjectedMultigrid,
+        "proximal-gauss-seidel": ProximalGaussSeidel,  # of `FrictionalContact`
         "psor": ProjectedSOR,
         "quadratic-program": QuadraticProgram,
         "staggering": Staggering,
