@@ -221,7 +221,7 @@ class RigidBody:
 
 
 class BodyStates(Sequence[RigidBody]):
-    """Several bodies with their states in one array: loops over all of them are NumPy's.
+    """Several bodies with their states in one array.
 
     Args:
         bodies: whose states become rows of the array, so that a body belongs to one `BodyStates`, the last one made of it.
@@ -270,12 +270,12 @@ class BodyStates(Sequence[RigidBody]):
         return BodyStates([copy(body) for body in self])
 
     def velocities(self) -> np.ndarray:
-        """Return velocities of centers of mass and angular velocities [m/s, rad/s], shape (n, 6)."""
+        """Return linear and angular velocities [m/s, rad/s], shape (n, 6)."""
         spin = spins(self.rotation, self.inverse_inertia, self.angular_momentum)
         return np.concatenate([self.momentum / self.mass[:, None], spin], axis=1)
 
     def push(self, impulses: np.ndarray) -> None:
-        """Add impulses and those of torque [N s, N m s], shape (n, k), whatever holds the bodies."""
+        """Add impulses [N s] and angular impulses [N m s], shape (n, k)."""
         six = in_space(impulses)
         self.momentum += six[:, :3]
         self.angular_momentum += six[:, 3:]
@@ -321,13 +321,16 @@ class BodyMotion:
         return Pose.about(center, rotation, position - center)
 
     def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s]: the body's point x moves at turn x + shift now."""
+        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s].
+
+        The body's point x moves at turn x + shift now.
+        """
         turn = cross_matrix(self.body.angular_velocity)
         return turn, self.body.velocity - turn @ self.body.position
 
 
 def in_space(values: np.ndarray) -> np.ndarray:
-    """Return velocities, impulses or ways of three (2-D) or six entries, shape (..., k), as ones of six."""
+    """Return vectors of three (2-D) or six entries, shape (..., k), as ones of six."""
     values = np.asarray(values, dtype=np.float64)
     if values.shape[-1] == 6:
         return values
@@ -337,7 +340,7 @@ def in_space(values: np.ndarray) -> np.ndarray:
 
 
 def spins(rotation: np.ndarray, inverse_inertia: np.ndarray, momentum: np.ndarray) -> np.ndarray:
-    """Return angular velocities R I^-1 R' L [rad/s] of rotations R and angular momenta L, shape (..., 3)."""
+    """Return angular velocities R I^-1 R' L [rad/s], shape (..., 3)."""
     return np.asarray(rotation @ (inverse_inertia @ (rotation.swapaxes(-1, -2) @ momentum[..., None])))[..., 0]
 
 
@@ -371,14 +374,14 @@ def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.nda
 
 
 def shift_states(values: np.ndarray, ways: np.ndarray) -> None:
-    """Move bodies by small ways (m, rad), shape (n, 6), without a velocity; `values`, shape (n, 26), are updated."""
+    """Move bodies by small displacements (m, rad), shape (n, 6), without velocity."""
     values[:, POSITION] += ways[:, :3]
     values[:, ROTATION] = (rotation_by(ways[:, 3:]) @ values[:, ROTATION].reshape(-1, 3, 3)).reshape(-1, 9)
     values[:, ANGLE] += ways[:, 5]
 
 
 def orthonormal(rotation: np.ndarray) -> np.ndarray:
-    """Return the rotations nearest to matrices that rounding has moved off them, shape (..., 3, 3).
+    """Return the rotations nearest to almost orthonormal matrices, shape (..., 3, 3).
 
     R (3 - R'R) / 2 is Newton's step to the polar factor of R (Newton-Schulz): |R'R - 1| = d becomes 3/4 d^2, which is below rounding.
     """
@@ -386,7 +389,9 @@ def orthonormal(rotation: np.ndarray) -> np.ndarray:
 
 
 def rotation_by(vector: np.ndarray) -> np.ndarray:
-    """Return matrices of turns by |v| [rad] about vectors v, shape (..., 3): SciPy's `Rotation.from_rotvec` to rounding.
+    """Return matrices of rotations by |v| [rad] about vectors v, shape (..., 3).
+
+    They equal SciPy's `Rotation.from_rotvec` to rounding.
 
     With K x = v x x that is 1 + sin(a) / a K + (sin(a/2) / (a/2))^2 K^2 / 2, a = |v|.
     """

@@ -221,7 +221,7 @@ def close_pairs(middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.nd
 
 @dataclass(frozen=True, eq=False)
 class FoundContacts:
-    """Points at which bodies touch something, k of them.
+    """Contact points of bodies, k of them.
 
     Args:
         first: body that normals point into, shape (k,).
@@ -253,7 +253,7 @@ class FoundContacts:
 
     @classmethod
     def of(cls, first: Any, second: Any, obstacle: int, points: Sequence[ContactPoints]) -> FoundContacts:
-        """Return the contacts of pairs that have some points each; first, second: shape (pairs,)."""
+        """Join the contact points of pairs; first, second: shape (pairs,)."""
         counts = [len(each) for each in points]
         one, other = (np.repeat(np.asarray(side, dtype=np.int64), counts) for side in (first, second))
         return cls(one, other, np.full(len(one), obstacle), ContactPoints.joined(points))

@@ -370,7 +370,10 @@ class ContactSolve:
         return found.without(self._joined)
 
     def assembled(self, found: FoundContacts, time: float, dt: float, gravity: np.ndarray | None) -> Contacts:
-        """Return the contacts with their rows; tangents are along the slip, or along gravity, if that is given."""
+        """Return the contacts with their rows.
+
+        Tangents are along the slip, or along gravity if that is given.
+        """
         falls, n, dim = 0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
         first, second = found.first, found.second
         point, normal, gap = found.points.point, found.points.normal, found.points.gap

@@ -105,7 +105,10 @@ class ContactMemory:
         self.values = np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])[: self._most]
 
     def recall(self, contacts: Contacts, bodies: BodyStates) -> np.ndarray:
-        """Return impulses to start from, shape (k, dimension): those of the nearest contact of the same two, once each."""
+        """Return impulses to start from, shape (k, dimension).
+
+        Those of the nearest contact of the same pair, each used once.
+        """
         start, old = np.zeros(contacts.wall.shape), self.values
         if not len(old) or not len(contacts):
             return start
