@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import timedelta
+from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -16,7 +18,8 @@ import typer
 from warp_lcp.cli.ending import wrong_input
 from warp_lcp.render.film import check_rate
 from warp_lcp.render.live import PORT, live_server, served
-from warp_lcp.render.recording import Color, RenderError, Show
+from warp_lcp.render.photo.photo import SAMPLES, SHUTTER, PhotoSettings, frame_range, photograph_film, photograph_run
+from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
 from warp_lcp.render.usd import export_run
 from warp_lcp.render.viewer import view_run
@@ -40,13 +43,22 @@ CameraOption = Annotated[
 ]
 
 
+class Look(StrEnum):
+    """How images are drawn."""
+
+    QUICK = "quick"
+    PHOTO = "photo"
+
+
 def render(
     folder: RunArgument,
+    look: Annotated[Look, typer.Option(help="quick: OpenGL, with legends; photo: path-traced, 3-D.")] = Look.QUICK,
     frame: Annotated[
         list[int] | None, typer.Option(metavar="N", help="Draw frame N, counted from the end if negative; may be repeated.")
     ] = None,
+    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Draw frames A to B, both included.", show_default=False)] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image; a sheet may be less high.")] = "1280x720",
-    out: Annotated[Path | None, typer.Option(help="The images' folder; DIR/images unless given.", show_default=False)] = None,
+    out: Annotated[Path | None, typer.Option(help="The images' folder; DIR/images, DIR/photo unless given.", show_default=False)] = None,
     show: ShowOption = None,
     color: ColorOption = None,
     sheet: Annotated[bool, typer.Option("--sheet", help="Draw the frames, or six of them, side by side into sheet.png.")] = False,
@@ -58,27 +70,65 @@ def render(
     at: Annotated[
         float | None, typer.Option(metavar="Z", help="Where a 3-D run is cut, in meters; in its middle unless given.", show_default=False)
     ] = None,
+    samples: Annotated[
+        int | None, typer.Option(metavar="N", help="Photo: paths through a pixel; 64 unless given.", show_default=False)
+    ] = None,
+    shutter: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="Photo: exposure in frame intervals; 0.25 unless given.", show_default=False)
+    ] = None,
     overrides: CameraOption = None,
 ) -> None:
-    """Draw a run's frames as PNG images or as a film (needs the extra `render`)."""
+    """Draw a run's frames as PNG images or as a film (needs the extra `render`, or `photo`)."""
     devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
     console = Terminal(stderr=True)
 
     def estimated(seconds: float) -> None:
-        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))} of a core")
+        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))}{'' if look is Look.PHOTO else ' of a core'}")
 
     with wrong_input(), Count(console, "drawing", "images") as told:
+        frame = [*(frame or ()), *(frame_range(frames, Recording(folder, color, show).numbers) if frames else ())]
+        if look is Look.PHOTO:
+            if fps is not None and film is None:
+                raise RenderError("--fps: is of a film; give --film")
+            refuse_quick_options(sheet=sheet, slice=cut, at=at is not None, color=color is not None)
+            settings = PhotoSettings(
+                size=parse_size(size), samples=SAMPLES if samples is None else samples, shutter=SHUTTER if shutter is None else shutter, show=show,
+                overrides=overrides or (),
+            )  # fmt: skip
+            draw = partial(photograph_film, film=film, rate=check_rate(fps)) if film else photograph_run
+            report: Any = {"told": told, "estimated": estimated, "noted": partial(say, console)}
+            images = list(draw(folder, frames=frame, settings=settings, out=out, **report))
+            tell(f"{film}: {len(images)} frames" if film else _listed(images))
+            return
+        if samples is not None or shutter is not None:
+            raise RenderError(f"--{'shutter' if samples is None else 'samples'}: is of --look photo")
         looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
         if film is not None:
             if frame or sheet or out:
-                raise RenderError("--film: shows all frames in one file; leave out --frame, --sheet and --out")
+                raise RenderError("--film: shows all frames in one file; leave out --frame, --frames, --sheet and --out")
             count = len(list(film_run(folder, film, looks=looks, rate=check_rate(fps), told=told, estimated=estimated)))
             tell(f"{film}: {count} frames")
             return
         if fps is not None:
             raise RenderError("--fps: is of a film; give --film")
         images = list(render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet, told=told, estimated=estimated))
-    tell(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
+    tell(_listed(images))
+
+
+def refuse_quick_options(**given: bool) -> None:
+    """Refuse options that only `--look quick` has.
+
+    Raises:
+        RenderError: one of them is given.
+    """
+    for name, there in given.items():
+        if there:
+            raise RenderError(f"--{name}: is of --look quick")
+
+
+def _listed(images: list[Path]) -> str:
+    """Return which images there are."""
+    return f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}"
 
 
 def view(folder: RunArgument, show: ShowOption = None, color: ColorOption = None, overrides: CameraOption = None) -> None:
