@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from small_runs import ball, box, write_run
 from warp_lcp.cli import commands as cli
 from warp_lcp.render.photo import photo
-from warp_lcp.render.photo.mitsuba_renderer import INSTALL, Quality, displaced, find_llvm, render_radiance
+from warp_lcp.render.photo.mitsuba_renderer import INSTALL, PASS_PATHS, Quality, displaced, find_llvm, pass_samples, render_radiance
 from warp_lcp.render.photo.photo import PhotoSettings, expected_seconds, frame_range, photograph_film, photograph_run
 from warp_lcp.render.photo.photo_scene import ABSORPTION, Finish, PhotoScenes, grain_colors, linear_color, liquid_absorption, rigid_pose
 from warp_lcp.render.recording import Recording, RenderError, Show
@@ -142,6 +142,15 @@ def test_the_estimate_grows_with_pixels_and_samples():
     small = seconds((640, 360), 32)
     assert seconds((1280, 720), 32) - small == pytest.approx(3.0 * (seconds((640, 360), 64) - small))
     assert seconds((1280, 720), 32) > small > 0.0
+
+
+@pytest.mark.parametrize(
+    ("size", "samples", "instants"), [((64, 36), 4, 1), ((1280, 720), 64, 8), ((4096, 4096), 3, 8), ((1920, 1080), 100, 1)]
+)
+def test_passes_share_the_samples(size, samples, instants):
+    shares = pass_samples(Quality(size, samples), instants)
+    assert sum(shares) == max(1, round(samples / instants)) and min(shares) >= 1
+    assert max(shares) == 1 or max(shares) * size[0] * size[1] <= 1.5 * PASS_PATHS
 
 
 def test_the_camera_sees_where_the_material_goes(dots, tmp_path):

@@ -91,10 +91,8 @@ def render(
             if fps is not None and film is None:
                 raise RenderError("--fps: is of a film; give --film")
             refuse_quick_options(sheet=sheet, slice=cut, at=at is not None, color=color is not None)
-            settings = PhotoSettings(
-                size=parse_size(size), samples=SAMPLES if samples is None else samples, shutter=SHUTTER if shutter is None else shutter, show=show,
-                overrides=overrides or (),
-            )  # fmt: skip
+            exposure: Any = {"samples": SAMPLES if samples is None else samples, "shutter": SHUTTER if shutter is None else shutter}
+            settings = PhotoSettings(size=parse_size(size), show=show, overrides=overrides or (), **exposure)
             draw = partial(photograph_film, film=film, rate=check_rate(fps)) if film else photograph_run
             report: Any = {"told": told, "estimated": estimated, "noted": partial(say, console)}
             images = list(draw(folder, frames=frame, settings=settings, out=out, **report))

@@ -42,7 +42,9 @@ def creased(points: np.ndarray, corners: np.ndarray, angle: float = CREASE) -> t
     place = np.arange(len(corner)) - np.repeat(np.cumsum(around) - around, around)
     other = order[first[point[corner]] + place] // 3
     near = np.einsum("ij,ij->i", unit[corner // 3], unit[other]) >= np.cos(np.radians(angle))
-    sums = np.stack([np.bincount(corner[near], normal[other[near], axis], len(point)) for axis in range(3)], axis=1)
+    sums = np.zeros((len(point), 3))
+    for axis in range(3):
+        sums[:, axis] = np.bincount(corner[near], normal[other[near], axis], len(point))
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
     return points[point], np.arange(len(point)).reshape(-1, 3), sums
 

@@ -32,7 +32,8 @@ mitsuba.render(mitsuba.load_dict(scene), spp=1).numpy()
 VERSION = 1  # of how pictures look; pictures of another one are rendered again
 DEPTH, ROULETTE = 20, 10  # bounces; from where on paths end by chance
 SUBFRAMES = 8  # instants of a shutter interval, where something moves
-LARGEST_SAMPLE = 30.0  # radiance of a pixel's mean over an instant: rare bright paths would leave spots
+PASS_PATHS = 4_000_000  # of a pass, at the most
+LARGEST_SAMPLE = 30.0  # radiance of a pixel's mean over a pass: rare bright paths would leave spots
 GROUND_REACH = 60.0  # of the ground, in sizes of the domain
 GROUND = [0.62, 0.61, 0.595]  # reflectance
 SKY_ROWS = 256
@@ -115,16 +116,25 @@ def render_radiance(scene: PhotoScene, quality: Quality, seed: int, variant: str
     mitsuba = load_renderer(variant)
     moves = quality.shutter > 0.0 and any(mesh.velocity is not None for mesh in scene.meshes)
     instants = min(SUBFRAMES, quality.samples) if moves else 1
-    each = max(1, round(quality.samples / instants))
-    total = np.zeros((quality.size[1], quality.size[0], 9), dtype=np.float32)
+    shares = pass_samples(quality, instants)
+    total = np.zeros((quality.size[1], quality.size[0], 9))
     for instant in range(instants):
         shift = quality.shutter * ((instant + 0.5) / instants - 0.5)
         loaded = mitsuba.load_dict(scene_plugins(mitsuba, displaced(scene, shift), quality.size))
-        image = np.nan_to_num(np.array(mitsuba.render(loaded, spp=each, seed=seed * SUBFRAMES + instant)), posinf=LARGEST_SAMPLE)
-        image[..., :3] = np.clip(image[..., :3], 0.0, LARGEST_SAMPLE)
-        total += image / instants
+        for number, samples in enumerate(shares):
+            layers = np.array(mitsuba.render(loaded, spp=samples, seed=(seed * SUBFRAMES + instant) * len(shares) + number))
+            layers = np.nan_to_num(layers, posinf=LARGEST_SAMPLE)
+            layers[..., :3] = np.clip(layers[..., :3], 0.0, LARGEST_SAMPLE)
+            total += samples / (instants * sum(shares)) * layers
         del loaded
     return denoised(total)
+
+
+def pass_samples(quality: Quality, instants: int) -> list[int]:
+    """Return the samples of each pass of an instant; a pass has at most `PASS_PATHS` paths, which bounds the memory."""
+    each = max(1, round(quality.samples / instants))
+    passes = min(each, math.ceil(each * math.prod(quality.size) / PASS_PATHS))
+    return [each // passes + (number < each % passes) for number in range(passes)]
 
 
 def denoised(layers: np.ndarray) -> np.ndarray:
@@ -220,7 +230,9 @@ def sky() -> np.ndarray:
     height = np.clip(direction[..., 1:2], 0.0, 1.0) ** 0.6
     radiance = (1.0 - height) * np.array([0.80, 0.84, 0.90]) + height * np.array([0.14, 0.24, 0.46])
     radiance = np.where(direction[..., 1:2] < 0.0, np.array([0.30, 0.30, 0.31]), radiance)
-    radiance += _lamp(direction, [-0.75, 1.0, -0.1], 13.0, 3.0, [28.0, 25.8, 22.5])  # key, from the left
+    radiance += _lamp(
+        direction, [-0.75, 1.0, -0.1], 20.0, 4.0, [12.2, 11.2, 9.8]
+    )  # key, from the left: large, since light below water finds it by chance
     radiance += _lamp(direction, [1.0, 0.45, -0.9], 18.0, 8.0, [2.0, 2.3, 2.8])  # rim, from behind on the right
     return radiance.astype(np.float32)
 
