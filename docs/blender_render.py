@@ -19,7 +19,7 @@ import mathutils
 
 ABSORPTION = (1.6, 0.47, 0.26)  # of water, 1/m for red, green and blue; the real one is hardly visible in a tank
 SHADOW = (0.82, 0.92, 0.95, 1.0)  # of water: shadow rays go straight on, so that what lies below it needs no caustics
-FLOOR = 0.6
+FLOOR, BODIES = (0.6, 0.6, 0.6), [(0.75, 0.24, 0.06), (0.85, 0.62, 0.08), (0.10, 0.35, 0.12)]
 GLASS_BOUNCES = 16
 
 
@@ -52,18 +52,23 @@ def water() -> Any:
     return material
 
 
+def matte(name: str, color: tuple[float, float, float]) -> Any:
+    """Return an opaque material of a linear color."""
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (*color, 1.0)
+    return material
+
+
 def studio(scene: Any, size: float) -> None:
     """Add a floor, a sky and a soft key light."""
     bpy.ops.mesh.primitive_plane_add(size=60.0 * size, location=(0.0, 0.0, -1e-3 * size))  # below the surface's own floor
-    floor = bpy.data.materials.new("floor")
-    floor.use_nodes = True
-    floor.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (FLOOR, FLOOR, FLOOR, 1.0)
-    bpy.context.object.data.materials.append(floor)
+    bpy.context.object.data.materials.append(matte("floor", FLOOR))
     scene.world = bpy.data.worlds.new("sky")
     scene.world.use_nodes = True
     scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.55, 0.65, 0.80, 1.0)
     light = bpy.data.lights.new("key", "SUN")
-    light.energy, light.angle = 3.0, math.radians(15.0)
+    light.energy, light.angle = 2.0, math.radians(15.0)
     key = bpy.data.objects.new("key", light)
     key.rotation_euler = mathutils.Vector((0.6, 0.1, -1.0)).to_track_quat("-Z", "Y").to_euler()
     scene.collection.objects.link(key)
@@ -107,10 +112,10 @@ def main() -> None:
     scene = bpy.context.scene
     bpy.ops.wm.usd_import(filepath=str(asked.usd.resolve()))
     scene.frame_set(asked.frame)
-    for item in scene.objects:
-        if item.name.startswith("surface"):
-            item.data.materials.clear()
-            item.data.materials.append(water())
+    for number, item in enumerate(item for item in scene.objects if item.type == "MESH"):
+        item.data.materials.clear()
+        color = BODIES[number % len(BODIES)]
+        item.data.materials.append(water() if item.name.startswith("surface") else matte(item.name, color))
     studio(scene, max(max(item.dimensions) for item in scene.objects))
     camera(scene, asked)
     settings(scene, asked)

@@ -1,6 +1,7 @@
 """Path-traced pictures of a run: their description, camera, settings and files. What needs Mitsuba is skipped where it is missing."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,16 @@ from warp_lcp.cli import commands as cli
 from warp_lcp.render.photo import photo
 from warp_lcp.render.photo.mitsuba_renderer import INSTALL, PASS_PATHS, Quality, displaced, find_llvm, pass_samples, render_radiance
 from warp_lcp.render.photo.photo import PhotoSettings, expected_seconds, frame_range, photograph_film, photograph_run
-from warp_lcp.render.photo.photo_scene import ABSORPTION, Finish, PhotoScenes, grain_colors, linear_color, liquid_absorption, rigid_pose
+from warp_lcp.render.photo.photo_scene import (
+    ABSORPTION,
+    Finish,
+    PhotoScenes,
+    grain_colors,
+    linear_color,
+    liquid_absorption,
+    particle_surface,
+    rigid_pose,
+)
 from warp_lcp.render.recording import Recording, RenderError, Show
 from warp_lcp.simulation import Points, Surface
 
@@ -189,6 +199,19 @@ def test_particles_become_grains(dots, tmp_path):
     assert colors.min() > 0.1 and colors.max() <= 0.9 and (colors[:, 0] >= colors[:, 2]).all() and len(np.unique(colors, axis=0)) > 500
 
 
+def test_particles_alone_get_a_surface():
+    places = np.stack(np.meshgrid(*[np.arange(0.025, 0.6, 0.05)] * 3), axis=-1).reshape(-1, 3)  # 12 x 12 x 12, a cube in a corner
+    velocity = np.tile([1.0, 2.0, 3.0], (len(places), 1))
+    scene = SimpleNamespace(
+        cell_counts=(10, 10, 10), spacing=0.1, domain=SimpleNamespace(size=(1.0, 1.0, 1.0)), particles=SimpleNamespace(per_axis=2),
+        output=SimpleNamespace(surface_resolution=None, surface_smoothing=1.0),
+    )  # fmt: skip
+    surface = particle_surface(scene, Points("particles", places, {"velocity": velocity}))
+    a, b, c = np.moveaxis(surface.points[surface.corners].astype(float), 1, 0)
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0 == pytest.approx(0.6**3, rel=0.05)
+    np.testing.assert_array_equal(surface.fields["velocity"][0], [1.0, 2.0, 3.0])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_poses_of_bodies_are_found_from_their_points(seed):
     rng = np.random.default_rng(seed)
@@ -205,11 +228,8 @@ def test_colors():
     np.testing.assert_allclose(linear_color("#ffffff"), 1.0)
     np.testing.assert_allclose(linear_color("#808080"), 0.2158605, rtol=1e-5)
 
-    class Scene:
-        class domain:  # noqa: N801
-            size = (2.0, 1.0, 1.0)
-
-    np.testing.assert_allclose(2.0 * liquid_absorption(Scene), ABSORPTION["water"])
+    scene = SimpleNamespace(domain=SimpleNamespace(size=(2.0, 1.0, 1.0)))
+    np.testing.assert_allclose(2.0 * liquid_absorption(scene), ABSORPTION["water"])
 
 
 def test_only_known_versions_of_llvm_are_tried(tmp_path, monkeypatch):

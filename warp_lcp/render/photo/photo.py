@@ -92,7 +92,7 @@ def photograph_run(
     load_renderer()
     recording = Recording(folder, None, settings.show, settings.overrides)
     numbers, out = recording.chosen(frames), out or folder / "photo"
-    scenes = PhotoScenes(recording, settings.size[0] / settings.size[1])
+    scenes = PhotoScenes(recording, settings.size[0] / settings.size[1], beads=settings.show is Show.PARTICLES)
     files = {number: out / f"photo_{number:06d}.png" for number in numbers}
     wanted = {number: picture_settings(scenes, number, settings) for number in numbers}
     held = {number: read_settings(file) for number, file in files.items()}
@@ -189,7 +189,7 @@ def picture_settings(scenes: PhotoScenes, number: int, settings: PhotoSettings) 
         "samples": settings.samples,
         "shutter": settings.shutter,
         "camera": [round(float(value), 9) for value in camera],
-        "show": str(scenes.recording.show),
+        "show": str(settings.show or scenes.recording.show),
         "frame": checksums,
     }
 

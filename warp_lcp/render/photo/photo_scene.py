@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid.motion import Pose
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.surface_mesh import SurfaceMesh
 from warp_lcp.render.actors import BODY_COLORS, is_round
 from warp_lcp.render.grains import placed_grains
 from warp_lcp.render.photo.meshes import (
@@ -30,7 +33,7 @@ from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.camera import VIEW_ANGLE, Viewpoint, view_of_points, viewpoint
 from warp_lcp.scene.shapes import BoxTable, PlaneTable
-from warp_lcp.simulation import Surface
+from warp_lcp.simulation import Points, Surface
 
 FRAMING_FRAMES = 8  # evenly spaced frames that tell where the material goes
 FRAMING_SHARE = 0.5  # percent of a frame's points that may leave the picture at each side
@@ -99,19 +102,28 @@ class PhotoScene:
 class PhotoScenes:
     """The picture's description of each frame of a run.
 
+    A liquid whose frames have particles alone gets a surface around them, unless particles are asked for.
+
     Args:
         recording: of a 3-D run.
         aspect: width over height of the picture.
+        beads: show a liquid's particles as beads where the frames have no surface.
 
     Raises:
-        RenderError: the run is 2-D, or has no frame that can be read.
+        RenderError: the run is 2-D, or has no frame that can be read; or its particles are only near a surface that is not there.
     """
 
-    def __init__(self, recording: Recording, aspect: float) -> None:
-        scene = recording.scene
+    def __init__(self, recording: Recording, aspect: float, *, beads: bool = False) -> None:
+        scene: Any = recording.scene
         if scene.dimension != 3:
             raise RenderError("--look photo: draws 3-D runs; this one is 2-D, which --look quick draws")
         self.recording, self._scene = recording, scene
+        particles = getattr(scene, "particles", None)  # settings of what the particles stand for
+        self._wrapped = scene.palette == "water" and particles is not None and not beads
+        if self._wrapped and recording.show is Show.PARTICLES and particles.narrow_band is not None:
+            raise RenderError(
+                "--look photo: a run with a narrow band of particles needs output.surface = true; --show particles draws beads"
+            )
         self._spacing = recording.particle_spacing()
         self.view = framed(recording, aspect)
         self._prescribed = [
@@ -132,6 +144,8 @@ class PhotoScenes:
             meshes += body_meshes(bodies, [body_surface(geometry, 3).points for geometry in self._bodies])
         if self.recording.show in (Show.SURFACE, Show.BOTH):
             meshes += self._material(self.recording.surface(number), self._distance(time, bodies))
+        elif self.recording.show is Show.PARTICLES and self._wrapped:
+            meshes += self._material(particle_surface(self._scene, self.recording.particles(number)), self._distance(time, bodies))
         elif self.recording.show is Show.PARTICLES:
             meshes += self._grains(number)
         return PhotoScene(meshes, self.view, 0.0, np.array(self._scene.domain.size))
@@ -196,6 +210,20 @@ class PhotoScenes:
         if not placed:
             return None
         return lambda points: nearest_distance(placed, wp.array(points, dtype=wp.vec3, device="cpu"))
+
+
+def particle_surface(scene: Any, particles: Points) -> Surface:
+    """Return the surface around a liquid's particles, as `output.surface` writes it, with the velocity of the nearest particle."""
+    grid = StaggeredGrid(scene.cell_counts, scene.spacing, 3, "cpu")
+    at = np.asarray(particles.points, dtype=np.float64)
+    at = at[((at >= 0.0) & (at <= scene.domain.size)).all(axis=1)]
+    output = scene.output
+    wrap = SurfaceMesh(grid, per_axis=scene.particles.per_axis, resolution=output.surface_resolution, smoothing=output.surface_smoothing)
+    mesh = wrap.find(wp.array(at, dtype=wp.vec3, device="cpu"))
+    points, corners, fields = mesh.points.numpy(), mesh.corners.numpy(), {}
+    if len(points) and "velocity" in particles.fields:
+        fields["velocity"] = particles.fields["velocity"][cKDTree(particles.points).query(points)[1]]
+    return Surface("surface", points, corners, fields)
 
 
 def framed(recording: Recording, aspect: float) -> Viewpoint:
