@@ -109,6 +109,8 @@ def pressed_against(points: np.ndarray, corners: np.ndarray, distance: Distance,
     used = np.unique(corners)
     normal[used] = smooth_normals(points, corners)[used]
     near = np.flatnonzero(np.abs(distance(points)) < TOUCHING * spacing)
+    if not len(near):
+        return points
     for _ in range(2):  # the gradient turns near edges
         at = points[near]
         step = 1e-2 * spacing

@@ -230,9 +230,7 @@ def sky() -> np.ndarray:
     height = np.clip(direction[..., 1:2], 0.0, 1.0) ** 0.6
     radiance = (1.0 - height) * np.array([0.80, 0.84, 0.90]) + height * np.array([0.14, 0.24, 0.46])
     radiance = np.where(direction[..., 1:2] < 0.0, np.array([0.30, 0.30, 0.31]), radiance)
-    radiance += _lamp(
-        direction, [-0.75, 1.0, -0.1], 20.0, 4.0, [12.2, 11.2, 9.8]
-    )  # key, from the left: large, since light below water finds it by chance
+    radiance += _lamp(direction, [-0.75, 1.0, -0.1], 13.0, 3.0, [28.0, 25.8, 22.5])  # key, from the left
     radiance += _lamp(direction, [1.0, 0.45, -0.9], 18.0, 8.0, [2.0, 2.3, 2.8])  # rim, from behind on the right
     return radiance.astype(np.float32)
 
