@@ -25,7 +25,7 @@ EXPOSURE = 1.55  # of radiance, before AgX
 CONTRAST, SATURATION = 1.6, 1.35  # the look, after AgX's sigmoid
 # CPU seconds of a million paths through liquid, and through grains, bodies and sky; of a frame's geometry. Measured on an
 # Intel Xeon; within a factor of 2.
-LIQUID_SECONDS, OPAQUE_SECONDS = {"scalar_rgb": 8.0, "llvm_ad_rgb": 3.5}, {"scalar_rgb": 5.0, "llvm_ad_rgb": 2.5}
+LIQUID_SECONDS, OPAQUE_SECONDS = {"scalar_rgb": 9.0, "llvm_ad_rgb": 4.6}, {"scalar_rgb": 9.0, "llvm_ad_rgb": 4.2}
 GEOMETRY_SECONDS = 8.0
 SETTINGS_KEY = "warp-lcp photo"  # of a PNG's text chunk
 SAMPLES, MOST_SAMPLES = 64, 65536  # paths through a pixel

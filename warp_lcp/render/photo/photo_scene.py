@@ -120,7 +120,7 @@ class PhotoScenes:
         self.recording, self._scene = recording, scene
         particles = getattr(scene, "particles", None)  # settings of what the particles stand for
         self._wrapped = scene.palette == "water" and particles is not None and not beads
-        if self._wrapped and recording.show is Show.PARTICLES and particles.narrow_band is not None:
+        if self._wrapped and recording.show is Show.PARTICLES and getattr(particles, "narrow_band", None) is not None:
             raise RenderError(
                 "--look photo: a run with a narrow band of particles needs output.surface = true; --show particles draws beads"
             )
