@@ -46,7 +46,7 @@ ABSORPTION = {"water": np.array([2.6, 0.75, 0.42]), "syrup": np.array([2.0, 12.0
 SYRUP = 1.0  # viscosity [Pa s] from which a liquid has the color of honey
 SANDS = np.array([[0.62, 0.45, 0.27], [0.72, 0.58, 0.40], [0.45, 0.31, 0.19], [0.80, 0.72, 0.60]])  # reflectances of grains
 SAND_SHARES = np.array([0.45, 0.30, 0.15, 0.10])
-SOLID = np.array([0.52, 0.53, 0.55])
+SOLID = np.array([0.36, 0.38, 0.41])
 PALE = np.array([0.82, 0.80, 0.76])  # wedges of balls
 WEDGES = 6
 
