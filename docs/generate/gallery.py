@@ -27,6 +27,8 @@ PICTURES = 3  # of a sheet: early, in the middle, late
 SIZE = "1500x480"  # pixels: one row
 SETTINGS = {"fluids": ("output.surface=true",), "granular": (), "contacts": ()}  # of 3-D scenes, besides their own
 SURFACE = ("--show", "surface")
+PHOTOS = {"crown-splash": 12, "pouring-pile": 50}  # frames of which `render --look photo` makes the picture
+PHOTO_SIZE, PHOTO_SAMPLES = "800x450", "48"
 
 HEAD = """# Gallery
 
@@ -40,6 +42,7 @@ warp-lcp render out/dam-break --sheet
 ```
 
 `output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `--set domain.resolution=128` refines.
+[`--look photo`](frames-and-films.md#photographs) made the pictures of `crown-splash` and `pouring-pile`.
 
 Run times are of one core of a shared {device},
 {date}; bodies alone on an AMD EPYC.
@@ -85,11 +88,14 @@ def show(name: str, work: Path) -> dict[str, Any]:
     memory = measured([str(program), *run[1:], "--out", str(out), "--force"])
     end = json.loads((out / "run.json").read_text())
     last = end["frames"]
-    chosen = [word for part in range(1, PICTURES + 1) for word in ("--frame", str(round(last * part / (PICTURES + 1) * 4 / 3)))]
-    measured([str(program), "render", str(out), *draw[3:], *chosen, "--size", SIZE])
+    if name in PHOTOS:
+        shot = ["--look", "photo", "--frame", str(PHOTOS[name]), "--shutter", "0", "--size", PHOTO_SIZE, "--samples", PHOTO_SAMPLES]
+        measured([str(program), "render", str(out), *shot])
+        picture = Image.open(out / "photo" / f"photo_{PHOTOS[name]:06d}.png")
+    else:
+        picture = _sheet(program, out, draw[3:], last)
     FOLDER.mkdir(exist_ok=True)
-    picture = Image.open(out / "images" / "sheet.png").convert("RGB")
-    picture.save(FOLDER / f"{name}.webp", quality=82, method=6)
+    picture.convert("RGB").save(FOLDER / f"{name}.webp", quality=82, method=6)
     return {
         "seconds": end["seconds"],
         "steps": end["steps"],
@@ -97,6 +103,13 @@ def show(name: str, work: Path) -> dict[str, Any]:
         "megabytes": round(memory / 2**20),
         "note": end["warnings"][0],
     }
+
+
+def _sheet(program: Path, out: Path, options: list[str], last: int) -> Image.Image:
+    """Return three frames of a run side by side."""
+    chosen = [word for part in range(1, PICTURES + 1) for word in ("--frame", str(round(last * part / (PICTURES + 1) * 4 / 3)))]
+    measured([str(program), "render", str(out), *options, *chosen, "--size", SIZE])
+    return Image.open(out / "images" / "sheet.png")
 
 
 def entry(name: str, figures: dict[str, Any]) -> str:

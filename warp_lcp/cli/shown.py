@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import timedelta
+from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -16,7 +18,8 @@ import typer
 from warp_lcp.cli.ending import wrong_input
 from warp_lcp.render.film import check_rate
 from warp_lcp.render.live import PORT, live_server, served
-from warp_lcp.render.recording import Color, RenderError, Show
+from warp_lcp.render.photo.photo import SAMPLES, SHUTTER, PhotoSettings, frame_range, photograph_film, photograph_run
+from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
 from warp_lcp.render.usd import export_run
 from warp_lcp.render.viewer import view_run
@@ -37,13 +40,22 @@ CameraOption = Annotated[
 ]
 
 
+class Look(StrEnum):
+    """How images are drawn."""
+
+    QUICK = "quick"
+    PHOTO = "photo"
+
+
 def render(
     folder: RunArgument,
+    look: Annotated[Look, typer.Option(help="quick: OpenGL, with legends; photo: path-traced, 3-D.")] = Look.QUICK,
     frame: Annotated[
         list[int] | None, typer.Option(metavar="N", help="Frame to draw; negative: from the end; repeatable. Default: all.")
     ] = None,
+    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Frames A to B, both included.", show_default=False)] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Image size in pixels; a sheet may be lower.")] = "1280x720",
-    out: Annotated[Path | None, typer.Option(help="Folder for images. Default: DIR/images.", show_default=False)] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for images. Default: DIR/images or DIR/photo.", show_default=False)] = None,
     show: ShowOption = None,
     color: ColorOption = None,
     sheet: Annotated[bool, typer.Option("--sheet", help="Draw the chosen frames, or six of all, side by side into sheet.png.")] = False,
@@ -56,27 +68,61 @@ def render(
         float | None,
         typer.Option(metavar="Z", help="Position z of the cross-section of a 3-D run, in meters. Default: the middle.", show_default=False),
     ] = None,
+    samples: Annotated[int | None, typer.Option(metavar="N", help="Photo: samples per pixel. Default: 64.", show_default=False)] = None,
+    shutter: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="Photo: exposure time in frame intervals. Default: 0.25.", show_default=False)
+    ] = None,
     overrides: CameraOption = None,
 ) -> None:
-    """Draw the frames of a run as PNG images or as a film (needs the extra `render`)."""
+    """Draw the frames of a run as PNG images or as a film (needs the extra `render` or `photo`)."""
     devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
     console = Terminal(stderr=True)
 
     def estimated(seconds: float) -> None:
-        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))} on one core")
+        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))}{'' if look is Look.PHOTO else ' on one core'}")
 
     with wrong_input(), Count(console, "drawing", "images") as told:
+        frame = [*(frame or ()), *(frame_range(frames, Recording(folder, color, show).numbers) if frames else ())]
+        if look is Look.PHOTO:
+            if fps is not None and film is None:
+                raise RenderError("--fps: needs --film")
+            refuse_quick_options(sheet=sheet, slice=cut, at=at is not None, color=color is not None)
+            exposure: Any = {"samples": SAMPLES if samples is None else samples, "shutter": SHUTTER if shutter is None else shutter}
+            settings = PhotoSettings(size=parse_size(size), show=show, overrides=overrides or (), **exposure)
+            draw = partial(photograph_film, film=film, rate=check_rate(fps)) if film else photograph_run
+            report: Any = {"told": told, "estimated": estimated, "noted": partial(say, console)}
+            images = list(draw(folder, frames=frame, settings=settings, out=out, **report))
+            tell(f"{film}: {len(images)} frames" if film else _listed(images))
+            return
+        if samples is not None or shutter is not None:
+            raise RenderError(f"--{'shutter' if samples is None else 'samples'}: needs --look photo")
         looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
         if film is not None:
             if frame or sheet or out:
-                raise RenderError("--film: draws all frames into one file; cannot be combined with --frame, --sheet or --out")
+                raise RenderError("--film: draws all frames into one file; cannot be combined with --frame, --frames, --sheet or --out")
             count = len(list(film_run(folder, film, looks=looks, rate=check_rate(fps), told=told, estimated=estimated)))
             tell(f"{film}: {count} frames")
             return
         if fps is not None:
             raise RenderError("--fps: needs --film")
         images = list(render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet, told=told, estimated=estimated))
-    tell(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
+    tell(_listed(images))
+
+
+def refuse_quick_options(**given: bool) -> None:
+    """Refuse options that only `--look quick` has.
+
+    Raises:
+        RenderError: one of them is given.
+    """
+    for name, there in given.items():
+        if there:
+            raise RenderError(f"--{name}: needs --look quick")
+
+
+def _listed(images: list[Path]) -> str:
+    """Return one line that names the images."""
+    return f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}"
 
 
 def view(folder: RunArgument, show: ShowOption = None, color: ColorOption = None, overrides: CameraOption = None) -> None:

@@ -12,12 +12,11 @@ SIZES = {2: 1.2, 3: 0.62}  # radius of one alone in its particle's room, over th
 APART = 0.7  # from its particle, over the distance of particles, along each axis at the most
 VARIETY = 0.16  # of a grain's brightness, either way
 PATTERNS = 4096
+PATTERN = np.random.default_rng(2281).uniform(-1.0, 1.0, (PATTERNS, A_PARTICLE, 4))
 
 
 def grains(points: np.ndarray, colors: np.ndarray, spacing: float, size: Sequence[float]) -> tuple[np.ndarray, np.ndarray, float]:
     """Return grains in place of particles.
-
-    Where they lie about a particle is told by its place: runs do not keep the order of particles, and sand at rest should not flicker.
 
     Args:
         points: of the particles [m], shape (n, 3).
@@ -28,14 +27,27 @@ def grains(points: np.ndarray, colors: np.ndarray, spacing: float, size: Sequenc
     Returns:
         Points [m], colors as `colors`, and the radius of a grain [m].
     """
+    at, own, radius = placed_grains(points, spacing, size)
+    shades = colors[:, None] * (1.0 + VARIETY * PATTERN.reshape(-1, 4)[own, 3:])
+    return at.reshape(-1, 3), np.clip(shades, 0.0, 255.0).reshape(-1, 3), radius
+
+
+def placed_grains(points: np.ndarray, spacing: float, size: Sequence[float]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the grains that stand for particles: points [m], shape (n, k, 3), numbers in `PATTERN`, shape (n, k), and their radius [m].
+
+    Where they lie about a particle is told by its place: runs do not keep the order of particles, and sand at rest should not flicker.
+
+    Args:
+        points: of the particles [m], shape (n, 3).
+        spacing: distance of neighboring particles [m].
+        size: of the domain [m], which grains do not leave.
+    """
     count = int(np.clip(GRAINS // max(len(points), 1), 1, A_PARTICLE))
     dimension = len(size)
     radius = SIZES[dimension] * spacing * count ** (-1.0 / dimension)
-    pattern = np.random.default_rng(2281).uniform(-1.0, 1.0, (PATTERNS, A_PARTICLE, 4))[:, :count]
-    pattern[..., dimension:3] = 0.0
     where = np.floor(points / spacing).astype(np.int64) @ np.array([73856093, 19349663, 83492791])
-    own = pattern[where % PATTERNS]
-    at = points[:, None] + APART * spacing * own[..., :3]
+    number = A_PARTICLE * (where % PATTERNS)[:, None] + np.arange(count)
+    at = np.repeat(points[:, None], count, axis=1)
+    at[..., :dimension] += APART * spacing * PATTERN.reshape(-1, 4)[number, :dimension]
     at[..., :dimension] = np.clip(at[..., :dimension], radius, np.maximum(np.array(size) - radius, radius))
-    shades = colors[:, None] * (1.0 + VARIETY * own[..., 3:])
-    return at.reshape(-1, 3), np.clip(shades, 0.0, 255.0).reshape(-1, 3), radius
+    return at, number, radius

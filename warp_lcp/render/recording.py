@@ -303,6 +303,13 @@ class Recording:
             raise RenderError(f"{file}: is not a readable frame: a cell lies outside the scene's domain")
         return cells
 
+    def files(self, number: int) -> list[Path]:
+        """Return the files that tell what a frame shows: of particles or surface, and of bodies."""
+        parts = {Show.PARTICLES: ["particles"], Show.SURFACE: ["surface"], Show.BOTH: ["particles", "surface"], Show.BODIES: []}
+        files = [self._file(part, number) for part in [*parts[self.show], "bodies"]]
+        pieces = [piece for file in files for piece in sorted(file.parent.glob(f"rank_*/{file.stem}.*"))]  # of ranks
+        return [file for file in files if file.is_file()] + pieces
+
     def _file(self, name: str, number: int) -> Path:
         path = self.folder / "frames" / f"{name}_{number:06d}"
         files = [path.with_suffix(f".{suffix}") for suffix in self._readable]

@@ -114,24 +114,36 @@ def viewpoint(scene: Scene, aspect: float) -> Viewpoint:
     low, high = scene.seen
     if scene.dimension == 2:
         corners = [np.append(camera.low or low[:2], 0.0), np.append(camera.high or high[:2], 0.0)]
-        return _around(corners[0], corners[1], Z_AXIS, VIEW_ANGLE, aspect)
+        return view_around(corners[0], corners[1], Z_AXIS, VIEW_ANGLE, aspect)
     angle = camera.field_of_view or VIEW_ANGLE
     if camera.position is None:
-        return _around(low, high, THREE_QUARTERS, angle, aspect)
+        return view_around(low, high, THREE_QUARTERS, angle, aspect)
     position, focus = np.array(camera.position), np.array(camera.look_at) if camera.look_at else 0.5 * (low + high)
     plain = Viewpoint(position, focus, np.array(camera.up or Y_AXIS), angle, aspect)
     return Viewpoint(position, focus, plain.axes[1], angle, aspect)
 
 
-def _around(low: np.ndarray, high: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
+def view_around(low: np.ndarray, high: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
     """Look at the middle of a box [m] from a direction, from as near as shows all of it."""
+    return view_of_points(np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3), toward, angle, aspect)
+
+
+def view_of_points(points: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
+    """Look at points [m], shape (n, 3), from a direction, from as near as shows all of them.
+
+    Args:
+        points: in the picture [m], shape (n, 3).
+        toward: from the points to the camera, of unit length.
+        angle: over the height of the image [degrees].
+        aspect: the image's width over its height.
+    """
     right = np.cross(Y_AXIS, toward)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(toward, right), toward])
-    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3) @ axes.T
+    corners = points @ axes.T
     focus = corners.mean(axis=0)
     slope = math.tan(math.radians(angle / 2)) / MARGIN
-    for _ in range(5):  # what is near looks larger, so the middle of the image is not that of the domain
+    for _ in range(5):  # what is near looks larger, so the middle of the image is not that of the points
         x, y, z = (corners - focus).T
         distance = max((z + np.abs(x) / (slope * aspect)).max(), (z + np.abs(y) / slope).max())
         seen = np.stack([x, y]) / (distance - z)
