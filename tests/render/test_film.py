@@ -175,4 +175,4 @@ def test_options_that_a_film_does_not_have(dots, tmp_path, arguments):
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.2)]])
     result = call(folder, "--film", tmp_path / "film.gif", *arguments)
     assert result.exit_code == 2
-    assert "cannot be combined with --frame, --sheet or --out" in result.stderr.replace("\n", " ")
+    assert "cannot be combined with --frame, --frames, --sheet or --out" in result.stderr.replace("\n", " ")

@@ -124,12 +124,12 @@ def viewpoint(scene: Scene, aspect: float) -> Viewpoint:
 
 
 def view_around(low: np.ndarray, high: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
-    """Look at the middle of a box [m] from a direction, from as near as shows all of it."""
+    """Return the nearest viewpoint in a direction that shows all of a box [m]."""
     return view_of_points(np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3), toward, angle, aspect)
 
 
 def view_of_points(points: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
-    """Look at points [m], shape (n, 3), from a direction, from as near as shows all of them.
+    """Return the nearest viewpoint in a direction that shows all points [m], shape (n, 3).
 
     Args:
         points: in the picture [m], shape (n, 3).
