@@ -129,7 +129,7 @@ def view_around(low: np.ndarray, high: np.ndarray, toward: np.ndarray, angle: fl
 
 
 def view_of_points(points: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
-    """Return the nearest viewpoint in a direction that shows all points [m], shape (n, 3).
+    """Return the nearest viewpoint in a direction that shows all points.
 
     Args:
         points: in the picture [m], shape (n, 3).
