@@ -59,7 +59,7 @@ def test_agx_of_greys():
     assert (np.diff(greys, axis=0) >= 0.0).all()
     assert np.ptp(greys, axis=1).max() < 5e-3
     assert greys[0].max() < 0.01 and greys[-1].min() > 0.99
-    assert agx(np.array([-1.0, 0.0, 0.0])).max() < 1e-6
+    assert agx(np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), contrast=1.6, saturation=1.3).max() < 1e-6  # and no NaN
 
 
 def test_agx_turns_bright_colors_white_and_keeps_dim_ones():

@@ -36,7 +36,7 @@ def agx(radiance: np.ndarray, *, contrast: float = 1.0, saturation: float = 1.0)
     low, high = STOPS
     stops = np.log2(np.maximum(mixed, 1e-30) / MIDDLE_GREY)
     code = sigmoid((np.clip(stops, low, high) - low) / (high - low))
-    code = code**contrast
+    code = np.clip(code, 0.0, 1.0) ** contrast  # rounding leaves black a little below 0
     luma = (code @ LUMA)[..., None]
     code = luma + saturation * (code - luma)
     return np.clip(code @ np.linalg.inv(INSET).T, 0.0, 1.0)
