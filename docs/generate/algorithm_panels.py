@@ -27,10 +27,10 @@ TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=400, patience=400)
 FAST = 300.0  # slip [m/s] that friction hardly turns
 
 
-def residuals(problem: wl.LCP, method: Any, stopping: wl.StoppingCriteria = TIGHT) -> np.ndarray:
+def residuals(problem: wl.LCP, method: Any, workspace: Any = None) -> np.ndarray:
     """Return the norm of the natural residual after each iteration."""
     norms = list[float]()
-    wl.solve(problem, method, stopping=stopping, callback=lambda progress: norms.append(progress.residual))
+    wl.solve(problem, method, stopping=TIGHT, workspace=workspace, callback=lambda progress: norms.append(progress.residual))
     return np.array(norms)
 
 
@@ -119,8 +119,7 @@ def contraction_panel(axes: Any) -> None:
     problem = wl.LCP(np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([-1.0, -2.0]), -np.inf)
     for label, method in (("Jacobi", wl.ProjectedJacobi(omega=1.0)), ("Gauss-Seidel", wl.ProjectedSOR(omega=1.0))):
         work = method.init(problem)
-        norms = list[float]()
-        wl.solve(problem, method, workspace=work, stopping=TIGHT, callback=lambda p, n=norms: n.append(p.residual))
+        norms = residuals(problem, method, work)
         k = np.arange(len(norms))
         (line,) = axes.semilogy(k, norms, "o", ms=3, label=label)
         axes.semilogy(k, norms[0] * work.contraction.factor**k, color=line.get_color(), lw=0.8)
