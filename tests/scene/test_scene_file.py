@@ -23,7 +23,7 @@ def test_the_file_names_the_scene(scene_file):
     ("text", "expected"),
     [
         ("damm-break", "damm-break: no such file, and no such built-in scene; did you mean 'dam-break'?"),
-        ("x" * 9, "no such built-in scene; choose from balls-on-sand-2d, "),
+        ("x" * 9, "no such built-in scene; choose from arched-snake, "),
         ("missing.toml", "missing.toml: there is no such file"),
         ("folder/missing", "folder/missing: there is no such file"),
     ],
