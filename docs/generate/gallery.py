@@ -27,7 +27,16 @@ PICTURES = 3  # of a sheet: early, in the middle, late
 SIZE = "1500x480"  # pixels: one row
 SETTINGS = {"fluids": ("output.surface=true",), "granular": (), "contacts": ()}  # of 3-D scenes, besides their own
 SURFACE = ("--show", "surface")
-PHOTOS = {"crown-splash": 12, "mesh-obstacle": 14, "pouring-pile": 50}  # frames of which `render --look photo` makes the picture
+PHOTOS = {  # frames of which `render --look photo` makes the picture
+    "column-collapse": 9,
+    "crown-splash": 12,
+    "dam-break": 30,
+    "hourglass": 20,
+    "mesh-obstacle": 14,
+    "pouring-pile": 50,
+    "stirred-tank": 37,
+    "waterfall": 90,
+}
 PHOTO_SIZE, PHOTO_SAMPLES = "800x450", "48"
 
 HEAD = """# Gallery
@@ -42,8 +51,7 @@ warp-lcp render out/dam-break --sheet
 ```
 
 `output.surface=true` adds the surface of a liquid; omit it for sand and in 2-D. `--set domain.resolution=128` refines.
-[`--look photo`](frames-and-films.md#photographs) made the pictures of `crown-splash`,
-`mesh-obstacle` and `pouring-pile`.
+Pictures of one frame are made by [`--look photo`](frames-and-films.md#photographs).
 
 Run times are of one core of a shared {device},
 {date}; bodies alone on an AMD EPYC.
