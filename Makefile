@@ -85,6 +85,7 @@ $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
 
 $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev,render]'
+	$(BIN)/python -m pip install --quiet --editable '.[photo]' || echo "the extra photo cannot be installed here: tests of photographs are skipped"
 	touch $@ $(VENV)/.run
 
 $(VENV)/.docs: pyproject.toml | $(VENV)/bin/python
