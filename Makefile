@@ -8,7 +8,7 @@ OUT ?= out/dam-break
 # Processes that run the tests.
 WORKERS ?= 2
 
-.PHONY: demo test check test-distributed emulated-cuda slow fuzz mutants docs wheel-check dist-check clean
+.PHONY: demo films test check test-distributed emulated-cuda slow fuzz mutants docs wheel-check dist-check clean
 
 demo: $(VENV)/.run
 	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
@@ -50,6 +50,19 @@ mutants: $(VENV)/.dev
 	$(BIN)/python -m warp_lcp.benchmarks.mutants $(MUTANTS_ARGS)
 
 # The documentation's site, in build/site; a link or an anchor that leads nowhere ends it.
+# A photographed film of ten seconds from each simulator, into out/films: hours on two cores. Repeat the command after an interruption.
+FILM ?= --size 960x540 --samples 32
+SECONDS_OF_FILM ?= 10
+define film
+	$(BIN)/warp-lcp run $(1) --set time.duration=$(SECONDS_OF_FILM) $(2) --out out/films/$(1) $$(test -f out/films/$(1)/run.json && echo --resume)
+	$(BIN)/warp-lcp render out/films/$(1) --look photo $(FILM) --film out/films/$(1).mp4
+endef
+
+films: $(VENV)/.dev
+	$(call film,floating-bodies,--set output.surface=true)
+	$(call film,pouring-pile)
+	$(call film,leaning-wall)
+
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
