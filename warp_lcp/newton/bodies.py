@@ -40,6 +40,7 @@ class WorldBodies(RigidBodies):
         self.motions = [BodyMotion(body) for body in self.bodies]
         self.refresh(model)
         self.contacts, self.contact_residual, self._surfaces = 0, 0.0, None
+        self.joints = ()  # the world has them
         self.exits = ((), 0)  # the world decides where they go
         self._before: np.ndarray | None = None
         self.force, self.impulses = (np.zeros((len(self.bodies), 6)) for _ in range(2))
