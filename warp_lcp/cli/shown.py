@@ -40,7 +40,7 @@ CameraOption = Annotated[
 ]
 
 
-class Look(StrEnum):
+class RenderLook(StrEnum):
     """How images are drawn."""
 
     QUICK = "quick"
@@ -49,7 +49,7 @@ class Look(StrEnum):
 
 def render(
     folder: RunArgument,
-    look: Annotated[Look, typer.Option(help="quick: OpenGL, with legends; photo: path-traced, 3-D.")] = Look.QUICK,
+    look: Annotated[RenderLook, typer.Option(help="quick: OpenGL, with legends; photo: path-traced, 3-D.")] = RenderLook.QUICK,
     frame: Annotated[
         list[int] | None, typer.Option(metavar="N", help="Frame to draw; negative: from the end; repeatable. Default: all.")
     ] = None,
@@ -79,11 +79,11 @@ def render(
     console = Terminal(stderr=True)
 
     def estimated(seconds: float) -> None:
-        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))}{'' if look is Look.PHOTO else ' on one core'}")
+        say(console, f"drawing takes about {timedelta(seconds=math.ceil(seconds))}{'' if look is RenderLook.PHOTO else ' on one core'}")
 
     with wrong_input(), Count(console, "drawing", "images") as told:
         frame = [*(frame or ()), *(frame_range(frames, Recording(folder, color, show).numbers) if frames else ())]
-        if look is Look.PHOTO:
+        if look is RenderLook.PHOTO:
             if fps is not None and film is None:
                 raise RenderError("--fps: needs --film")
             refuse_quick_options(sheet=sheet, slice=cut, at=at is not None, color=color is not None)

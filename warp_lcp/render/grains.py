@@ -33,9 +33,10 @@ def grains(points: np.ndarray, colors: np.ndarray, spacing: float, size: Sequenc
 
 
 def placed_grains(points: np.ndarray, spacing: float, size: Sequence[float]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the grains that stand for particles: points [m], shape (n, k, 3), numbers in `PATTERN`, shape (n, k), and their radius [m].
+    """Return the grains of particles: points [m], shape (n, k, 3), numbers in `PATTERN`, shape (n, k), and radius [m].
 
-    Where they lie about a particle is told by its place: runs do not keep the order of particles, and sand at rest should not flicker.
+    The offsets of grains depend on the position of the particle, not on its number. Runs reorder particles, and sand at rest
+    must not flicker.
 
     Args:
         points: of the particles [m], shape (n, 3).
