@@ -16,7 +16,7 @@ import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
-from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary import Boundary
@@ -24,6 +24,8 @@ from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.rows.vectors import convert
 
 HEADERS = Path(__file__).parent / "headers"
@@ -165,12 +167,12 @@ class PressureProjection:
         self._least: Any = -np.inf if self._lower is None else self._lower
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._count, self._contacts = WindowTally(COUNT, grid), WindowTally(self._passes.contact, grid)
-        self._trail, self._solved, self._rhs, self._guess = (
-            DirtyRegion(grid.domain),
-            grid.domain,
-            self._b,
-            self._start,
-        )  # what is solved for
+        self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)  # those that are solved for
+        self._rhs, self._guess = self._b, self._start
+        self._ratio_cell, self._adhesion, self._threshold, self._limit = (Scalar() for _ in range(4))
+        self._counting = LaunchGraph(grid.device, lambda: self._count.take(self._cells, kind=self._unknown))
+        self._preparation = LaunchGraph(grid.device, self._launch_preparation)
+        self._projection = LaunchGraph(grid.device, self._launch_projection)
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
 
@@ -192,22 +194,27 @@ class PressureProjection:
             window: cells that hold all FLUID cells; None: all cells.
         """
         self._look(window)
-        self._count.take(self._solved, kind=self._unknown)
+        self._counting.run(variant=self._cells.near is None)
+        self._count.changed()
         if self._problem is None and self.counted() > 0:
             self._make_problem()
         self._begin(kick_dt)
         if self._problem is None:
             return False
-        problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
-        problem["jump"] = self.jump
-        numbers: dict[str, Any] = {"ratio": self._ratio, "adhesion": kick_dt * self.adhesion}
-        self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, **numbers)
+        self._ratio_cell.value, self._adhesion.value = self._ratio, kick_dt * self.adhesion
+        self._preparation.run(velocity, variant=(self._cells.near is None, self.jump is None))
         self._update()
         return True
 
+    def _launch_preparation(self, velocity: Sequence[wp.array]) -> None:
+        """Launch the set-up of b, the lower bound, the first guess and the shift of the diagonal."""
+        problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
+        numbers: dict[str, Any] = {"ratio": self._ratio_cell, "adhesion": self._adhesion, "jump": self.jump}
+        self._cells.run(self._passes.prepare, **self._liquid(velocity), **problem, **numbers)
+
     def _look(self, window: Window | None) -> None:
         """Solve for the cells of a window, and undo what is left of the last one."""
-        self._solved = self._trail.through(window)
+        self._cells.move_to(self._trail.through(window))
 
     def leave(self) -> Projection:
         """Record a step without liquid cells: all liquid is spray."""
@@ -307,19 +314,28 @@ class PressureProjection:
             result: of `solve`.
             criteria: of `solve`.
         """
-        self._accept(result.x)
+        unknowns = self.counted()
+        reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
+        # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
+        threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
+        self._threshold.value = threshold
+        self._last = self._kick
+        self._limit.value = self._gravity * self._last
+        variant = result.x.ptr, window.near is None, self._cells.near is None, self.jump is None
+        self._projection.run(velocity, window, result.x, variant=variant)
+        self._contacts.changed()
+        return Projection(result, unknowns, self._found)
+
+    def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
+        """Launch the projection: the gradient, the support of spray, the contact of wall cells."""
+        self._accept(x)
         for axis, field in enumerate(velocity):
             window.clear(self.known[axis])
             faces = self._faces() | {"x": self.pressure, "field": field, "known": self.known[axis]}
             window.run(self._passes.subtract_gradient, axis=axis, **faces)
         self._support(velocity, window)
-        unknowns = self.counted()
-        reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
-        # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
-        threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
-        given = {"x": self.pressure, "contact": self.contact, "threshold": threshold}
-        self._contacts.take(self._solved, **self._liquid(velocity), **given)
-        return Projection(result, unknowns, self._found)
+        given = {"x": self.pressure, "contact": self.contact, "threshold": self._threshold}
+        self._contacts.take(self._cells, **self._liquid(velocity), **given)
 
     def counted(self) -> int:
         """Return the number of unknowns of the prepared problem."""
@@ -372,13 +388,12 @@ class PressureProjection:
         """Let the pressure act on what rests on the surface; its faces become known after the projected ones."""
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
             faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight, "jump": self.jump}
-            window.run(self._passes.support, axis=axis, limit=self._gravity * self._last, **faces)
+            window.run(self._passes.support, axis=axis, limit=self._limit, **faces)
 
     def _accept(self, x: wp.array) -> None:
         """Take the solution of the problem, and show its cells."""
         self._take(x)
-        wp.copy(self.cells, self.kind)
-        self._last = self._kick
+        copy(self.cells, self.kind)
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure."""

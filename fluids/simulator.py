@@ -40,6 +40,7 @@ from warp_lcp.material.particle_assembly import (
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
@@ -99,6 +100,7 @@ class LiquidSimulation(ParticleSimulation):
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
         self.surface = self._surface()
+        self._surface_graph = LaunchGraph(grid.device, self._launch_surface, at_once=self.shared or self.band is not None)
         self.tension = self._tension()
         self.projection = self._pressure()
         self.probes = self._probes()
@@ -139,6 +141,7 @@ class LiquidSimulation(ParticleSimulation):
 
     def mark(self) -> None:
         """Mark the liquid cells."""
+        self.surface.begin(self.grid.everywhere)
         self.surface.mark(self.particles, self.grid.everywhere, self.projection.kind)
         self.projection.show()
 
@@ -295,11 +298,16 @@ class LiquidSimulation(ParticleSimulation):
         """Mark the liquid's cells, give velocity to their faces, and let the surface's tension push them."""
         projection = self.projection
         with self.watch.stage("surface", self.particles.key, projection.kind):
-            self.surface.mark(self.particles, window, projection.kind)
-            self.surface.complete(window, self.velocity, self.weights, projection.known)
+            self.surface.begin(window)
+            self._surface_graph.run(window, variant=window.near is None)
         if self.tension is not None:
             with self.watch.stage("surface tension", *self.velocity, self.tension.jump):
                 self.tension.act(self.velocity, window, projection.kind, self.kick_dt)
+
+    def _launch_surface(self, window: Window) -> None:
+        """Launch the marking of the liquid's cells, and the velocity of their faces."""
+        self.surface.mark(self.particles, window, self.projection.kind)
+        self.surface.complete(window, self.velocity, self.weights, self.projection.known)
 
     def _rub(self, viscosity: Viscosity, window: Window, dt: float, speed: float) -> Row:
         """Change the velocity before the pressure by what viscosity does to that after it; return what the log says of it.

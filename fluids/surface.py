@@ -8,26 +8,24 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel, launch_list, list_kernel
 from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import Fill, LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import AIR, FLUID
+from warp_lcp.rows.program import copy
 
 _AIR = wp.constant(wp.int8(AIR))
 _FLUID = wp.constant(wp.int8(FLUID))
 
 
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.surface"}
-
-
-@wp.kernel(**options)
+@list_kernel("fluids.surface")
 @typing.no_type_check
-def mark_particles_kernel(key: wp.array(dtype=wp.int32), kind: wp.array(dtype=wp.int8)):
+def mark_particles_kernel(i, key: wp.array(dtype=wp.int32), kind: wp.array(dtype=wp.int8)):
     """A cell that holds a particle is FLUID."""
-    cell = key[wp.tid()]
+    cell = key[i]
     if kind[cell] == _AIR:
         kind[cell] = _FLUID
 
@@ -57,8 +55,11 @@ class FreeSurface(Protocol):
     phi: wp.array | None
     density: wp.array | None
 
+    def begin(self, window: Window) -> None:
+        """Begin a step in a window: clear what the last one has left elsewhere."""
+
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Mark the kind of each cell.
+        """Mark the kind of each cell, after `begin`.
 
         Args:
             particles: the liquid; `key` holds its cells.
@@ -96,12 +97,17 @@ class WholeCellSurface:
         self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell) if boundary.open else None
         self.density = self._level_set.density if self._level_set is not None else None
 
+    def begin(self, window: Window) -> None:
+        """Clear what the last step has left elsewhere."""
+        if self._level_set is not None:
+            self._level_set.leave(window)
+
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Mark cells that hold a particle as FLUID."""
-        wp.copy(kind, self.boundary.base)
-        wp.launch(mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device)
+        copy(kind, self.boundary.base)
+        launch_list(mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device, ordered=True)
         if self._level_set is not None:
-            self._level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
+            self._level_set.compute(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
             window.launch(mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind])
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
@@ -132,9 +138,12 @@ class NoSurface:
         filled = (grid.interior(kind) == wl.FLUID)[cells]
         self._volume = float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume
 
+    def begin(self, window: Window) -> None:
+        """Do nothing: all cells are marked in each step."""
+
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Mark all open cells as FLUID."""
-        wp.copy(kind, self._kind)
+        copy(kind, self._kind)
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Set u* on faces between particles."""
@@ -172,11 +181,15 @@ class GhostFluidSurface:
         self.density: wp.array | None = self.level_set.density
         self._window, self._counted, self._measured = grid.everywhere, counted or grid.domain, False
 
+    def begin(self, window: Window) -> None:
+        """Clear what the last step has left elsewhere."""
+        self._window, self._measured = window.now, False
+        self.level_set.leave(window)
+
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Mark cells below the surface as FLUID."""
-        self._window, self._measured = window, False
-        self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
-        wp.copy(kind, self.boundary.base)
+        self.level_set.compute(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
+        copy(kind, self.boundary.base)
         window.launch(mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:

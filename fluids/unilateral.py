@@ -93,7 +93,7 @@ class UnilateralPressure(PressureProjection):
         least = SHIFT if self.boundary.open else 0.0
         fields = [self.pressure, self._ratio, least, self._b, self._start, self._shift]
         self.grid.domain.launch(kernels.prepare_kernel, [self._at(velocity), self.kind, *fields])
-        self._count.take(self._solved, kind=self._unknown)
+        self._count.take(self._cells, kind=self._unknown)
         unknowns = self.counted()
         if unknowns and self._problem is None:
             self._make_problem()
@@ -107,17 +107,18 @@ class UnilateralPressure(PressureProjection):
         Arguments as in the base class.
         """
         self._accept(result.x)
+        self._last = self._kick
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
             open_ = self.boundary.open[axis] if self.boundary.open else None
             inputs = [self._setting, axis, self.pressure, open_, self._weights[axis], field, self.known[axis]]
             window.launch(kernels.push_kernel, inputs)
         inputs = [self._at(velocity), self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
-        self._solved.launch_rows(kernels.contact_kernel, inputs)
+        self._cells.launch_rows(kernels.contact_kernel, inputs)
         return Projection(result, self.counted(), self._found)
 
     def _found(self) -> tuple[float, float]:
-        rows = self._solved.rows_of(self._sums)
+        rows = self._cells.rows_of(self._sums)
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
     def fluid_cells(self) -> np.ndarray:

@@ -148,7 +148,10 @@ class Viscosity:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
             self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes, self._inner, across)
         self._solver = self._krylov()
-        self._trail, self._sums = DirtyRegion(grid.everywhere), [WindowTally(self._passes.force, grid) for _ in range(grid.dimension)]
+        self._trail, self._sums = (
+            DirtyRegion(grid.everywhere),
+            [WindowTally(self._passes.force, grid, grid.domain) for _ in range(grid.dimension)],
+        )
 
     def solve(
         self, velocity: Sequence[wp.array], window: Window, kind: wp.array, contact: wp.array, dt: float, speed: float, *, last: bool = True
@@ -331,7 +334,7 @@ class Viscosity:
                 "dx": self.grid.spacing,
             } | self._motion(axis)
             self._sums[axis].take(inner, **of, **fine.across(axis), **where)
-            found += self._sums[axis].read(self.grid.domain)
+            found += self._sums[axis].read()
         if self._bodies is not None:
             self._bodies.answer(self.multigrid.r, self._change)
             found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())

@@ -29,9 +29,9 @@ class SandReport:
     def __init__(self, stress: Stress) -> None:
         grid, self.stress = stress.packing.grid, stress
         self.ratio, self.contact, self.known = grid.field(), grid.field(wp.uint8), grid.faces(wp.int8)
-        cut = stress.packing.cut
+        cut, stored = stress.packing.cut, Window((0, 0, 0), grid.shape, grid.device)
         self._openings = None if cut is None else cut.openings
-        self._report = WindowTally(report_pass(grid.dimension, stress.rate, cut is not None), grid)
+        self._report = WindowTally(report_pass(grid.dimension, stress.rate, cut is not None), grid, stored)
         self._base = stress.packing.base if cut is None else grid.field(wp.int8)  # no face inside a solid that cuts cells is left unknown
 
     def take(self, velocity: Sequence[wp.array]) -> None:
@@ -60,5 +60,4 @@ class SandReport:
 
     def _found(self) -> list[float]:
         """Return how many cells carry shear, how many have yielded, what friction takes and the largest excess."""
-        grid = self.stress.packing.grid
-        return self._report.read(Window((0, 0, 0), grid.shape, grid.device))
+        return self._report.read()

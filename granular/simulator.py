@@ -117,9 +117,9 @@ class SandSimulation(ParticleSimulation):
         self._find_density(self.grid.everywhere)
         self.packing.update(self.density, self.velocity, 1.0)
 
-    def window(self, totals: ParticleTotals) -> Window:
+    def _reached(self, totals: ParticleTotals) -> Window:
         """Return the window of cells that particles can reach in a step."""
-        window = super().window(totals)
+        window = super()._reached(totals)
         return window if self.sides is None else self.sides.widen(window)
 
     def particles_to_grid(self, window: Window) -> None:

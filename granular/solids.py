@@ -96,7 +96,7 @@ class SandSolids:
     ) -> None:  # fmt: skip
         self._counted = counted
         self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
-        self.base = grid.field(wp.int8)
+        self.base, self.index = grid.field(wp.int8), grid.field(wp.int32)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
         self._cells: np.ndarray | None = None  # `index` as `walls` know it
@@ -121,7 +121,8 @@ class SandSolids:
             for solid in self._placed
         ]  # fmt: skip
         found = voxelize(grid, now, wall_separating=True, open_sides=self._boundary.open_sides, remarks=False)
-        self.index, self._covered = found.index, found.covered
+        self._covered = found.covered
+        wp.copy(self.index, found.index)
         self._join(self.index)
         grid.everywhere.launch(kernels.base_kernel, [self.index, self.base])
         cells = self.index.numpy()

@@ -37,7 +37,9 @@ class DistributedPressure(PressureProjection):
 
     def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
         super().__init__(part.grid, boundary, solver, **settings)
-        self.part, self._solved = part, part.owned
+        self.part = part
+        self._cells.move_to(part.owned)
+        self._projection.at_once = True  # ranks exchange halos in it
         if self._phi is None and not (self.shares_pockets or part.ranks.any(bool(boundary.open_sides & ~part.cuts))):
             self._shift = None  # sides at cuts are open, but not the domain's
         self._boxes: list[Any] = [None if f is None else self.part.box_like(f) for f in self._shared]

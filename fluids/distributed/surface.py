@@ -26,6 +26,10 @@ class SharedSurface:
     def __init__(self, part: Subdomain, surface: FreeSurface) -> None:
         self.phi, self.density, self.complete, self._part, self.surface = surface.phi, surface.density, surface.complete, part, surface
 
+    def begin(self, window: Window) -> None:
+        """Clear what the last step has left elsewhere."""
+        self.surface.begin(window)
+
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds, those of the ghost layers and what they come from by other ranks."""
         self.surface.mark(particles, window, kind)

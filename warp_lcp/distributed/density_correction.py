@@ -13,7 +13,8 @@ from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import DirtyRegion, Window
-from warp_lcp.material.density_correction import DensityCorrection, DensityMonitor
+from warp_lcp.grid.tally import WindowTally
+from warp_lcp.material.density_correction import CROWD, DensityCorrection, DensityMonitor
 from warp_lcp.rows.vectors import convert
 
 
@@ -27,7 +28,8 @@ class SharedDensityMonitor(DensityMonitor):
 
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         super().__init__(*settings, **more)
-        self.part, self._counted, self._trail = part, part.owned, DirtyRegion(part.owned)
+        self.part, self._trail = part, DirtyRegion(part.owned)
+        self._crowd = WindowTally(CROWD, self.grid, part.owned)
         self._known: tuple[float, float] | None = None
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:
@@ -64,6 +66,7 @@ class SharedDensityCorrection(DensityCorrection):
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         super().__init__(*settings, **more)
         self.part, self._solved = part, part.owned
+        self._preparation.at_once = True  # ranks exchange particles and halos in it
         self._boxes: list[Any] = [None if f is None else part.box_like(f) for f in self._fields]
         self._cells, self._rhs, self._guess, _, _ = self._boxes
 

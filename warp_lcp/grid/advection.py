@@ -30,6 +30,7 @@ from warp_lcp.grid.particle_loops import MARGIN, cell_pass, launch, particle_pas
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.memory import Scalar, scaled
 
 MAX_CLEARANCE = 6  # cells; a particle that moves further in a step takes the careful way, which is always right
 CENTERS = 3  # the `axis` of a field at cell centers
@@ -137,7 +138,7 @@ def clearance(grid: StaggeredGrid, cells: wp.array) -> wp.array:
 
 
 def advect(
-    grid: StaggeredGrid, fields: list[wp.array], room: wp.array, dt: float, position: wp.array, stopped: wp.array, endless: int = 0
+    grid: StaggeredGrid, fields: list[wp.array], room: wp.array, dt: float | Scalar, position: wp.array, stopped: wp.array, endless: int = 0
 ) -> None:  # fmt: skip
     """Advect particles for a time step among whole-cell solids.
 
@@ -152,12 +153,12 @@ def advect(
             end up there.
     """
     u, v, w = [*fields, None][:3]
-    given = {"u": u, "v": v, "w": w, "room": room, "stopped": stopped, "h": dt * (1.0 / grid.spacing)}
+    given = {"u": u, "v": v, "w": w, "room": room, "stopped": stopped, "h": scaled(dt, 1.0 / grid.spacing)}
     launch(advect_pass(endless), len(position), grid, position=position, **given)
 
 
 def advect_with_distance(
-    grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, position: wp.array, stopped: wp.array, *,
+    grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float | Scalar, position: wp.array, stopped: wp.array, *,
     open_sides: int = 0, endless: int = 0,
 ) -> None:  # fmt: skip
     """Advect particles for a time step among walls given by their distance.
@@ -179,7 +180,7 @@ def advect_with_distance(
         endless: has bit n set if axis n has no end, see `advect`; its sides are open, and alike.
     """
     u, v, w = [*fields, None][:3]
-    given = {"u": u, "v": v, "w": w, "distance": distance, "stopped": stopped, "h": dt * (1.0 / grid.spacing)}
+    given = {"u": u, "v": v, "w": w, "distance": distance, "stopped": stopped, "h": scaled(dt, 1.0 / grid.spacing)}
     launch(distance_pass(endless), len(position), grid, position=position, open_sides=open_sides, **given)
 
 

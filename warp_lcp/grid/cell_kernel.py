@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
-from warp_lcp.rows.program import Launch, launch_ranges
+from warp_lcp.rows.program import Launch, is_recording, launch_ranges
 
 F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))  # fields
 I16, I32 = wp.array3d(dtype=wp.int16), wp.array3d(dtype=wp.int32)
@@ -93,8 +93,11 @@ def list_kernel(module: str) -> Callable:
     return lambda function: _made(function, module, ("tasks", wp.vec2i), ELEMENTS, "")
 
 
-def launch_list(kernel: wp.Kernel, count: int, inputs: list, *, device: wp.Device, cost: int = 1, launch: Launch | None = None) -> None:
-    """Launch a kernel of `list_kernel`, or record it.
+def launch_list(
+    kernel: wp.Kernel, count: int, inputs: list, *, device: wp.Device, cost: int = 1, launch: Launch | None = None,
+    ordered: bool = False,
+) -> None:  # fmt: skip
+    """Launch a kernel of `list_kernel`, or record it: then for as many as the list of one of its arrays has when it runs.
 
     Args:
         kernel: what is launched.
@@ -103,9 +106,11 @@ def launch_list(kernel: wp.Kernel, count: int, inputs: list, *, device: wp.Devic
         device: where.
         cost: of an element, in cells of a usual pass.
         launch: of a program.
+        ordered: whether several entries may write the same element.
     """
-    inputs = [wp.vec2i(0, 0), *inputs]
-    launch_ranges(kernel, (count,), cost, inputs, device=wp.get_device(device), launch=launch, ordered=False)
+    listed = next((a.listed for a in inputs if hasattr(a, "listed")), None) if is_recording() else None
+    inputs, sized = [wp.vec2i(0, 0), *inputs], 0 if listed is None else listed.entries
+    launch_ranges(kernel, (count,), cost, inputs, device=wp.get_device(device), launch=launch, ordered=ordered, sized=sized)
 
 
 def _kernel(function: Callable, module: str) -> wp.Kernel:

@@ -11,8 +11,9 @@ from warp_lcp.grid import level_set_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.particle_loops import on_grid, scatter, touched_planes
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import COPY, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
+from warp_lcp.rows.program import clear
 
 REACH = 1.5  # half the width of a cell's kernel, in cells: beyond it a plane leaves no trace
 QUANTILE = 3.7191  # of the normal distribution at 1 - level_set_kernels.TAIL
@@ -74,28 +75,34 @@ class LevelSet:
             base: int8, SOLID in cells that hold no liquid.
             fill: adds the density of liquid without particles in a window.
         """
+        self.leave(window)
+        self.compute(particles, window, capacity, base, fill=fill)
+
+    def leave(self, window: Window) -> None:
+        """Clear what the last update has left in another window."""
+        before, self._filled = self._filled, window.now
+        if before is not None and (before.low, before.high) != (window.low, window.high):
+            before.launch(kernels.clear_kernel, [self.limit, self.phi, self._known])
+
+    def compute(self, particles: Particles, window: Window, capacity: wp.array | None, base: wp.array, *, fill: Fill | None = None) -> None:
+        """Launch what `update` does after `leave`."""
         grid = self.grid
         particle_density(grid, particles, window, self.particles_a_cell, self.density)
         if fill is not None:
             fill(window, self.density)
         density, smooth = self.density, None
         if self.smoothing:
-            for field in self._scratch[:2]:  # a pass looks one cell beyond the window, where an earlier update may have left something
-                field.zero_()
+            clear(*self._scratch[:2])  # a pass looks one cell beyond the window, where an earlier update may have left something
             density = self._smoothed(window, self.density, self._scratch[0], self._scratch[1])
             if capacity is not None:
                 free = self._scratch[1] if density is self._scratch[0] else self._scratch[0]
                 smooth = self._smoothed(window, capacity, free, self._scratch[2])
-        if self._filled is not None and (self._filled.low, self._filled.high) != (window.low, window.high):
-            self._filled.launch(kernels.clear_kernel, [self.limit, self.phi, self._known])
-        self._filled = window
         found = {"phi": self.phi, "known": self._known, "spread": self._spread, "limit": self.limit}
         window.run(kernels.DISTANCE, density=density, capacity=capacity, smooth=smooth, base=base, **found)
         if smooth is not None:
             shifted = next(field for field in self._scratch if field is not smooth)
             window.launch(kernels.wall_shift_kernel, [self._spread**2, self.limit, smooth, self.phi, self._known, shifted])
-            box = tuple(map(slice, window.low, window.high))
-            wp.copy(self.phi[box], shifted[box])
+            window.run(COPY, source=shifted, field=self.phi)
         extrapolate(window, self._known, self.phi, kernels.EXTENDED)
 
     def volume(self, distance: wp.array | None, window: Window) -> float:
@@ -152,7 +159,7 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
         density: float32 (written, 0 away from particles).
     """
     given = {"position": particles.position, "density": density, "each": 1.0 / particles_a_cell}
-    density.zero_()
+    clear(density)
     if particles.offsets is not None:
         window.run(kernels.GATHER, offsets=particles.offsets, **given, **on_grid(grid))
     else:

@@ -5,13 +5,17 @@ cell, sorted); as native loops over a grain of particles they take 25, 12 and 34
 alias, gathers from the fields included.
 """
 
+import ctypes
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
+from warp_lcp.rows.program import is_recording
 from warp_lcp.rows.team import get_threads
 
 if TYPE_CHECKING:
@@ -76,6 +80,42 @@ def scatter_pass(name: str, whole: Mapping[str, Any], *, real: Any = wp.float32,
     )  # fmt: skip
 
 
+class ListMemory:
+    """A list that changes between the runs of recorded launches: its length, and where its arrays lie.
+
+    Attributes:
+        count: its entries.
+        rows: of passes over them.
+        entries: address of the number of entries, for kernels with a task an entry.
+        touched: memory of `touched_planes`.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self.device, self.count, self.rows = device, Scalar(), RowsMemory()
+        self._slots: dict[str, Slot] = {}
+        self._entries = ctypes.c_int64()
+        self.entries = ctypes.addressof(self._entries)
+        self.touched = self._resized(wp.empty(2, dtype=wp.int32, device=device), 1)
+
+    def take(self, count: int, arrays: Mapping[str, wp.array[Any]]) -> None:
+        """Take the list over: its length, and its arrays by name, which launches name by the same objects."""
+        for name, array in arrays.items():
+            self._slots.setdefault(name, Slot()).point_to(array)
+            array.listed = self
+        if count == self.count.value:
+            return
+        self.count.value = self._entries.value = count
+        self.rows.take(chunks(count, self.device).single)
+        self.touched = self._resized(self.touched, count)
+
+    def _resized(self, touched: wp.array[Any], count: int) -> wp.array[Any]:
+        least = 2 * -(-max(count, 1) // CPU_GRAIN)
+        if len(touched) < least:
+            touched = wp.empty(2 * least, dtype=wp.int32, device=self.device)
+        self._slots.setdefault("touched of", Slot()).point_to(touched)
+        return touched
+
+
 TOUCHED: dict[Any, RowPass] = {
     vector: particle_pass(f"warp_lcp.grid.touched_{real.__name__}.touched", {"position": vector}, real=real, whole={"touched": wp.int32})
     for vector, real in ((wp.vec3, wp.float32), (wp.vec3d, wp.float64))
@@ -86,7 +126,8 @@ def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[w
     """Return the planes (rows in 2-D) of a field that the particles of each chunk may add to; None where one thread adds up all."""
     if grid.device.is_cuda or get_threads() == 1:
         return None
-    touched = wp.empty(2 * -(-max(len(position), 1) // CPU_GRAIN), dtype=wp.int32, device=grid.device)
+    listed = getattr(position, "listed", None) if is_recording() else None
+    touched = wp.empty(2 * -(-max(len(position), 1) // CPU_GRAIN), dtype=wp.int32, device=grid.device) if listed is None else listed.touched
     launch(TOUCHED[position.dtype], len(position), grid, position=position, touched=touched)
     return touched
 
@@ -106,14 +147,16 @@ def scatter(
         given: what else the pass takes.
     """
     count, planes = len(position), grid.shape[3 - grid.dimension]
-    if not count:
+    listed = getattr(position, "listed", None) if is_recording() else None
+    if not count and listed is None:
         return
+    number = count if listed is None else listed.count
     if grid.device.is_cuda:
         rows = Rows.listed(count, grid.device)
     else:
         each = planes if touched is None else max(4, -(-planes // (SHARES * get_threads())))
         rows = Rows.listed(planes, grid.device, each, weight=1 << 20)  # a share is a piece
-    passed.bind(rows, **on_grid(grid), position=position, touched=touched, runs=runs, count=count, chunk=CPU_GRAIN, **given).launch()
+    passed.bind(rows, **on_grid(grid), position=position, touched=touched, runs=runs, count=number, chunk=CPU_GRAIN, **given).launch()
 
 
 def on_grid(grid: "StaggeredGrid") -> dict[str, Any]:
@@ -128,6 +171,12 @@ def chunks(count: int, device: wp.Device) -> Rows:
 
 
 def launch(passed: RowPass, count: int, grid: "StaggeredGrid", **given: Any) -> None:
-    """Launch a pass over the first particles of a list."""
-    if count:
+    """Launch a pass over the first particles of a list.
+
+    A launch that is recorded takes as many as the list has when it runs, if one of its arrays is of a `ListMemory`.
+    """
+    listed = next((a.listed for a in given.values() if hasattr(a, "listed")), None) if is_recording() else None
+    if listed is not None:
+        passed.bind(replace(chunks(count, grid.device), memory=listed.rows), **on_grid(grid), **given).launch()
+    elif count:
         passed.bind(chunks(count, grid.device), **on_grid(grid), **given).launch()

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.particle_loops import MARGIN, launch, on_grid
+from warp_lcp.grid.particle_loops import MARGIN, ListMemory, launch, on_grid
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
@@ -128,6 +128,7 @@ class Particles:
         self._last: ParticleTotals | None = None
         self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
+        self._memory = ListMemory(grid.device)
         self._grow(0)
         self.append(position, velocity, kept)
 
@@ -250,6 +251,11 @@ class Particles:
             self._grow(before)
         for column in (*self._columns.values(), self._spare):
             column.view = column.store[:count]
+        self._publish()
+
+    def _publish(self) -> None:
+        """Tell recorded launches how many particles there are, and where."""
+        self._memory.take(self.count, {**self.arrays(), "key": self.key})
 
     def _grow(self, before: int) -> None:
         """Make room for `count` particles and more, and keep those there were `before`."""
@@ -298,6 +304,7 @@ class Particles:
         for name, column in self._columns.items():
             launch_list(kernels.reorder_kernel, self.count, [self._order, column.view, self._spare.view], device=grid.device, cost=4)
             self._columns[name], self._spare = self._spare, column
+        self._publish()
         if self.offsets is not None:
             wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)
 

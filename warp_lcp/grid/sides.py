@@ -15,7 +15,7 @@ from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch
 
 SIDES = ("left", "right", "bottom", "top", "back", "front")  # at low x, high x, low y, high y, low z, high z; bit n is side n
 GONE = 0.75 * MARGIN  # cells from an open side at which a particle has left: nearer than particles keep from walls
@@ -155,7 +155,7 @@ class PeriodicSides:
         self.axes = tuple(axis for axis in endless if axis not in cut)
         self.bits = sum(1 << axis for axis in self.axes)
 
-    def wrap(self, *fields: wp.array, launch: Launch = wp.launch) -> None:
+    def wrap(self, *fields: wp.array, launch: Launch = launch) -> None:
         """Fill the ring of fields, in the stored shape or stacked in layers of it, from the other side."""
         for field in fields:
             layers = field if field.ndim == 4 else field.reshape((1, *self.grid.shape))
@@ -167,7 +167,7 @@ class PeriodicSides:
         """Add what lies in the ring of a sum over particles to the cells that it repeats."""
         for axis in self.axes:
             lines = self._lines(field, axis)
-            wp.launch(add_kernel, lines.shape[:2], [self.grid.counts[axis], lines], device=self.grid.device)
+            launch(add_kernel, lines.shape[:2], [self.grid.counts[axis], lines], device=self.grid.device)
         self.wrap(field)
 
     def average(self, velocity: Sequence[wp.array], weights: Sequence[wp.array], saved: Sequence[wp.array] = ()) -> None:
@@ -182,7 +182,7 @@ class PeriodicSides:
             old = saved[number] if saved else None
             for axis in self.axes:
                 lines, means = self._lines(weight, axis), [None if v is None else self._lines(v, axis) for v in (field, old)]
-                wp.launch(average_kernel, lines.shape[:2], [self.grid.counts[axis], lines, *means], device=self.grid.device)
+                launch(average_kernel, lines.shape[:2], [self.grid.counts[axis], lines, *means], device=self.grid.device)
             self.wrap(field, *([old] if old is not None else []))
 
     def carry(self, position: wp.array) -> None:

@@ -7,6 +7,7 @@ that a point lies in cell floor(X). In 2-D, z is ignored. A grid may be a part o
 of the larger grid, so that a point has the same in all parts, and lies in stored cell floor(X) - origin.
 """
 
+import ctypes
 import typing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,8 +18,9 @@ import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
-from warp_lcp.rows.layout import grain
-from warp_lcp.rows.program import Launch, launch_ranges
+from warp_lcp.rows.layout import BLANK, grain
+from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
+from warp_lcp.rows.program import Launch, clear, launch_ranges
 from warp_lcp.settings import renamed_names
 
 CLEAR: dict[typing.Any, RowPass] = {
@@ -27,6 +29,10 @@ CLEAR: dict[typing.Any, RowPass] = {
     )
     for dtype in (wp.int8, wp.float32, wp.float64)
 }
+COPY = RowPass(
+    "warp_lcp.grid.copy_box.copy", Path(__file__).parent / "headers" / "copy_box.h", wp.float32,
+    box={"field": wp.float32, "source": wp.float32},
+)  # fmt: skip
 SEGMENT = 8  # cells of a row that are visited together where a box is visited in part
 
 
@@ -187,7 +193,7 @@ class Window:
         """
         for array in given:
             if self.near is None:
-                array.zero_()
+                clear(array)
             else:
                 self.run(CLEAR[array.dtype], field=array)
 
@@ -213,6 +219,133 @@ class Window:
             dim, cost = (1, 1, cells.chunks), self._visited // max(cells.chunks, 1)
         launch_ranges(kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
 
+    @property
+    def now(self) -> "Window":
+        """The window itself; of an `ActiveWindow` the one that it stands for."""
+        return self
+
+
+NO_CELLS = CellRange()
+
+
+def _native(struct: typing.Any) -> typing.Any:
+    """Return the type of a Warp struct's memory."""
+    return type(struct.__ctype__())
+
+
+def _set(native: typing.Any, members: dict[str, int]) -> None:
+    for name, value in members.items():
+        setattr(native, name, value)
+
+
+class _RangeMemory:
+    """A CellRange that recorded launches read, and the number of its tasks."""
+
+    def __init__(self) -> None:
+        self.range, self.tasks = _native(CellRange())(), ctypes.c_int64()
+        self.first = 0, ctypes.addressof(self.range), ctypes.sizeof(self.range)
+        self.sized = ctypes.addressof(self.tasks)
+
+    def take(self, cells: typing.Any, tasks: int) -> None:
+        """Take a CellRange over."""
+        ctypes.memmove(self.first[1], ctypes.addressof(cells.__ctype__()), self.first[2])
+        self.tasks.value = tasks
+
+
+class ActiveWindow(Window):
+    """The window of the current step, in memory: launches that are recorded with it visit the window of the step in which they run.
+
+    Args:
+        window: the first one.
+
+    Attributes:
+        first: plane, row of its first cell.
+        sizes: its planes, its rows.
+    """
+
+    first: tuple[Scalar, Scalar]
+    sizes: tuple[Scalar, Scalar]
+    pieces: Scalar
+    hulls: Slot
+    _rows: tuple[RowsMemory, RowsMemory]  # of passes, of passes that sum
+    _ranges: tuple[_RangeMemory, _RangeMemory]  # of kernels for cells, for rows
+    _now: Window
+
+    def __init__(self, window: Window) -> None:
+        memory = {"_rows": (RowsMemory(), RowsMemory()), "_ranges": (_RangeMemory(), _RangeMemory()), "hulls": Slot()}
+        numbers = {"first": (Scalar(), Scalar()), "sizes": (Scalar(), Scalar()), "pieces": Scalar()}
+        for name, value in {"device": window.device, **memory, **numbers, "_now": None}.items():
+            object.__setattr__(self, name, value)  # which a dataclass that is frozen does not allow otherwise
+        self.move_to(window)
+
+    low = property(lambda self: self._now.low)
+    high = property(lambda self: self._now.high)
+    near = property(lambda self: self._now.near)
+    now = property(lambda self: self._now)
+    cells = property(lambda self: self._now.cells)
+
+    def move_to(self, window: Window) -> None:
+        """Stand for another window."""
+        window, before = window.now, self._now
+        if window is before:
+            return
+        object.__setattr__(self, "_now", window)
+        if before is not None and before == window and before.near is None and window.near is None:
+            return
+        if self.device.is_cuda:
+            return
+        (k, j, i), planes, rows, end = window.low, *window.rows, window.high[2]
+        self.pieces.value = 0
+        for number, value in zip((*self.first, *self.sizes), (k, j, planes, rows), strict=True):
+            number.value = value
+        if window.near is None:  # as `Rows.box` and `Window.cells` have it: a task takes a row
+            box = {"planes": planes, "rows": rows, "nx": end - i, "grain": max(end - i, 1), "chunks": int(end > i)}
+            cells = {"rows": rows, "chunks": 1, "k": k, "j": j, "i": i, "end": end, "grain": end - i}
+            for memory in self._rows:
+                memory.take(BLANK, window.low)
+                memory.tasks.value = planes * rows * box["chunks"]
+                _set(memory.layout, box | {"slab": 1})
+            for of_cells in self._ranges:
+                of_cells.take(NO_CELLS, planes * rows)
+                _set(of_cells.range, cells)
+            return
+        for memory, rows_ in zip(self._rows, (window._shared, window._whole), strict=True):
+            memory.take(rows_.single, window.low)
+        for of_cells, pieces in zip(self._ranges, (window._pieces, window._hulls), strict=True):
+            of_cells.take(_in_part(pieces), len(pieces))
+        self.hulls.point_to(window._hulls)
+        self.pieces.value = len(window._hulls)
+
+    @property
+    def hull_pieces(self) -> typing.Any:
+        """The pieces that sums over rows visit; None: all rows of the box."""
+        return None if self.near is None else self._now._hulls
+
+    @property
+    def _shared(self) -> Rows:
+        return replace(self._now._shared, memory=self._rows[0])
+
+    @property
+    def _whole(self) -> Rows:
+        return replace(self._now._whole, memory=self._rows[1])
+
+    def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
+        """Launch kernel(cells, *inputs) with one thread per row."""
+        cells = self._now._cells(self.high[2] - self.low[2]) if self.near is None else _in_part(self._now._hulls)
+        self._launch(kernel, cells, inputs, None, self._ranges[1])
+
+    def _launch(
+        self, kernel: wp.Kernel, cells: typing.Any, inputs: list[typing.Any], launch: Launch | None, memory: _RangeMemory | None = None
+    ) -> None:
+        memory = memory or self._ranges[0]
+        dim, cost = (*self.rows, cells.chunks), cells.grain
+        if self.near is not None:
+            dim, cost = (1, 1, cells.chunks), self._now._visited // max(cells.chunks, 1)
+        ordered = getattr(kernel, "ordered", False)
+        launch_ranges(
+            kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered, first=memory.first, sized=memory.sized
+        )
+
 
 class DirtyRegion:
     """Dirty region: union of the current window and the last one.
@@ -237,7 +370,7 @@ class DirtyRegion:
 
         This one becomes the last. None: all cells.
         """
-        now, last = (window and window.common(self.all)) or self.all, self._last
+        now, last = (window and window.now.common(self.all)) or self.all, self._last
         low, high = np.minimum(now.low, last.low), np.maximum(now.high, last.high)
         self._last = now
         near = None if now.near is None or last.near is None else now.near | last.near

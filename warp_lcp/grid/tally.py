@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
-import numpy as np
+import warp as wp
 
-from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.rows import RowPass
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Tally
 
 CUDA_SUMS = 1 << 20  # columns of cells, a thread each, into which a GPU cuts a grid: some waves of the largest ones
 CUDA_PLANES = 16  # of one of them, at least
+
+_BOXES = ("first_k", "first_j", "planes", "rows_", "box_k", "box_j", "box_planes", "box_rows")
+ADD_ROWS = RowPass(
+    "warp_lcp.grid.tally.add_rows", Path(__file__).parent / "headers" / "add_rows.h", wp.float64,
+    whole={"partials": wp.float64, "host": wp.float64, "results": wp.float64, "pieces": wp.vec2i}, optional=("pieces",),
+    numbers=dict.fromkeys((*_BOXES, "hulls", "sums_", "all_planes", "all_rows"), int),
+)  # fmt: skip
 
 
 class WindowTally:
@@ -20,36 +29,57 @@ class WindowTally:
     Args:
         declared: a pass over a box, with what it finds.
         grid: the grid.
+        counted: cells whose rows the CPU adds up; None: those of the window.
     """
 
-    def __init__(self, declared: RowPass, grid: StaggeredGrid) -> None:
-        self._shape, domain = grid.shape[:2], grid.domain
+    def __init__(self, declared: RowPass, grid: StaggeredGrid, counted: Window | None = None) -> None:
+        self._shape, domain, self._declared = grid.shape[:2], grid.domain, declared
         self._planes = max(CUDA_PLANES, grid.size // CUDA_SUMS)
-        self.name = declared.name
-        self._tally = Tally(declared, grid.device, domain.rows_of_sums(self._planes).places)
-        self._window, self._host = domain, np.zeros((*self._shape, len(declared.found)))
+        self.name, self._counted = declared.name, counted
+        columns, device = len(declared.found), grid.device
+        self._tally = Tally(declared, device, domain.rows_of_sums(self._planes).places) if device.is_cuda else None
+        if self._tally is None:
+            rows = self._shape[0] * self._shape[1]
+            self._partials, self._host = (wp.zeros(columns * rows, dtype=wp.float64, device=device) for _ in range(2))
+            self._reading, self._columns = Reading(device, columns), Rows.flat(columns, device, serial=True)
 
     def take(self, window: Window, **given: Any) -> None:
         """Launch the pass over a window."""
-        self._window = window
-        self._tally.take(window.rows_of_sums(self._planes), **given)
+        if self._tally is not None:
+            self._tally.take(window.rows_of_sums(self._planes), **given)
+            return
+        self._declared.bind(window.rows_of_sums(self._planes), **given, out=self._partials).launch()
+        box, numbers = self._counted or window, dict[str, Any]()
+        if isinstance(window, ActiveWindow):
+            numbers |= {"hulls": window.pieces, "pieces": window.hull_pieces}
+        elif window.near is not None:
+            numbers |= {"hulls": len(window._hulls), "pieces": window._hulls}
+        else:
+            numbers |= {"hulls": 0, "pieces": None}
+        numbers |= dict(zip(("first_k", "first_j", "planes", "rows_"), _numbers(window), strict=True))
+        numbers |= dict(zip(("box_k", "box_j", "box_planes", "box_rows"), _numbers(box), strict=True))
+        arrays = {"partials": self._partials, "host": self._host, "results": self._reading.array}
+        sizes: dict[str, Any] = {"sums_": len(self._declared.sums), "all_planes": self._shape[0], "all_rows": self._shape[1]}
+        ADD_ROWS.bind(self._columns, **arrays, **numbers, **sizes).launch()
+        self._reading.changed()
+
+    def changed(self) -> None:
+        """Say that a recorded `take` has run."""
+        if self._tally is None:
+            self._reading.changed()
 
     def on_device(self) -> Any:
         """Return what is found, a number a column, where it is on a GPU; None on the CPU."""
-        return self._tally.found
+        return None if self._tally is None else self._tally.found
 
-    def read(self, box: Window | None = None) -> list[float]:
-        """Return what the last launch found; `box`: cells whose rows the host adds up, which has the bits of it; None: of the window."""
-        return [float(v) for v in self._tally.read(lambda parts: self._arranged(parts, box or self._window))]
+    def read(self) -> list[float]:
+        """Return what the last launch found."""
+        found = self._reading.numpy() if self._tally is None else self._tally.read()
+        return [float(v) for v in found]
 
-    def _arranged(self, parts: np.ndarray, box: Window) -> np.ndarray:
-        """Return what rows have found as they lie in the grid, 0 where none was visited."""
-        host, window = self._host, self._window
-        host[...] = 0.0
-        if window.near is None:
-            planes, rows = window.rows
-            host[window.low[0] : window.high[0], window.low[1] : window.high[1]] = parts.T.reshape(planes, rows, -1)
-        else:
-            k, j = window.rows_visited.T
-            host[k, j] = parts.T
-        return np.moveaxis(host[box.low[0] : box.high[0], box.low[1] : box.high[1]], -1, 0)
+
+def _numbers(window: Window) -> tuple[Any, ...]:
+    """Return the first plane and row of a window, and how many it has."""
+    if isinstance(window, ActiveWindow):
+        return *window.first, *window.sizes
+    return *window.low[:2], *window.rows

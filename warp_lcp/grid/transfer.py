@@ -18,13 +18,13 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.particle_loops import launch, on_grid, particle_pass, scatter, scatter_pass, touched_planes
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.memory import Scalar, value_of
 
 TINY_WEIGHT = 1e-9  # below it a face counts as untouched
 # A particle that lies exactly on the boundary between cells would leave one face of its own cell without weight, hence without gravity.
@@ -136,7 +136,7 @@ def accelerate_kernel(k, j, i, change: float, weight: F32, field: F32):
         field[k, j, i] = field[k, j, i] + change
 
 
-def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], change: np.ndarray) -> None:
+def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], change: Sequence[float | Scalar]) -> None:
     """Change the velocity of every face with particle weight.
 
     Closed faces included: they pass it on to the material beside them.
@@ -145,8 +145,8 @@ def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[w
         window: faces that particles can reach.
         velocity: each component [m/s] (updated).
         weights: of the particles on each component's faces.
-        change: of each component [m/s], shape (3,).
+        change: of each component [m/s], shape (3,); a recorded launch has one for those that are not 0 then.
     """
     for axis, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
-        if change[axis] != 0.0:
-            window.launch(accelerate_kernel, [float(change[axis]), weight, field])
+        if value_of(change[axis]) != 0.0:
+            window.launch(accelerate_kernel, [change[axis], weight, field])

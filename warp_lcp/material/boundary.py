@@ -22,6 +22,8 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.wall import Join, extend_velocity, extend_velocity_cut
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, clear, launch
 from warp_lcp.rows.readings import Reading
 
 Faces = list[wp.array]  # one field a component
@@ -153,7 +155,9 @@ class WholeCells:
             for axis, field in enumerate(self.velocity):
                 grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, *walls, field])
         self._room = clearance(grid, self.base)
-        self._stopped = Reading(grid.device, dtype=wp.int32)
+        self._stopped, self._dt = Reading(grid.device, dtype=wp.int32), Scalar()
+        self._advection = LaunchGraph(grid.device, self._advect)
+        self._displacement = LaunchGraph(grid.device, self._displace)
 
     def top_speed(self, time: float, span: float) -> float:
         """Return 0: the solids do not move."""
@@ -176,9 +180,13 @@ class WholeCells:
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, never into a SOLID cell."""
-        self._stopped.array.zero_()
-        advect(self.grid, fields, self._room, dt, position, self._stopped.array, self._endless)
+        self._dt.value = dt
+        self._advection.run(fields, position)
         self._stopped.changed()
+
+    def _advect(self, fields: Faces, position: wp.array) -> None:
+        clear(self._stopped.array)
+        advect(self.grid, fields, self._room, self._dt, position, self._stopped.array, self._endless)
 
     def met(self) -> tuple[int, int, int]:
         """Return the number of particles that met a wall."""
@@ -186,6 +194,9 @@ class WholeCells:
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m], never into a SOLID cell."""
+        self._displacement.run(fields, position)
+
+    def _displace(self, fields: Faces, position: wp.array) -> None:
         advect(self.grid, fields, self._room, 1.0, position, self._stopped.array, self._endless)
 
     def place(self, time: float) -> None:
@@ -229,7 +240,9 @@ class CutBoundary:
         self.touch = grid.field(wp.uint8)
         self._scratch = grid.faces()
         self._reachable = grid.field() if cut.moves else cut.distance  # distance where particles may go within a step
-        self._counts = Reading(grid.device, 3, wp.int32)
+        self._counts, self._dt = Reading(grid.device, 3, wp.int32), Scalar()
+        self._advection = LaunchGraph(grid.device, self._advect)
+        self._displacement = LaunchGraph(grid.device, self._displace)
         self._moving = [(solid.motion, solid.geometry.bounds()) for solid in cut.solids if solid.motion is not None]
         self.kinks = tuple(time for motion, _ in self._moving for time in kinks(motion))
         self._find_walls()
@@ -263,19 +276,23 @@ class CutBoundary:
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, then move the solids to `time`."""
-        counts = self._counts.array
-        counts.zero_()
+        self._dt.value = dt
         if self.moves:
             wp.copy(self._reachable, self.cut.distance)
             self.place(time)
-            wp.launch(
-                kernels.larger_kernel, self.grid.size, [self.cut.distance.flatten(), self._reachable.flatten()], device=self.grid.device
-            )
-        sides, ways = self.open_sides, {"open_sides": self.open_sides, "endless": self._endless}
-        advect_with_distance(self.grid, fields, self._reachable, dt, position, counts[0:1], **ways)
-        if self.moves:
-            push_out(self.grid, self.cut.distance, position, counts[1:2], counts[2:3], open_sides=sides)
+        self._advection.run(fields, position)
         self._counts.changed()
+
+    def _advect(self, fields: Faces, position: wp.array) -> None:
+        """Move the particles where the solids are or have been, then out of the solids."""
+        counts, distance = self._counts.array, self.cut.distance
+        clear(counts)
+        if self.moves:
+            launch(kernels.larger_kernel, self.grid.size, [distance.flatten(), self._reachable.flatten()], device=self.grid.device)
+        sides, ways = self.open_sides, {"open_sides": self.open_sides, "endless": self._endless}
+        advect_with_distance(self.grid, fields, self._reachable, self._dt, position, counts[0:1], **ways)
+        if self.moves:
+            push_out(self.grid, distance, position, counts[1:2], counts[2:3], open_sides=sides)
 
     def met(self) -> tuple[int, int, int]:
         """Return numbers of particles that met a wall, were pushed, and are stuck."""
@@ -284,6 +301,9 @@ class CutBoundary:
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m] among the solids at rest."""
+        self._displacement.run(fields, position)
+
+    def _displace(self, fields: Faces, position: wp.array) -> None:
         ways = {"open_sides": self.open_sides, "endless": self._endless}
         advect_with_distance(self.grid, fields, self.cut.distance, 1.0, position, self._counts.array[0:1], **ways)
 

@@ -16,12 +16,14 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.rows.vectors import convert
 from warp_lcp.settings import renamed_names
 
@@ -74,9 +76,10 @@ class DensityMonitor:
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, max_density: float) -> None:
         self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
-        self._crowd = WindowTally(CROWD, grid)
+        self._crowd = WindowTally(CROWD, grid, grid.domain)
         self._density: wp.array | None = None
-        self._trail, self._counted = DirtyRegion(grid.domain), grid.domain
+        self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)
+        self._measuring = LaunchGraph(grid.device, self._launch)
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:
         """Measure the density; `found` then returns the result.
@@ -89,9 +92,14 @@ class DensityMonitor:
         if density is None:
             density = self._density = self.grid.field() if self._density is None else self._density
             self._find(density, particles, window)
+        self._cells.move_to(self._trail.through(window))
+        self._measuring.run(density, variant=self._cells.near is None)
+        self._crowd.changed()
+
+    def _launch(self, density: wp.array) -> None:
         b = self.boundary
         filled = {"base": b.base, "density": density, "capacity": b.capacity}
-        self._crowd.take(self._trail.through(window), **filled, most=self.max_density)
+        self._crowd.take(self._cells, **filled, most=self.max_density)
 
     def _find(self, density: wp.array, particles: Particles, window: Window) -> None:
         """Find the particles' density."""
@@ -99,7 +107,7 @@ class DensityMonitor:
 
     def _read(self) -> list[float]:
         """Return what is beyond what cells may hold, what there is, and the largest density."""
-        return self._crowd.read(self._counted)
+        return self._crowd.read()
 
     def found(self) -> tuple[float, float]:
         """Return the fraction of material above the limit, and the largest density.
@@ -187,6 +195,9 @@ class DensityCorrection:
         self._shift = wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device) if boundary.open or even else None
         self._problem: wl.LCP | None = None  # built when there is material: an empty problem is refused
         self._solved = grid.domain  # the cells of the problem
+        self._way = Scalar()  # by which the displacement is multiplied [m]
+        self._preparation = LaunchGraph(grid.device, self._launch_preparation)
+        self._displacing = LaunchGraph(grid.device, self._launch_displacement)
 
     def apply(
         self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None, share: float = 1.0
@@ -200,10 +211,11 @@ class DensityCorrection:
             contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`; None: they do not.
             share: of the displacement that particles go.
         """
-        self._find_density(particles, window)
-        if fill is not None:
-            fill(window, self.density)
-        over_full, most = self._prepare(contact)
+        if particles.offsets is not None:
+            particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
+        self._preparation.run(particles, window, fill, contact, variant=(window.near is None, contact is None))
+        self._over.changed()
+        over_full, most = self._counts(*self._found())
         if over_full == 0:
             self.x.zero_()
             return Correction(None, 0, most)
@@ -212,17 +224,27 @@ class DensityCorrection:
             self.x.zero_()
             return Correction(result, over_full, most)
         self._take(result.x)
+        self._way.value = share * self.grid.spacing
+        self._displacing.run()
+        self._displace_particles(particles)
+        return Correction(result, over_full, most)
+
+    def _launch_displacement(self) -> None:
+        """Launch the computation of the displacement on all faces."""
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None
             fields = {"x": self.x, "kind": self._kind, "open": open_, "density": self.density, "capacity": self.boundary.capacity}
-            self.grid.domain.run(self._displace, **fields, axis=axis, most=longest, dx=share * self.grid.spacing, d=field)
-        self._displace_particles(particles)
-        return Correction(result, over_full, most)
+            self.grid.domain.run(self._displace, **fields, axis=axis, most=longest, dx=self._way, d=field)
+
+    def _launch_preparation(self, particles: Particles, window: Window, fill: Fill | None, contact: wp.array | None) -> None:
+        """Launch the density and the set-up of the problem."""
+        self._find_density(particles, window)
+        if fill is not None:
+            fill(window, self.density)
+        self._prepare(contact)
 
     def _find_density(self, particles: Particles, window: Window) -> None:
-        if particles.offsets is not None:
-            particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
         particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
 
     def _displace_particles(self, particles: Particles) -> None:
@@ -232,8 +254,8 @@ class DensityCorrection:
         """Take the solution of the problem."""
         convert(x.flatten(), self.x.flatten())
 
-    def _prepare(self, contact: wp.array | None) -> tuple[int, float]:
-        """Set up the problem; return how many cells are over-full, and the largest density."""
+    def _prepare(self, contact: wp.array | None) -> None:
+        """Set up the problem, and count over-full cells."""
         b, most = self.boundary, self.max_density
         fields: dict[str, Any] = {
             "kind": self._kind,
@@ -243,15 +265,20 @@ class DensityCorrection:
             "capacity": b.capacity,
             "inside": self._inside,
         }
-        lacking = 0.0
         self._over.take(self._solved, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
         if self._inside is not None:
             numbers: dict[str, Any] = {"least": min(most, 2.0 - most), "planes": self.grid.planes - 1}
             self._join()
             self._lacking.take(self._solved, **fields, **numbers, lower=self._lower)
+
+    def _found(self) -> tuple[float, float]:
+        """Return how many cells are over-full or lack material deep inside, and the largest density."""
+        lacking = 0.0
+        if self._inside is not None:
+            self._lacking.changed()
             (lacking,) = self._lacking.read()
         full, densest = self._over.read()
-        return self._counts(full + lacking, densest)
+        return full + lacking, densest
 
     def _join(self) -> None:
         """Take what else is known of the cells that are inside, before those deep inside are told by them."""

@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import SurfaceMesh
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.grid.vicinity import Vicinity
@@ -27,6 +27,8 @@ from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.material.spray import Spray
 from warp_lcp.material.wall import Join
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
 
 CONTACTS_MISSED = 1e-2  # relative residual of bodies' contacts: what gravity makes in a step is wrong by a hundredth, and bodies creep
@@ -116,6 +118,11 @@ class ParticleSimulation(ParticleCheckpoints):
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
         self._faces_know = False  # the velocity of the particles, around them
+        self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
+        at_once = self.shared or self.band is not None
+        self._transfer_to_grid = LaunchGraph(grid.device, self._launch_particles_to_grid, at_once=at_once)
+        self._extrapolation = LaunchGraph(grid.device, self._continue, at_once=at_once)
+        self._transfer_to_particles = LaunchGraph(grid.device, self._launch_grid_to_particles, at_once=at_once)
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
         if not (self.shared or self.band is not None or scene.endless):  # without an interior, and ends where the grid does
@@ -260,6 +267,11 @@ class ParticleSimulation(ParticleCheckpoints):
             self.bodies.restore_step()
 
     def window(self, totals: ParticleTotals) -> Window:
+        """Return the cells that the particles can touch in a step: the step's `active` window, which is moved there."""
+        self.active.move_to(self._reached(totals))
+        return self.active
+
+    def _reached(self, totals: ParticleTotals) -> Window:
         """Return the cells that the particles can touch in a step."""
         low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
         box = self.grid.window(low, high, grow=self.reach + 2)
@@ -273,13 +285,19 @@ class ParticleSimulation(ParticleCheckpoints):
         """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
         p = self.particles
         with self.watch.stage("particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights):
-            order = {"offsets": p.offsets, "runs": p.runs}
-            particles_to_faces(self.grid, p.position, p.velocity, p.affine, self.velocity, self.weights, window=window, **order)
-            if self.band is not None:
-                self.band.blend(window, self.velocity, self.weights)
-            for field, saved in zip(self.velocity, self._saved or (), strict=False):
-                wp.copy(saved, field)
-            accelerate(window, self.velocity, self.weights, self.gravity * self.kick_dt)
+            for kick, change in zip(self.kicks, self.gravity * self.kick_dt, strict=True):
+                kick.value = float(change)
+            self._transfer_to_grid.run(window, variant=window.near is None)
+
+    def _launch_particles_to_grid(self, window: Window) -> None:
+        p = self.particles
+        order = {"offsets": p.offsets, "runs": p.runs}
+        particles_to_faces(self.grid, p.position, p.velocity, p.affine, self.velocity, self.weights, window=window, **order)
+        if self.band is not None:
+            self.band.blend(window, self.velocity, self.weights)
+        for field, saved in zip(self.velocity, self._saved or (), strict=False):
+            copy(saved, field)
+        accelerate(window, self.velocity, self.weights, self.kicks)
 
     def extrapolate_velocity(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
         """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
@@ -291,7 +309,7 @@ class ParticleSimulation(ParticleCheckpoints):
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.boundary_kernels`.
         """
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
-            self._continue(window, list(known), kind, contact, self._layer_filled())
+            self._extrapolation.run(window, list(known), kind, contact, self._layer_filled(), variant=window.near is None)
             if self.sources is not None:
                 self.sources.hold(self.velocity, [])
 
@@ -323,10 +341,11 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.flights.begin(particles, window, self.weights, kind, dt, self.gravity * self.kick_dt)
         self._faces_know = True
         with self.watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
-            flip = self.scene.particles.flip_ratio if self._saved else 0.0
-            faces_to_particles(
-                self.grid, self.velocity, particles.position, particles.velocity, particles.affine, saved=self._saved, flip=flip
-            )
+            self._transfer_to_particles.run()
+
+    def _launch_grid_to_particles(self) -> None:
+        p, flip = self.particles, self.scene.particles.flip_ratio if self._saved else 0.0
+        faces_to_particles(self.grid, self.velocity, p.position, p.velocity, p.affine, saved=self._saved, flip=flip)
 
     def move(self, dt: float, window: Window) -> Row:
         """Move particles and solids by dt [s], exchange particles with sources and outlets, even them out, and advance the clock.

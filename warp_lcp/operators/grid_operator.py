@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,6 +17,8 @@ from warp_lcp.problem.pickling import Pickled
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, checked_device, real_array, relative_rounding
+from warp_lcp.rows.program import LaunchGraph, launch
+from warp_lcp.rows.program import copy as copy_array
 from warp_lcp.rows.vectors import Across
 
 HEADERS = Path(__file__).parent / "headers"
@@ -49,6 +51,7 @@ class GridOperator(Pickled):
     _finder: Any = None  # of floating components
     _rounding = 0.0  # the largest relative one of coefficients that were given as arrays
     outside = SOLID  # what lies beyond the array
+    records = False  # whether taking cells reads nothing from the device, so that it is recorded once
 
     def __init__(self, cells: Any, coefficients: dict[str, Any], periodic: tuple[bool, ...], device: Any, dtype: Any) -> None:
         if dtype not in (wp.float32, wp.float64):
@@ -72,7 +75,8 @@ class GridOperator(Pickled):
         self.layout.chunks = self._chunks if chunks else None
         self._find_rows()
         self.layout.find_use(self._reach.numpy()[..., 1] > 0)
-        self.version = 0
+        self.version = 1
+        self._refills: dict[int, LaunchGraph] = {}  # by the address of the cells
         self.stencil = self._empty_stencil()
         self._mask: wp.array[Any] | None = None
         self._fill_stencil()
@@ -174,6 +178,7 @@ class GridOperator(Pickled):
         """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""
         mask = (self.layout.load(free, wp.uint8, "free").numpy() != 0) & (self.cells.numpy().ravel() == FLUID)
         twin = copy.copy(self)
+        twin._refills = {}
         twin._mask, twin._finder = wp.array(mask.astype(np.uint8), device=self.device), None
         d, kind = self.stencil.d.numpy(), self.stencil.d.dtype
         if shift is not None:
@@ -230,6 +235,15 @@ class GridOperator(Pickled):
 
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
+        self.version += 1
+        if not self.records:
+            self._take_cells(cells)
+            return
+        if cells.ptr not in self._refills:
+            self._refills[cells.ptr] = LaunchGraph(self.device, partial(self._take_cells, cells))
+        self._refills[cells.ptr].run()
+
+    def _take_cells(self, cells: wp.array[Any]) -> None:
         if cells is not self.cells:
             COPY_CELLS.bind(Rows.of(self.layout.padding, self.device), source=cells.flatten(), to=self.cells.flatten()).launch()
         self._find_rows()
@@ -264,13 +278,12 @@ class GridOperator(Pickled):
     def _find_rows(self) -> None:
         """Find what of each row is in use."""
         counts = self.layout.padding.counts
-        wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans, self._reach, self._chunks], device=self.device)
+        launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans, self._reach, self._chunks], device=self.device)
 
     def _wrap_cells(self) -> None:
-        """Fill ghost cells of periodic axes in `cells_around`; a version more."""
-        self.version += 1
+        """Fill ghost cells of periodic axes in `cells_around`."""
         if self.cells_around is not self.cells:
-            wp.copy(self.cells_around, self.cells)
+            copy_array(self.cells_around, self.cells)
             self.stencil.wrap(self.cells_around)
 
     @cached_property

@@ -228,6 +228,8 @@ class GridPoisson(GridOperator):
         total, count = sums if across is None else across.sum(sums)
         return float(total / max(count, 1))
 
+    records = True
+
     def _fill_stencil(self) -> None:
         """Compute diagonal and weights, on rows that are in use or have been."""
         s, padding, reach = self.stencil, self.layout.padding, self._rows_in_reach

@@ -258,6 +258,7 @@ class Rows:
         place: first stored cell of a box.
         ends: one past the last stored cell (k, j, i) of a box.
         weight: cells of a usual pass that one costs as much as.
+        memory: a `warp_lcp.rows.memory.RowsMemory` that recorded launches read in each run; None: rows are always these.
     """
 
     summed: Any
@@ -268,6 +269,7 @@ class Rows:
     place: Mapping[str, int] = field(default_factory=dict)
     ends: tuple[int, ...] = ()
     weight: int = 1
+    memory: Any = None
 
     @staticmethod
     def of(padding: Padding, device: wp.Device, spans: Any = None, *, whole: bool = False, more: int = 0) -> "Rows":

@@ -3,16 +3,43 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.rows.team import CELLS, Entry, Operation, Stage, Table, arguments_of, launched_alone, ranges, team
+from warp_lcp.rows.memory import ARRAY_BYTES, Scalar, value_of
+from warp_lcp.rows.team import ALONE, CELLS, Entry, Operation, Patch, Stage, Table, arguments_of, copied, get_threads, ranges, team
+
+
+class _Recording(threading.local):
+    """The program that takes what a thread launches; None: it is launched."""
+
+    program: Program | None = None
+
+
+RECORDING = _Recording()
+
+
+def is_recording() -> bool:
+    """Return whether what this thread launches is recorded."""
+    return RECORDING.program is not None
+
+
+@contextmanager
+def recording(program: Program) -> Iterator[None]:
+    """Record what this thread launches by `warp_lcp.rows`, in place of launching it."""
+    before, RECORDING.program = RECORDING.program, program
+    try:
+        yield
+    finally:
+        RECORDING.program = before
 
 
 def loops_on_device(device: wp.Device) -> bool:
@@ -44,7 +71,7 @@ class Task:
 
     def launch(self, launch: Launch = wp.launch) -> None:
         """Do it now, or record it between the launches."""
-        recorded = isinstance(getattr(launch, "__self__", None), Program) and team() is not None
+        recorded = (is_recording() or isinstance(getattr(launch, "__self__", None), Program)) and team() is not None
         perform(self.operation() if recorded and self.operation else self.function, launch)
 
 
@@ -63,7 +90,9 @@ class Conditional:
 def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
     """Call a function, or have the team do an operation, now if `launch` launches now; else record it among the launches."""
     program = getattr(launch, "__self__", None)
-    if isinstance(program, Program):
+    if not isinstance(program, Program):
+        program = RECORDING.program
+    if program is not None:
         program.record(what)
     elif isinstance(what, Operation):
         run_table(Table([what]))
@@ -79,26 +108,73 @@ def run_table(table: Table) -> None:
 
 
 def launch_ranges(
-    kernel: Any, dim: tuple[int, ...], cells: int, inputs: list[Any], *, device: Any, launch: Launch | None, ordered: bool
-) -> None:
+    kernel: Any, dim: tuple[int, ...], cells: int, inputs: list[Any], *, device: Any, launch: Launch | None, ordered: bool,
+    first: Patch | None = None, sized: int = 0,
+) -> None:  # fmt: skip
     """Launch a kernel whose first argument begins with the range of tasks that a thread takes, or record it.
 
     Args:
         kernel: with as many coordinates of a thread as `dim` has.
         dim: of the launch where there is no such range.
         cells: what a task costs, in cells of a usual pass.
-        inputs: arguments.
+        inputs: arguments; numbers may be `Scalar`.
         device: where.
         launch: of a program; None: now.
         ordered: whether tasks write what others read or write.
+        first: what of the first argument recorded launches read from memory.
+        sized: address of the number of tasks then; 0: that of `dim`.
     """
-    tasks = math.prod(dim)
-    if device.is_cuda or team() is None or (launch is None and tasks * cells < 2 * CELLS):
-        (launch or wp.launch)(kernel, dim, inputs, device=device)
-    elif tasks:
-        made = wp.launch(kernel, (1,) * len(dim), inputs, device=device, record_cmd=True)
-        stage = Stage(Entry(made), arguments_of(made), inputs, tasks // dim[0], dim[0])
-        perform(ranges(stage, cells, ordered=ordered), launch or wp.launch)
+    tasks, recorded = math.prod(dim), launch is None and is_recording()
+    if device.is_cuda or team() is None or (launch is None and not recorded and tasks * cells < 2 * CELLS):
+        (launch or wp.launch)(kernel, dim, [value_of(v) for v in inputs], device=device)
+    elif tasks or (recorded and sized):
+        made = wp.launch(kernel, (1,) * len(dim), [value_of(v) for v in inputs], device=device, record_cmd=True)
+        memory = arguments_of(made)
+        patches = [*([first] if first else ()), *_patches(inputs, kernel, memory)] if recorded else ()
+        stage = Stage(Entry(made), memory, inputs, tasks // dim[0] if dim[0] else 0, dim[0], patches=patches)
+        perform(ranges(stage, cells, ordered=ordered, sized=sized if recorded else 0), launch or wp.launch)
+
+
+def _patches(inputs: Sequence[Any], kernel: Any, memory: Any) -> Iterator[Patch]:
+    """Return what of a kernel's arguments is read from memory: numbers and arrays that others replace."""
+    for i, value in enumerate(inputs):
+        offset = getattr(type(memory), f"p{i}").offset
+        if type(value) is Scalar:
+            yield (offset, *value.address(kernel.adj.args[i].type))
+        elif (slot := getattr(value, "slot", None)) is not None:
+            yield offset, slot.address, ARRAY_BYTES
+
+
+def launch(kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
+    """Launch a Warp kernel, now or among recorded launches; numbers may be `Scalar`."""
+    program = RECORDING.program
+    if program is None:
+        wp.launch(kernel, dim, [value_of(v) for v in inputs], device=device, block_dim=block_dim)
+    else:
+        program.launch(kernel, dim, inputs, device=device, block_dim=block_dim)
+
+
+def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
+    """Copy an array to another of the same type and size whose elements lie side by side, now or among recorded launches."""
+    program = RECORDING.program
+    if program is None:
+        wp.copy(to, source)
+    else:
+        program.record(copied(to.ptr, source.ptr, _bytes_of(to), (to, source)))
+
+
+def clear(*arrays: wp.array[Any]) -> None:
+    """Set arrays whose elements lie side by side to 0, now or among recorded launches."""
+    program = RECORDING.program
+    for array in arrays:
+        if program is None:
+            array.zero_()
+        elif array.size:
+            program.record(copied(array.ptr, 0, _bytes_of(array), array))
+
+
+def _bytes_of(array: wp.array[Any]) -> int:
+    return int(array.size * wp.types.type_size_in_bytes(array.dtype))
 
 
 class Program:
@@ -125,10 +201,16 @@ class Program:
         return len(self._commands)
 
     def launch(self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
-        """Record a launch, and keep its arguments alive."""
+        """Record a launch, and keep its arguments alive; numbers may be `Scalar` on the CPU."""
         self._arguments.append(inputs)
-        made = wp.launch(kernel, dim, inputs, device=device, block_dim=block_dim, record_cmd=True)
-        self.record(made if self.device.is_cuda or team() is None else launched_alone(made))
+        listed = [value_of(v) for v in inputs]
+        made = wp.launch(kernel, dim, listed, device=device, block_dim=block_dim, record_cmd=True)
+        if self.device.is_cuda or team() is None:
+            self.record(made)
+            return
+        memory = arguments_of(made)
+        patches = list(_patches(inputs, kernel, memory))
+        self.record(Operation(ALONE, [Stage(Entry(made), memory, (made, inputs), patches=patches)]))
 
     def record(self, what: Any) -> None:
         """Record a recorded launch, an operation of the team or a task of the host."""
@@ -147,7 +229,10 @@ class Program:
         self._stretches = None
 
     def run(self) -> None:
-        """Launch everything once."""
+        """Launch everything once, or record that among the launches of another program."""
+        if RECORDING.program is not None:
+            RECORDING.program.extend(self)
+            return
         if self._stretches is None and self.device.is_cuda and self._runs == 0:
             self._launch()
         else:
@@ -211,3 +296,61 @@ class Program:
     def _launch(self) -> None:
         for command in self._commands:
             command.launch()
+
+    def differs(self, other: Program) -> str:
+        """Say where operations differ from another program's in more than what they read from memory; "" if nowhere."""
+        if len(self._commands) != len(other._commands):
+            return f"{len(self._commands)} operations, {len(other._commands)} before"
+        for at, (mine, its) in enumerate(zip(self._commands, other._commands, strict=True)):
+            if isinstance(mine, Operation) and isinstance(its, Operation) and mine.content() != its.content():
+                return f"operation {at}: {mine.name()}, {its.name()} before"
+        return ""
+
+
+class LaunchGraph:
+    """What a step launches between two decisions of the host: recorded at the first run, on the CPU then one native call.
+
+    On CUDA, and where launches must go through Warp, `record` is called in each run.
+
+    Args:
+        device: where the kernels run.
+        record: launches by `warp_lcp.rows` what is to be recorded: kernels, `copy`, `clear`. It must not read from the device, nor
+            decide anything by what changes from run to run: `Scalar`, `ActiveWindow` and lists stand for that.
+        at_once: whether to launch in each run instead, as CUDA does.
+    """
+
+    verify: ClassVar[bool] = False  # whether each run records anew and compares: a test finds what changes though it must not
+
+    def __init__(self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False) -> None:
+        self.device, self._record, self.at_once = device, record, at_once or device.is_cuda
+        self._programs: dict[Hashable, Program] = {}
+        self._threads = 0
+
+    def run(self, *arguments: Any, variant: Hashable = None) -> None:
+        """Launch everything, or record that among the launches of a program that is being recorded.
+
+        Args:
+            arguments: of `record`; the same in each run.
+            variant: by what `record` decides which of several sequences it launches; each is recorded once.
+        """
+        if self.at_once or RECORDING.program is not None or team() is None:
+            self._record(*arguments)
+            return
+        if self._threads != get_threads():
+            self._programs, self._threads = {}, get_threads()
+        program = self._programs.get(variant)
+        if program is None:
+            program = self._programs[variant] = self._recorded(arguments)
+        elif LaunchGraph.verify and (other := self._recorded(arguments).differs(program)):
+            raise AssertionError(f"a recorded launch differs: {other}")
+        program.run()
+
+    def forget(self) -> None:
+        """Record anew in the next run: arrays are others."""
+        self._programs = {}
+
+    def _recorded(self, arguments: tuple[Any, ...]) -> Program:
+        program = Program(self.device)
+        with recording(program):
+            self._record(*arguments)
+        return program

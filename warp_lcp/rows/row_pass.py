@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
+from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
 from warp_lcp.rows.native import HEADERS, shared, text
-from warp_lcp.rows.program import Launch, perform
-from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Stage, get_threads, ranges, team
+from warp_lcp.rows.program import Launch, is_recording, perform
+from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, ranges, team
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
@@ -348,8 +349,11 @@ class Form:
         for name in self.types:
             parts[name] = given[name]
         values = {name: given[name] for name in self.declared.numbers}
+        scalars = {name: v for name, v in values.items() if type(v) is Scalar}
         try:
-            return joined(self.blank, parts, self._numbers, values)
+            made = joined(self.blank, parts, self._numbers, {n: value_of(v) for n, v in values.items()} if scalars else values)
+            made.__dict__.update(scalars)  # which recorded launches read
+            return made
         except struct.error as error:
             raise TypeError(f"{self.declared.name}: {', '.join(f'{n} = {v!r}' for n, v in values.items())}: {error}") from None
 
@@ -409,19 +413,36 @@ class Bound(NamedTuple):
         """Launch the pass, or record it."""
         if self.rows.device.is_cuda or team() is None:
             (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
-        elif 0 not in threads(self.layout):
+        elif 0 not in threads(self.layout) or (self.rows.memory is not None and is_recording()):
             perform(self._operation(), launch)
 
     def _operation(self) -> Operation:
         """Return the pass for the team, cut into ranges of tasks."""
-        return ranges(self.stage(), self.layout.grain * self.rows.weight, ordered=self.form.declared.ordered)
+        sized = self.rows.memory.sized if self.rows.memory is not None and is_recording() else 0
+        cost = max(self.layout.grain * self.rows.weight, 1)
+        return ranges(self.stage(), cost, ordered=self.form.declared.ordered, sized=sized)
+
+    def _patches(self) -> list[Patch]:
+        """Return what a recorded launch reads from memory: rows, numbers, and arrays that others replace."""
+        d, native, patches = self.form.declared, type(self.fields.__ctype__()), []
+        if self.rows.memory is not None:
+            patches += self.rows.memory.patches(LAYOUT_BYTES + native.k0.offset if d.box else None)
+        for name in self.form.types:
+            if (slot := getattr(getattr(self.fields, name), "slot", None)) is not None:
+                patches.append((LAYOUT_BYTES + getattr(native, name).offset, slot.address, ARRAY_BYTES))
+        for name, kind in d.numbers.items():
+            if type(number := self.fields.__dict__[name]) is Scalar:
+                kind = self.form.letters[kind] if isinstance(kind, str) else kind
+                patches.append((LAYOUT_BYTES + getattr(native, name).offset, *number.address(kind)))
+        return patches
 
     def stage(self, lag: int = 0, **members: int) -> Stage:
         """Return the pass for the team, as a stage of a wave whose layout has these members."""
         L = put(copy_of(self.layout), members) if members else self.layout
         memory = ctypes.create_string_buffer(bytes(L.__ctype__()) + bytes(self.fields.__ctype__()))
         entry = self.form.entry(L, self.fields)
-        return Stage(entry, memory, self, L.rows * L.chunks, threads(L)[0], lag, max(L.fz, 1), L.n1)
+        patches = self._patches() if is_recording() else ()
+        return Stage(entry, memory, self, L.rows * L.chunks, threads(L)[0], lag, max(L.fz, 1), L.n1, patches)
 
 
 def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:

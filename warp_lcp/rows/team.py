@@ -14,7 +14,7 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import warp as wp
@@ -27,11 +27,12 @@ MOST_THREADS = 1024
 PATIENCE = 50_000_000  # nanoseconds in native code after which the interpreter is asked whether there is a signal
 CELLS = 16384  # of a usual pass that a piece has at least: some microseconds, many times what it costs to take one
 PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
+COPIED = 1 << 18  # bytes that a thread copies at least
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
-ALONE, TASKS, SLABS = range(3)
+ALONE, TASKS, SLABS, COPY = range(4)
 DONE_ALONE, SHARED, RESUMED = range(3)
-TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 56, 64, 24, 11, 8
+TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 56, 64, 24, 12, 8
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED = range(16, 21)
 MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
 LOCKS = ("pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast")
@@ -47,6 +48,9 @@ def work_through(team_: wp.uint64, table_: wp.uint64, mode: int, me: int, share:
 def team_kernel(team: wp.uint64, table: wp.uint64, mode: int, me: int, share: int, limit: wp.int64):
     """Do what `mode` asks of thread `me`; one thread."""
     work_through(team, table, mode, me, share, limit)
+
+
+Patch = tuple[int, int, int]  # a part of a kernel's arguments that is read from memory: offset in them, address, bytes
 
 
 class Arguments(ctypes.Structure):
@@ -84,17 +88,34 @@ class Stage:
         lag: planes that it is behind the first stage of a wave.
         finer: planes of the finer level that one of its planes stands for.
         finer_planes: their number.
+        patches: parts of the arguments that are read from memory in each run: offset, address, bytes.
     """
 
     def __init__(
         self, entry: Entry, memory: Any, kept: Any, plane_tasks: int = 1, planes: int = 1, lag: int = 0, finer: int = 1,
-        finer_planes: int = 0,
+        finer_planes: int = 0, patches: Sequence[Patch] = (),
     ) -> None:  # fmt: skip
-        self.kept, self.tasks, self.planes = (entry, memory, kept), plane_tasks * planes, planes
+        listed = _words(len(patches), *(word for patch in patches for word in patch)) if patches else None
+        self.kept, self.tasks, self.planes = (entry, memory, kept, listed), plane_tasks * planes, planes
+        self.patches = tuple(patches)
         size = ctypes.sizeof(memory)
         if size > ROOM:
             raise ValueError(f"a kernel's arguments take {size} bytes: expected at most {ROOM}")
-        self.words = entry.call, entry.bounds, ctypes.addressof(memory), size, plane_tasks, planes, lag, finer, finer_planes, 0
+        where = 0 if listed is None else ctypes.addressof(listed)
+        self.words = entry.call, entry.bounds, ctypes.addressof(memory), size, plane_tasks, planes, lag, finer, finer_planes, where
+
+    def content(self) -> tuple[Any, ...]:
+        """Return what it does: the kernel, its arguments but for what is patched, and the patches; of a copy, its words."""
+        if not isinstance(self.kept, tuple) or not isinstance(self.kept[0], Entry):
+            return self.words
+        memory = bytearray(self.kept[1])
+        for offset, _, size in self.patches:
+            memory[offset : offset + size] = bytes(size)
+        return self.words[0], bytes(memory), self.patches
+
+
+def _words(*words: int) -> Any:
+    return (ctypes.c_uint64 * len(words))(*words)
 
 
 class Operation:
@@ -104,35 +125,64 @@ class Operation:
         check: raises what has failed in it, once the table is done; None: nothing can.
 
     Args:
-        kind: ALONE for a launch as it is; TASKS, SLABS for what is cut.
+        kind: ALONE for a launch as it is; TASKS, SLABS for what is cut; COPY for memory.
         stages: what is launched.
         chunks: into how many pieces it is cut.
         each: tasks, or planes, of a piece.
         everything: tasks, or planes, in all.
         margin: planes that the last stage of a wave is behind the first.
+        sized: address of the number of tasks, which may differ from run to run; 0: it is `everything`.
     """
 
-    __slots__ = ("_kept", "_stages", "check", "chunks", "words")
+    __slots__ = ("_kept", "_stages", "check", "chunks", "sized", "words")
 
-    def __init__(self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0) -> None:
+    def __init__(
+        self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0, sized: int = 0
+    ) -> None:
         made = [word for stage in stages for word in stage.words]
         self._stages, self._kept, self.chunks = (ctypes.c_uint64 * len(made))(*made), stages, chunks
         self.check: Callable[[], object] | None = None
-        self.words = kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks
+        self.words, self.sized = (kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks), sized
+
+    def content(self) -> tuple[Any, ...]:
+        """Return what it does, but for what it reads from memory in each run."""
+        return (self.words[0], self.sized, *(stage.content() for stage in self._kept))
+
+    def name(self) -> str:
+        """Return the names of its kernels."""
+        return ", ".join(stage.kept[0].kernel.key if self.words[0] != COPY else "copy" for stage in self._kept)
 
 
-def ranges(stage: Stage, cells: int, *, ordered: bool = False) -> Operation:
+def ranges(stage: Stage, cells: int, *, ordered: bool = False, sized: int = 0) -> Operation:
     """Return a stage cut into ranges of its tasks.
 
     Args:
         stage: what is launched.
         cells: what a task costs, in cells of a usual pass.
         ordered: whether tasks write what others read or write: then it is not cut.
+        sized: address of the number of tasks in each run; 0: it is the stage's.
     """
-    each = max(-(-stage.tasks // (PIECES * get_threads())), -(-CELLS // cells))
-    if ordered or get_threads() == 1:
-        each = stage.tasks
+    threads = 1 if ordered else get_threads()
+    if sized:
+        return Operation(TASKS, [stage], PIECES * threads if threads > 1 else 1, -(-CELLS // max(cells, 1)), stage.tasks, sized=sized)
+    each = stage.tasks if threads == 1 else max(-(-stage.tasks // (PIECES * threads)), -(-CELLS // cells))
     return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
+
+
+def copied(to: int, source: int, size: int, kept: Any) -> Operation:
+    """Return the copy of some bytes as an operation.
+
+    Args:
+        to: address.
+        source: address; 0: zeros.
+        size: bytes.
+        kept: what must live as long.
+    """
+    stage = object.__new__(Stage)
+    stage.kept, stage.tasks, stage.planes, stage.patches = kept, 1, 1, ()
+    stage.words = source, 0, to, size, 1, 1, 0, 1, 0, 0
+    each = max(size if get_threads() == 1 else -(-size // get_threads() // 64) * 64, COPIED)
+    return Operation(COPY, [stage], max(-(-size // each), 1), each, size)
 
 
 class Table:
@@ -153,7 +203,7 @@ class Table:
         total, made = 0, []
         for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
             total += operation.chunks
-            made += [total, *operation.words, count, self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)]
+            made += [total, *operation.words, count, self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count), operation.sized]
             at += size
         self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = made
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.native import HEADERS, text
-from warp_lcp.rows.program import Launch, Task
+from warp_lcp.rows.program import Launch, Task, copy
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.team import Operation
 
@@ -253,6 +253,6 @@ def rows_of(field: wp.array[Any]) -> Rows:
 def convert(a: wp.array[Any], b: wp.array[Any]) -> None:
     """b = a, between float types."""
     if a.dtype is b.dtype:
-        wp.copy(b, a)
+        copy(b, a)
     else:
         CONVERT.bind(rows_of(a), a=a, b=b).launch()

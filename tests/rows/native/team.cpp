@@ -1,4 +1,5 @@
 // The team compiled by itself, for ThreadSanitizer: tables of cut and whole operations, run, resumed and cancelled, threads that come late.
+#include <cstddef>
 #include <cstdio>
 #include <cstring>
 #include <pthread.h>
@@ -38,18 +39,21 @@ int main() {
     for (int me = 1; me < SIZE; ++me) others.emplace_back([&, me] { work_through((U)team.data(), 0, 1, me, 0, 0); });
 
     std::vector<int> cells(2*CELLS_, 0), expected(2*CELLS_, 0);
-    Arguments plus{0, 0, 0, cells.data(), 3, 0}, twice{0, 0, 0, cells.data(), 2, 0}, none{0, 0, 0, cells.data(), 1, 0};
+    Arguments plus{0, 0, 0, cells.data(), 0, 0}, twice{0, 0, 0, cells.data(), 2, 0}, none{0, 0, 0, cells.data(), 1, 0};
     auto stage = [](void (*f)(void*, void*), Arguments* a, U lag) {
         return std::vector<U>{(U)f, 0, (U)a, sizeof(Arguments), 1, CELLS_, lag, 1, 0, 0}; };
     std::vector<U> first = stage(add, &plus, 0), wave = stage(add, &twice, 0), last = stage(all, &none, 0), after = stage(next, &none, 1);
+    int three = 3; const U tasks = CELLS_;  // a number that the first operation reads when it runs, and how many tasks it has
+    const U patches[] = {1, offsetof(Arguments, value), (U)&three, sizeof(int)};
+    first[9] = (U)patches;
     wave.insert(wave.end(), after.begin(), after.end());
-    enum { SLABS_ = 8, PIECES_ = 16, LANES_ = 3, WORDS_ = 11, LANE_ = 8 };
+    enum { SLABS_ = 8, PIECES_ = 16, LANES_ = 3, WORDS_ = 12, LANE_ = 8 };
     const U each = CELLS_/SLABS_;
     std::vector<U> table(24 + 3*WORDS_ + 3*LANE_*LANES_ + SLABS_);
     U *words = &table[24], *taken = words + 3*WORDS_, *cuts = taken + 3*LANE_*LANES_;
-    const U made[3][WORDS_] = {{PIECES_, 1, (U)first.data(), 1, CELLS_/PIECES_, CELLS_, 0, PIECES_, LANES_, (U)taken, 0},
-        {PIECES_ + SLABS_, 2, (U)wave.data(), 2, each, CELLS_, 1, SLABS_, LANES_, (U)(taken + LANE_*LANES_), (U)cuts},
-        {PIECES_ + SLABS_ + 1, 0, (U)last.data(), 1, 0, 0, 0, 1, 1, (U)(taken + 2*LANE_*LANES_), 0}};
+    const U made[3][WORDS_] = {{PIECES_, 1, (U)first.data(), 1, 1, 0, 0, PIECES_, LANES_, (U)taken, 0, (U)&tasks},
+        {PIECES_ + SLABS_, 2, (U)wave.data(), 2, each, CELLS_, 1, SLABS_, LANES_, (U)(taken + LANE_*LANES_), (U)cuts, 0},
+        {PIECES_ + SLABS_ + 1, 0, (U)last.data(), 1, 0, 0, 0, 1, 1, (U)(taken + 2*LANE_*LANES_), 0, 0}};
     memcpy(words, made, sizeof(made));
     table[16] = 3; table[17] = made[2][0]; table[18] = (U)words;
     int wrong = 0, resumed = 0;

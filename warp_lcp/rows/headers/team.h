@@ -7,12 +7,12 @@
 #ifndef __CUDA_ARCH__
 typedef unsigned long long Word; typedef long long Long; typedef void (*Call)(void*, void*);
 enum { RUN, SERVE, CANCEL, QUIT };                                                                    // what is asked for
-enum { ALONE, TASKS, SLABS };                                                                         // operations
+enum { ALONE, TASKS, SLABS, COPY };                                                                   // operations
 enum { POSTED = 0, TABLE = 1, QUITS = 8, SLEEPERS = 16, MUTEX = 24, CONDITION = 40, CALLS = 56, THREADS = 64 };  // words of a team
 enum { YIELD, CLOCK, NAP, LOCK, UNLOCK, WAIT, WAKE, CLOCK_NUMBER };                                   // functions of the system, from CALLS on
 enum { RUNS = 0, DONE = 8, COUNT = 16, TOTAL = 17, OPERATIONS = 18, SHARED = 19, UNFINISHED = 20 };     // words of a table
-enum { END, KIND, STAGES, STAGE_COUNT, EACH, ALL, MARGIN, CHUNKS, LANES, TAKEN, CUTS, WORDS };         // of an operation
-enum { FUNCTION, BOUNDS, ARGUMENTS, BYTES, PLANE_TASKS, PLANES, LAG, FINER, FINER_PLANES, STAGE_WORDS = 10 };  // of a stage
+enum { END, KIND, STAGES, STAGE_COUNT, EACH, ALL, MARGIN, CHUNKS, LANES, TAKEN, CUTS, SIZED, WORDS };  // of an operation
+enum { FUNCTION, BOUNDS, ARGUMENTS, BYTES, PLANE_TASKS, PLANES, LAG, FINER, FINER_PLANES, PATCHES, STAGE_WORDS };  // of a stage
 enum { LANE_WORDS = 8, MOST = 4, ROOM = 4096, SPINS = 2000, YIELDS = 1000, IDLE_YIELDS = 4000 };
 Word* T = (Word*)team_; Word* H = (Word*)table_;
 const auto get = [](const Word* w) { return __atomic_load_n(w, __ATOMIC_SEQ_CST); };
@@ -32,7 +32,13 @@ const auto wake = [=] { call(LOCK, (void*)(T + MUTEX)); call(WAKE, (void*)(T + C
 
 const auto take = [](const Word* made, char* arguments) {  // arguments of our own, which begin with the range of tasks
     const Word* from = (const Word*)made[ARGUMENTS]; Word* to = (Word*)arguments;
-    for (Word w = 0; w < (made[BYTES] + 7) / 8; ++w) to[w] = from[w]; };
+    for (Word w = 0; w < (made[BYTES] + 7) / 8; ++w) to[w] = from[w];
+    const Word* patch = (const Word*)made[PATCHES];  // what changes from run to run is read where it stands: windows, lists, numbers
+    if (!patch) return;
+    for (Word left = *patch++; left > 0; --left, patch += 3) __builtin_memcpy(arguments + patch[0], (const void*)patch[1], patch[2]); };
+const auto copy = [](const Word* made, Long begin, Long end) {  // bytes of a field, or zeros
+    const char* from = (const char*)made[FUNCTION]; char* to = (char*)made[ARGUMENTS];
+    if (from) __builtin_memcpy(to + begin, from + begin, end - begin); else __builtin_memset(to + begin, 0, end - begin); };
 const auto run = [](const Word* made, char* arguments, Long begin, Long end) {
     ((int*)arguments)[0] = (int)begin; ((int*)arguments)[1] = (int)end;
     ((Call)made[FUNCTION])((void*)made[BOUNDS], arguments); };
@@ -92,11 +98,18 @@ const auto work = [=](const Word* op, Word runs, Long c) -> Word {  // on a chun
     const Word* stages[MOST];
     for (int s = 0; s < (int)op[STAGE_COUNT]; ++s) {
         stages[s] = (const Word*)op[STAGES] + s*STAGE_WORDS;
-        if (op[KIND] != ALONE) take(stages[s], room[s]); }
-    const Long each = (Long)op[EACH], all = (Long)op[ALL];
+        if (op[KIND] == TASKS || op[KIND] == SLABS || (op[KIND] == ALONE && stages[s][PATCHES])) take(stages[s], room[s]); }
     if (op[KIND] == SLABS) return stream(op, runs, c, stages, room);
-    if (op[KIND] == ALONE) ((Call)stages[0][FUNCTION])((void*)stages[0][BOUNDS], (void*)stages[0][ARGUMENTS]);
-    else run(stages[0], room[0], c*each, (c + 1)*each < all ? (c + 1)*each : all);
+    const Word* made = stages[0];
+    if (op[KIND] == ALONE) {
+        ((Call)made[FUNCTION])((void*)made[BOUNDS], made[PATCHES] ? (void*)room[0] : (void*)made[ARGUMENTS]);
+        return 1; }
+    // tasks whose number is known when they run are cut into as many chunks as the largest number of them was
+    const Long all = op[SIZED] ? *(const Long*)op[SIZED] : (Long)op[ALL], share = (all + (Long)op[CHUNKS] - 1) / (Long)op[CHUNKS];
+    const Long each = op[SIZED] && share > (Long)op[EACH] ? share : (Long)op[EACH];
+    const Long begin = c*each, end = begin + each < all ? begin + each : all;
+    if (begin >= end) return 1;
+    if (op[KIND] == COPY) copy(made, begin, end); else run(made, room[0], begin, end);
     return 1; };
 
 const auto help = [=](Word* H, Word runs, Long limit) -> int {  // work through a table; 1: the caller's time is over first

@@ -1,0 +1,125 @@
+"""Memory that recorded launches read when they run: numbers, windows, lists, and where arrays lie.
+
+A launch that is recorded once holds its arguments as bytes. What changes from run to run stands in memory of its owner,
+and a patch of the launch, (offset in the arguments, address, bytes), has it copied into them each time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.rows.layout import RowLayout
+
+_BLANK: Any = RowLayout()
+LAYOUT = type(_BLANK.__ctype__())
+LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
+ARRAY_BYTES = ctypes.sizeof(wp.array(dtype=wp.uint8).__ctype__())
+FORMATS: dict[Any, Any] = {
+    wp.float32: ctypes.c_float, wp.float64: ctypes.c_double, wp.int32: ctypes.c_int32, wp.int64: ctypes.c_int64, wp.bool: ctypes.c_bool,
+    float: ctypes.c_float, int: ctypes.c_int32, bool: ctypes.c_bool,
+}  # fmt: skip
+
+
+class Scalar:
+    """A number that changes between the runs of recorded launches.
+
+    Pass it where a kernel takes a number: a launch that is recorded reads `value` each time it runs, another takes it as it is.
+    """
+
+    __slots__ = ("_cells", "_scaled", "_value")
+
+    def __init__(self, value: float = 0.0) -> None:
+        self._cells: dict[Any, Any] = {}  # the number in each type that kernels take it in
+        self._scaled: dict[float, Scalar] = {}
+        self._value = value
+
+    @property
+    def value(self) -> float:
+        """The number."""
+        return self._value
+
+    @value.setter
+    def value(self, value: float) -> None:
+        self._value = value
+        for cell in self._cells.values():
+            cell.value = value
+        for factor, product in self._scaled.items():
+            product.value = value * factor
+
+    def scaled(self, factor: float) -> Scalar:
+        """Return the number times a factor, which goes along with it."""
+        if factor not in self._scaled:
+            self._scaled[factor] = Scalar(self._value * factor)
+        return self._scaled[factor]
+
+    def address(self, kind: Any) -> tuple[int, int]:
+        """Return the address of the number in one of Warp's types, and its bytes."""
+        kind = FORMATS[kind]
+        if kind not in self._cells:
+            self._cells[kind] = kind(self._value)
+        return ctypes.addressof(self._cells[kind]), ctypes.sizeof(kind)
+
+
+def scaled(number: float | Scalar, factor: float) -> Any:
+    """Return a number times a factor."""
+    return number.scaled(factor) if isinstance(number, Scalar) else number * factor
+
+
+def value_of(number: Any) -> Any:
+    """Return a number, or what a `Scalar` holds now."""
+    return number.value if type(number) is Scalar else number
+
+
+class Slot:
+    """Where an array lies that is replaced by others between runs: the arrays that stand for it have it as their `slot`."""
+
+    __slots__ = ("_memory", "address")
+
+    def __init__(self) -> None:
+        self._memory = ctypes.create_string_buffer(ARRAY_BYTES)
+        self.address = ctypes.addressof(self._memory)
+
+    def point_to(self, array: wp.array[Any]) -> None:
+        """Have recorded launches use this array from now on."""
+        ctypes.memmove(self.address, ctypes.addressof(array.__ctype__()), ARRAY_BYTES)
+        array.slot = self
+
+
+class RowsMemory:
+    """Rows that change between runs: their layout, the first cell of a box, and the number of tasks.
+
+    Attributes:
+        layout: native struct of the layout.
+        place: first (k, j, i) of a box.
+        tasks: of a pass over the rows.
+    """
+
+    __slots__ = ("layout", "place", "tasks")
+
+    def __init__(self) -> None:
+        self.layout = LAYOUT()
+        self.place, self.tasks = (ctypes.c_int32 * 3)(), ctypes.c_int64()
+
+    def patches(self, place: int | None) -> list[tuple[int, int, int]]:
+        """Return what a launch reads; `place`: offset of `k0` in its arguments, None: it has none."""
+        found = [(0, ctypes.addressof(self.layout), LAYOUT_BYTES)]
+        return found if place is None else [*found, (place, ctypes.addressof(self.place), ctypes.sizeof(self.place))]
+
+    @property
+    def sized(self) -> int:
+        """Address of the number of tasks."""
+        return ctypes.addressof(self.tasks)
+
+    def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
+        """Take rows over.
+
+        Args:
+            layout: a RowLayout.
+            place: first (k, j, i).
+        """
+        ctypes.memmove(ctypes.addressof(self.layout), ctypes.addressof(layout.__ctype__()), LAYOUT_BYTES)
+        self.place[:] = list(place)
+        self.tasks.value = -(-layout.planes // max(layout.slab, 1)) * layout.rows * layout.chunks
