@@ -11,9 +11,9 @@ from warp_lcp.grid import level_set_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.particle_loops import on_grid, scatter, touched_planes
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import COPY, StaggeredGrid, Window
+from warp_lcp.grid.staggered import COPY, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
-from warp_lcp.rows.program import clear
+from warp_lcp.rows.program import LaunchGraph, clear
 
 REACH = 1.5  # half the width of a cell's kernel, in cells: beyond it a plane leaves no trace
 QUANTILE = 3.7191  # of the normal distribution at 1 - level_set_kernels.TAIL
@@ -60,6 +60,7 @@ class LevelSet:
         self.phi.fill_(self.limit)
         self._scratch = [grid.field() for _ in range(3)] if smoothing else []
         self._volume: WindowTally | None = None  # made when it is first asked for
+        self._box, self._measuring = ActiveWindow(grid.domain), LaunchGraph(grid.device, self._launch_volume)
         self._measured = False
         self._filled: Window | None = None
 
@@ -123,15 +124,20 @@ class LevelSet:
 
         None: of no cells.
         """
-        grid = self.grid
-        box = window.common(grid.domain) if window is not None else None
+        box = window.common(self.grid.domain) if window is not None else None
         self._measured = box is not None
         if box is None:
             return
         if self._volume is None:
-            self._volume = WindowTally(kernels.VOLUME, grid)
-        found = {"phi": self.phi, "known": self._known, "distance": distance}
-        self._volume.take(box, **found, planes=grid.planes, parts=PARTS[grid.dimension])
+            self._volume = WindowTally(kernels.VOLUME, self.grid)
+        self._box.move_to(box)
+        self._measuring.run(distance, variant=box.near is None)
+        self._volume.changed()
+
+    def _launch_volume(self, distance: wp.array | None) -> None:
+        grid, found = self.grid, {"phi": self.phi, "known": self._known, "distance": distance}
+        assert self._volume is not None
+        self._volume.take(self._box, **found, planes=grid.planes, parts=PARTS[grid.dimension])
 
     @property
     def measured(self) -> float:

@@ -1,7 +1,8 @@
 """Particles in approximate cell order: position, velocity, APIC gradients."""
 
 import typing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -10,8 +11,11 @@ from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import MARGIN, ListMemory, launch, on_grid
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.rows import Rows
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import zeros
+from warp_lcp.rows.memory import RowsMemory, Scalar
+from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Tally
 
 CHUNK = 256  # the fewest particles that one thread adds up
@@ -19,6 +23,11 @@ THREADS = 1024  # the most threads of a sum, each a partial result that the host
 CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
 GROWTH = 1.5  # of the storage when it is full: n appended particles are copied 2 n times at most, a third of it lies idle at most
 SORT_EVERY = 8  # steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL 2, a sort costs 25 ns
+
+ADD_IN_ORDER = RowPass(
+    "warp_lcp.grid.particles.add_in_order", Path(__file__).parent / "headers" / "add_in_order.h", wp.float64,
+    whole={"partials": wp.float64, "results": wp.float64}, numbers={"places_of_sums": int, "sums_": int},
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -124,7 +133,14 @@ class Particles:
         self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device) if indexed else None
         self._names = ["position", "velocity", *(f"affine_{c}" for c in range(grid.dimension if affine else 0))]
         self._names += ["kept"] * (kept is not None)
-        self._totals = Tally(kernels.TOTAL, grid.device, max(THREADS, CUDA_THREADS * grid.device.is_cuda))
+        self._tally, columns = None, len(kernels.TOTAL.found)
+        if grid.device.is_cuda:
+            self._tally = Tally(kernels.TOTAL, grid.device, CUDA_THREADS)
+        else:
+            self._partials = wp.zeros(columns * THREADS, dtype=wp.float64, device=grid.device)
+            self._found, self._total_rows, self._places = Reading(grid.device, columns), RowsMemory(), Scalar()
+            self._totals = LaunchGraph(grid.device, self._launch_totals)
+            self._numbering = LaunchGraph(grid.device, self._launch_numbers)
         self._last: ParticleTotals | None = None
         self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
@@ -231,6 +247,9 @@ class Particles:
     def move_to(self, grid: StaggeredGrid) -> None:
         """Sort the particles by the cells of another grid from now on."""
         self.grid = grid
+        if self._tally is None:
+            self._totals.forget()
+            self._numbering.forget()
         if self.offsets is not None:
             self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
 
@@ -255,6 +274,10 @@ class Particles:
 
     def _publish(self) -> None:
         """Tell recorded launches how many particles there are, and where."""
+        if self._tally is None and self.count != self._memory.count.value:
+            rows = self._rows_of_totals()
+            self._total_rows.take(rows.summed)
+            self._places.value = rows.places
         self._memory.take(self.count, {**self.arrays(), "key": self.key})
 
     def _grow(self, before: int) -> None:
@@ -287,6 +310,12 @@ class Particles:
 
     def number(self) -> None:
         """Find the cell of each particle."""
+        if self._tally is None:
+            self._numbering.run()
+        else:
+            self._launch_numbers()
+
+    def _launch_numbers(self) -> None:
         grid = self.grid
         counts = dict(zip(("nx", "ny", "nz"), grid.counts, strict=True))
         launch(kernels.NUMBER, self.count, grid, position=self.position, key=self.key, **counts)
@@ -314,12 +343,12 @@ class Particles:
             return self._known
         if self.count == 0:
             return ParticleTotals()
-        device = self.grid.device
-        chunk = max(CUDA_CHUNK if device.is_cuda else CHUNK, -(-self.count // (CUDA_THREADS if device.is_cuda else THREADS)))
-        rows = Rows.entries(self.count, device, chunk)
-        self._totals.take(rows, position=self.position, velocity=self.velocity, **on_grid(self.grid))
-        with np.errstate(invalid="ignore"):  # sums of values that are not finite, which are counted
-            total = self._totals.read(in_order)
+        if self._tally is not None:
+            self._tally.take(self._rows_of_totals(), position=self.position, velocity=self.velocity, **on_grid(self.grid))
+            total = self._tally.read()
+        else:
+            self._totals.run()
+            total = self._found.numpy().copy()
         self._last = found = ParticleTotals(
             count=self.count,
             mean_square_speed=float(total[0]) / self.count,
@@ -332,6 +361,20 @@ class Particles:
             low=-total[13:16],
         )
         return found
+
+    def _rows_of_totals(self) -> Rows:
+        """Return how the particles are shared out for sums over them."""
+        device = self.grid.device
+        chunk = max(CUDA_CHUNK if device.is_cuda else CHUNK, -(-self.count // (CUDA_THREADS if device.is_cuda else THREADS)))
+        return Rows.entries(self.count, device, chunk)
+
+    def _launch_totals(self) -> None:
+        """Launch the sums over the particles, and those of the threads' sums."""
+        rows, given = replace(self._rows_of_totals(), memory=self._total_rows), on_grid(self.grid)
+        kernels.TOTAL.bind(rows, position=self.position, velocity=self.velocity, **given, out=self._partials).launch()
+        arrays: dict[str, typing.Any] = {"partials": self._partials, "results": self._found.array}
+        numbers: dict[str, typing.Any] = {"places_of_sums": self._places, "sums_": len(kernels.TOTAL.sums)}
+        ADD_IN_ORDER.bind(Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True), **arrays, **numbers).launch()
 
     def totals_stay(self, stay: bool) -> None:
         """Declare that positions and velocities are unchanged since `totals`.
@@ -354,15 +397,6 @@ class Particles:
     def arrays(self) -> dict[str, wp.array]:
         """Return the arrays of the particles by name."""
         return {name: column.view for name, column in self._columns.items()}
-
-
-def in_order(parts: np.ndarray) -> np.ndarray:
-    """Return the sums over threads in order, shape (columns, 1).
-
-    From partial sums of shape (columns, threads).
-    """
-    sums = len(kernels.TOTAL.sums)
-    return np.append(np.ascontiguousarray(parts[:sums].T).sum(axis=0), parts[sums:].max(axis=1))[:, None]
 
 
 def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:

@@ -29,6 +29,7 @@ class Reading:
     def __init__(self, device: wp.Device, count: int = 1, dtype: Any = wp.float64) -> None:
         self.array: wp.array[Any]
         self._board, self._change = None, 0
+        self._view: np.ndarray | None = None  # of an array that the host reads as it is
         board, size = board_of(device.alias) if device.is_cuda else None, count * wp.types.type_size_in_bytes(dtype)
         place = None if board is None else board.take(size)
         if board is None or place is None:
@@ -47,7 +48,9 @@ class Reading:
     def numpy(self) -> np.ndarray:
         """Return the numbers as they are after all that has been launched, not to be written to."""
         if self._board is None:
-            return self.array.numpy()
+            if self._view is None:
+                self._view = self.array.numpy()
+            return self._view
         return self._board.fetched(self._change)[self._slice].view(self._kind)
 
 
