@@ -40,5 +40,5 @@ F32, F64, U8, I32 = wp.float32, wp.float64, wp.uint8, wp.int32
 
 
 def xyz(**fields: Any) -> dict[str, Any]:
-    """Return the components of vectors by the names `name_x`, `name_y`, `name_z`; None for missing ones."""
+    """Return vector components by `name_x`, `name_y`, `name_z`; None if missing."""
     return {f"{name}_{axis}": field for name, three in fields.items() for axis, field in zip("xyz", [*three, None, None], strict=False)}
