@@ -74,7 +74,7 @@ SINGLE = (
 )  # fmt: skip
 MANY_STAGES = ("warp_lcp.small_levels.*",)  # a hundred times as much is allowed: what one stage rounds, others compute with
 CANCEL = ("warp_lcp.projected_multigrid.undo.*",)  # x less its last step, from 0 nothing but rounding: what counts is how large x is
-ONE_THREAD = ("warp_lcp.grid.transfer_*.scatter.*", "warp_lcp.grid.density.scatter_density.*")  # on a CPU one adds all, see `shares.h`
+ONE_THREAD = ("warp_lcp.grid.transfer_*.scatter.*", "warp_lcp.grid.density.scatter_density.*")  # on a CPU one adds all, see `particles.h`
 
 
 def among(name, patterns):

@@ -23,19 +23,17 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.rows.vectors import convert
 
-HEADERS = Path(__file__).parent / "headers"
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
 THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
 F32, F64, I8, U8 = wp.float32, wp.float64, wp.int8, wp.uint8
 FACES = {f"{what}_{axis}": F32 for what in ("open", "solid") for axis in "xyz"}
-COUNT = RowPass(
-    "fluids.pressure.count_fluid", HEADERS / "count_fluid.h", F64, box={"kind": I8}, constants={"FLUID": FLUID}, sums=("fluid",)
-)
+KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h", CONSTANTS)
+COUNT = KERNELS["fluids.pressure.count_fluid"]
 
 
 @functools.cache
@@ -50,20 +48,8 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
     """
     module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost + "_equations" * (not bounded)
     flags = {"CUT": cut, "MOVING": moving, "GHOST": ghost, "BOUNDED": bounded, "THETA_MIN": THETA_MIN, "TINY_WEIGHT": TINY_WEIGHT}
-
-    def made(name: str, fields: dict[str, Any], numbers: dict[str, Any], **more: Any) -> RowPass:
-        box, optional = {"kind": I8, **FACES, "phi": F32} | fields, (*FACES, "phi", "w", "lower", "shift", "jump")
-        numbers, path = {"planes": int} | numbers, HEADERS / f"{name}.h"
-        return RowPass(f"{module}.{name}", path, F64, box=box, numbers=numbers, constants=CONSTANTS | flags, optional=optional, **more)
-
-    liquid, faces = {"u": F32, "v": F32, "w": F32, "touch": U8}, {"x": F64, "field": F32, "known": I8}
-    problem = {"previous": F64, "b": F64, "lower": F64, "start": F64, "shift": F32, "jump": F32}
-    return SimpleNamespace(
-        prepare=made("prepare", liquid | problem, {"ratio": F64, "adhesion": F64}),
-        subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
-        support=made("support", faces | {"weight": F32, "jump": F32}, {"axis": int, "limit": F32}),
-        contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, sums=("released",), largest=("worst",)),
-    )
+    names = ("prepare", "subtract_gradient", "support", "contact")
+    return SimpleNamespace(**{name: KERNELS.kernel(f"fluids.pressure.{name}", module=module, constants=flags) for name in names})
 
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of an outflow, relative to the speeds it is the difference of (float32 faces)

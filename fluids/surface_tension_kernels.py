@@ -7,14 +7,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warp_lcp.fluids.pressure import CONSTANTS, F32, FACES, I8, THETA_MIN
+from warp_lcp.fluids.pressure import CONSTANTS, THETA_MIN
 from warp_lcp.grid.cell_kernel import F32 as FIELD
 from warp_lcp.grid.cell_kernel import I8 as MARKS
 from warp_lcp.grid.cell_kernel import INTS, POINTS, cell_kernel, list_kernel
-from warp_lcp.grid.particle_loops import cell_pass
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 
-HEADERS = Path(__file__).parent / "headers"
 MODULE = "fluids.surface_tension"
 FLOATS = wp.array(dtype=wp.float32)
 TAIL = wp.constant(1e-6)  # shares nearer to 0 or 1 have no place on the profile
@@ -25,30 +23,19 @@ BAND = 0.02  # cells whose share is nearer to 0 or 1 are too far from the surfac
 HALF = 0.3  # the part of the shares on either side of the surface that its area is found from
 FARTHEST = 1.5  # cells from one beside the surface to the smooth surface
 PROFILE = {"planes": int, "linear": wp.float32, "cubic": wp.float32}  # of the distance that a smooth share means
-_SHARES = {"headers": HEADERS, "constants": CONSTANTS | {"BAND": BAND, "FARTHEST": FARTHEST}}
-CURVATURE = cell_pass(f"{MODULE}.curvature", "once twice bend", numbers={**PROFILE, "limit": wp.float32}, **_SHARES)
-JUMP = cell_pass(f"{MODULE}.jump", "once twice bend jump", {"kind": wp.int8}, numbers={**PROFILE, "scale": wp.float32}, **_SHARES)
+KERNELS = KernelFile(
+    Path(__file__).parent / "headers/surface_tension.h",
+    CONSTANTS | {"BAND": BAND, "FARTHEST": FARTHEST, "THETA_MIN": THETA_MIN, "HALF": HALF},
+)
+CURVATURE = KERNELS["fluids.surface_tension.curvature"]
+JUMP = KERNELS["fluids.surface_tension.jump"]
 
 
 @functools.cache
 def push_pass(cut: bool) -> SimpleNamespace:
     """Return `push`, which acts on the velocity, and `energy`, which sums the surface up; `cut`: whether faces have open fractions."""
-    module = MODULE + "_cut" * cut
-    flags = {"CUT": cut, "MOVING": False, "GHOST": True, "BOUNDED": False, "THETA_MIN": THETA_MIN, "HALF": HALF}
-    surface, numbers = {"kind": I8, **FACES, "phi": F32}, {"planes": int}
-    optional = (*FACES,)
-
-    def made(name: str, compute: object, fields: dict, **more: object) -> RowPass:
-        taken = numbers | more.pop("numbers", {})
-        path = HEADERS / f"{name}.h"
-        return RowPass(
-            f"{module}.{name}", path, compute, box=surface | fields, numbers=taken, constants=CONSTANTS | flags, optional=optional, **more
-        )
-
-    return SimpleNamespace(
-        push=made("push", F32, {"jump": F32, "field": F32}, numbers={"axis": int}),
-        energy=made("surface_energy", wp.float64, {"once": F32, "twice": F32}, numbers=PROFILE, sums=("area", "wetted")),
-    )
+    made = functools.partial(KERNELS.kernel, module=MODULE + "_cut" * cut, constants={"CUT": cut, "MOVING": False, "GHOST": True})
+    return SimpleNamespace(push=made("fluids.surface_tension.push"), energy=made("fluids.surface_tension.surface_energy"))
 
 
 @wp.func

@@ -9,12 +9,12 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Across, Reduction, convert, rows_of
 
-f64 = wp.float64
-CHANGE = RowPass("tolerance.change", Path(__file__).parent / "headers" / "change.h", f64, reads={"x": f64}, writes={"guess": f64})
+KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h")
+CHANGE = KERNELS["tolerance.change"]
 FRACTION = 0.1  # of the time step's error that the solve may leave
 FIRST = 1e-4  # relative residual of the first steps, before which there is no change to measure: a liquid that is at rest shall stay so
 LEAST = 1e-6  # relative residual than which none is asked to be smaller: rounding on the faces is what is left then

@@ -5,16 +5,11 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
-
-import warp as wp
 
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile, RowPass
 
-HEADERS = Path(__file__).parent / "headers"
-F32, I8, U8 = wp.float32, wp.int8, wp.uint8
 CLOSE = 1e-3  # cells: a face within it of a wall, or behind it, has the wall's velocity
 THETA = 0.02  # cells: the shortest link to a wall
 ALIKE = 1.001  # viscosities at most as far apart are one
@@ -23,10 +18,8 @@ ALONG = 0.95  # of a cell that the distance changes by from face to face: the wa
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
 SHIFT = "shift_x shift_y shift_z"  # cells from one less than twice a coarse cell to the finer level's first one in it, in parts of grids
 LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE}
-
-
-def _fields(names: str, dtype: Any = F32) -> dict[str, Any]:
-    return dict.fromkeys(names.split(), dtype)
+KERNELS = KernelFile(Path(__file__).parent / "headers/viscosity.h", KINDS | LIMITS)
+LEVELS = KernelFile(Path(__file__).parent / "headers/viscosity_multigrid.h", {"ALIKE": CORE})
 
 
 @functools.cache
@@ -40,64 +33,23 @@ def viscous_passes(dimension: int, cut: bool = False, ghost: bool = False, movin
         moving: whether solids have velocities.
         varies: whether viscosities differ.
     """
-    deep = dimension == 3
+    area, deep = f"fluids.viscosity_{dimension}d", dimension == 3
+    walls, flags = "_cut" * cut + "_ghost" * ghost + "_moving" * moving, {"CUT": cut, "GHOST": ghost, "MOVING": moving}
 
-    def made(name: str, box: dict[str, Any], numbers: str, *, apart: str = "", **more: Any) -> RowPass:
-        types = {word: F32 if word in ("scale", "dx") else int for word in numbers.split()}
-        module = f"fluids.viscosity_{dimension}d{apart}"
-        return RowPass(f"{module}.{name}", HEADERS / f"viscous_{name}.h", F32, box=box, numbers=types, **more)
+    def near(name: str, apart: str = "", **more: bool) -> RowPass:
+        return KERNELS.kernel(f"fluids.viscosity.{name}", module=area + walls + apart, constants=flags | more)
 
-    walls = "_cut" * cut + "_ghost" * ghost + "_moving" * moving
-    macros = KINDS | LIMITS | {"CUT": cut, "GHOST": ghost, "MOVING": moving}
-    cells: dict[str, Any] = {"kind": I8, "contact": U8}
-    stencil, row = _fields("x y z xb xc cell mixed diagonal"), {"span": wp.int32}
-    spans: dict[str, Any] = {"whole": row, "optional": ("z", "xc", "right")}
-    carried: dict[str, Any] = {"whole": _fields("coarse") | row, "optional": ("diagonal", "x")}
-    sums: dict[str, Any] = {"sums": ("residual", "taken", "given_by_walls", "stiff")}
-    near: dict[str, Any] = {"apart": walls, "constants": macros}
+    def plain(name: str) -> RowPass:
+        return KERNELS.kernel(f"fluids.viscosity.{name}", module=area)
+
+    def level(name: str, apart: str = "", **constants: bool) -> RowPass:
+        return LEVELS.kernel(f"fluids.viscosity.{name}", module=area + apart, constants=constants)
+
     return SimpleNamespace(
-        distance=made(
-            "distance", _fields("out hold nodes") | {"kind": I8, "wall": wp.int16, "index": wp.int32}, "axis planes walls",
-            whole={"slip": F32}, optional=("nodes", "kind", "wall", "index"), **near,
-        ),
-        weights=made(
-            "weights", _fields("cell mixed xy xz yz vx vy vz dx dy dz hx hy hz phi mx my mz") | cells, "planes scale",
-            optional=("xz", "yz", "vz", "dz", "hz", "phi", "mx", "my", "mz"), apart=walls + "_varies" * varies,
-            constants=macros | {"VARIES": varies},
-        ),
-        diagonal=made(
-            "diagonal", _fields("diagonal drag held d h cell xb xc volume") | cells, "axis planes", optional=("xc",), **near
-        ),
-        force=made(
-            "force",
-            _fields("r diagonal u ub uc d h db dc cell mixed xb xc volume change own solid_b solid_c")
-            | cells | {"wall": wp.int16, "base": I8},
-            "axis planes before_x before_y before_z dx", whole=_fields("turn shift"),
-            optional=("uc", "dc", "xc", "change", "own", "solid_b", "solid_c", "wall", "turn", "shift"), **sums, **near,
-        ),
-        links=made(
-            "links",
-            _fields("d h db dc cell mixed xb xc diagonal") | cells | _fields("wall wall_b wall_c", wp.int16) | {"index": wp.int32},
-            "axis planes before_x before_y before_z dx width from_",
-            whole=_fields("counts offsets entry_rows blocks body", wp.int32) | _fields("values center", wp.float64),
-            optional=("dc", "wall", "wall_b", "wall_c", "index", "xc", "offsets", "entry_rows", "blocks", "values"), **near,
-        ),
-        cover=made("cover", _fields("total u hold h own") | {"kind": I8, "base": I8}, "axis", optional=("own",), **near),
-        add=made("add", _fields("u total more"), ""),
-        sum=made("sum", _fields("u kept more"), ""),
-        span=made("span", _fields("dx dy dz"), "", whole=row | {"ends": wp.int32}, optional=("dz", "ends"), constants={"ALIKE": CORE}),
-        sweep=made(
-            "sweep", stencil | _fields("b scratch"), "axis color order only band", constants={"DEPTH": deep}, whole=row,
-            optional=("z", "xc"),
-        ),
-        product=made("apply", stencil | _fields("out right"), "axis", constants={"DEPTH": deep, "RESIDUAL": False}, **spans),
-        residual=made(
-            "apply", stencil | _fields("out right"), "axis", apart="_residual", constants={"DEPTH": deep, "RESIDUAL": True}, **spans
-        ),
-        average=made("average", _fields("out"), f"planes faces scale {SHIFT}", whole={"fine": F32}),
-        close=made("close", _fields("out"), f"axis planes {SHIFT}", whole={"fine": F32}),
-        coarse_diagonal=made("coarse_diagonal", _fields("diagonal there h volume drag cell xb xc"), "axis planes", optional=("xc",)),
-        normalize=made("prolong", _fields("norm diagonal x"), f"axis planes {SHIFT}", apart="_norm", constants={"NORM": True}, **carried),
-        prolong=made("prolong", _fields("norm diagonal x"), f"axis planes {SHIFT}", constants={"NORM": False}, **carried),
-        restrict=made("restrict", _fields("out diagonal"), f"axis planes {SHIFT}", whole=_fields("fine norm") | row),
+        distance=near("distance"),
+        weights=near("weights", "_varies" * varies, VARIES=varies), diagonal=near("diagonal"), force=near("force"),
+        links=near("links"), cover=near("cover"), add=plain("add"), sum=plain("sum"), span=level("span"), sweep=level("sweep", DEPTH=deep),
+        product=level("apply", RESIDUAL=False, DEPTH=deep), residual=level("apply", "_residual", RESIDUAL=True, DEPTH=deep),
+        average=level("average"), close=level("close"), coarse_diagonal=level("coarse_diagonal"),
+        normalize=level("prolong", "_norm", NORM=True), prolong=level("prolong", NORM=False), restrict=level("restrict"),
     )  # fmt: skip

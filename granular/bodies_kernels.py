@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.granular.stress_kernels import CELLS, MOMENTUM, STEP, STRESSES
-from warp_lcp.granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL, WALLS, sand_pass, xyz
+from warp_lcp.granular.stress_kernels import KERNELS
+from warp_lcp.granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL
 from warp_lcp.rows.layout import make_struct, put
 
 _INTS, _BYTES, _REALS = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8), wp.array(dtype=wp.float64)
@@ -242,9 +242,7 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
         along, across = entry(u, a, i) - entry(u, a, i - grid.strides[b]), entry(u, b, i) - entry(u, b, i - grid.strides[a])
         set_entry(rates, d, i, along + across)
 
-    edges = xyz(edge=[real] * 3)
-    made = functools.partial(sand_pass, name, dimension=dimension, real=real, BOX=box, RATE=rate, RESIDUAL=0, TRIAL=1, **MOMENTUM)
-    cells, entries = {"cell": wp.int32, "spans": wp.int32, **STEP}, {**WALLS, **STRESSES, **edges, **xyz("share", "inverse"), **STEP}
-    trial = made("step", box={"flags": wp.uint8, **CELLS, **edges, **xyz(u=[real] * 3)}, whole=cells, listed="cell")
-    trial_wall = made("wall_step", box={"active": wp.int32}, whole=entries)
+    words = {"DIM": dimension, "BOX": box, "RATE": rate, "RESIDUAL": 0, "TRIAL": 1}
+    made = functools.partial(KERNELS.kernel, module=f"granular.{name}", compute=real, constants=words)
+    trial, trial_wall = made("granular.bodies.step"), made("granular.bodies.wall_step")
     return SimpleNamespace(move=move, strain=strain, trial=trial, trial_wall=trial_wall)

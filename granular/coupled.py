@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -14,8 +15,8 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_kernels import PERIOD
-from warp_lcp.granular.yield_set import F32, I32, U8, WALLS, sand_pass, xyz
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.granular.yield_set import CONSTANTS, xyz
+from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.settings import Count, CountOrZero, NonNegative, Positive, Relaxation, Settings, ShareOrZero, renamed_names
 
 BETTER = 0.95  # of the best estimate: progress
@@ -25,6 +26,7 @@ SWING = 1.9  # 1 - momentum, times the cells of a side, of cold solves: with les
 # wave, a quarter of which fits into a column's depth, swings back, and walls hold down what they have let rise; friction asks for more
 STILL = 1e-2  # of the tolerance, which leaves sand at rest
 APART = 3  # cells along an axis, so that two threads change no velocity in common: what a cell changes reaches two cells far
+KERNELS = KernelFile(Path(__file__).parent / "headers/sweeps.h", CONSTANTS)
 
 
 class StressWorkspace:
@@ -232,14 +234,11 @@ def _sweep(stress: Stress, passed: RowPass, **given: Any) -> None:
 @functools.cache
 def interleaved_passes(dimension: int, box: bool = False, rate: bool = False, listed: bool = False) -> SimpleNamespace:
     """Return the sweep kernels in 2-D or 3-D; `listed`: over a list of cells."""
-    module = f"interleaved_{dimension}d{'_box' * box}{'_rate' * rate}{'_listed' * listed}"
-    made = functools.partial(sand_pass, module, dimension=dimension, real=F32, numbers={"omega": F32}, BOX=box, RATE=rate)
-    cells, moved = {"flags": U8, "now": F32}, xyz("inverse", "u")
-    lists: dict[str, Any] = {"whole": {"numbers": F32} | ({"cells": I32} if listed else {}), "listed": "cells" if listed else ""}
+    module = f"granular.interleaved_{dimension}d{'_box' * box}{'_rate' * rate}{'_listed' * listed}"
+    made = functools.partial(KERNELS.kernel, module=module, constants={"DIM": dimension, "BOX": box, "RATE": rate})
+    area = "granular.interleaved" + "_listed" * listed
     return SimpleNamespace(
-        pressure=made("sweep_pressure", box={**cells, "drive": F32, "share_x": F32, **xyz("mass"), **moved}, **lists),
-        friction=made("sweep_friction", box={**cells, "stiff": F32, **xyz("share"), **moved}, **lists),
-        wall=made("sweep_walls", box={"cells": I32}, whole={**WALLS, **cells, **xyz("share"), **moved, "numbers": F32}),
+        pressure=made(f"{area}.sweep_pressure"), friction=made(f"{area}.sweep_friction"), wall=made("granular.interleaved.sweep_walls")
     )
 
 

@@ -2,27 +2,25 @@
 """Kernels of what is told of a step: how near each cell is to yielding, what friction takes, and what holds sand to walls."""
 
 import functools
+from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.granular.yield_set import sand_pass, xyz
+from warp_lcp.granular.yield_set import CONSTANTS
 from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile, RowPass
 
 RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
+KERNELS = KernelFile(Path(__file__).parent / "headers/stress.h", CONSTANTS | {"RATIO_YIELDS": RATIO_YIELDS})
 
 
 @functools.cache
 def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> RowPass:
     """Return the pass for 2 or 3 dimensions; friction grows with the rate of shear; solids cut cells."""
-    vectors = xyz("share", "mass", "inverse", edge=[wp.float64] * 3, u=[wp.float64] * 3)
-    fields = {"flags": wp.uint8, **dict.fromkeys(("now", "drive", "stiff", "ratio", "openings"), wp.float32), **vectors}
-    found = {"sums": ("cells", "yielded", "taken"), "largest": ("most",)}
-    module = f"report_{dimension}d{'_rate' * rate}{'_cut' * cut}"
-    whole, words = {"numbers": wp.float32}, {"RATE": rate, "CUT": cut, "RATIO_YIELDS": RATIO_YIELDS}
-    return sand_pass(module, "report", dimension, wp.float64, fields, whole=whole, **found, **words)
+    module = f"granular.report_{dimension}d{'_rate' * rate}{'_cut' * cut}"
+    return KERNELS.kernel("granular.report.report", module=module, constants={"DIM": dimension, "RATE": rate, "CUT": cut})
 
 
 @cell_kernel("granular.report")

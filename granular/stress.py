@@ -13,7 +13,7 @@ import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.solids import Walls
-from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
+from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, momentum_kernel, stress_passes
 from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
 from warp_lcp.rows import Rows
 from warp_lcp.rows.program import Launch, Program
@@ -105,13 +105,13 @@ class Stress(wl.VariationalInequality):
     for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never
     denser than 1, and friction takes as much energy as it can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2.
     On a face of a solid the shear stress is within mu times the normal load (Coulomb), and within what the sand beside it bears there: a
-    rougher wall makes the sand fail (`headers/wall_bound.h`).
+    rougher wall makes the sand fail (snippet `wall_bound` of `headers/sand.h`).
 
     So it is a quasi-variational inequality, over the product of x >= 0 and of the slices of the cones that hold each cell's s at its x; its
     natural residual is how far (x, s) - P((x, s) - y/d) lies from 0, y = (w, -E u), P onto x >= 0 first and then onto the slice at that x.
     It is not the projection onto the cones themselves, which would let sand push itself apart as it shears (an associated flow rule, whose
     normal velocity is k times the slip). `wl.solve` solves it, by the methods of `granular.coupled`. Gradient, projection and momentum of
-    a cell are one pass over memory (`headers/step.h`): that is why neither y nor P stand here alone.
+    a cell are one pass over memory (`granular.stress.step` in `headers/stress.h`): that is why neither y nor P stand here alone.
 
     Args:
         packing: where sand is.
@@ -293,7 +293,7 @@ class Stress(wl.VariationalInequality):
 
     @property
     def _stresses(self) -> dict[str, Any]:
-        return dict(zip(STRESSES, (self.now, self._before, self._point), strict=True))
+        return dict(zip(("now", "before", "point"), (self.now, self._before, self._point), strict=True))
 
     @property
     def _step(self) -> dict[str, Any]:

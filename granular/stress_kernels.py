@@ -9,12 +9,14 @@ changes. Only cells deep in dense sand take part, away from solids that cut cell
 """
 
 import functools
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.granular.yield_set import COLUMNS, F32, F64, I32, U8, WALLS, sand_pass, xyz
+from warp_lcp.granular.yield_set import COLUMNS, CONSTANTS, F64
+from warp_lcp.rows import KernelFile
 
 # The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
 # residuals over the last PERIOD steps; sums over these; 1 less the most that the momentum may grow to.
@@ -24,9 +26,7 @@ DAMPED = 0.15  # of the checkerboard, in a step
 HIGH, LOW = 0.85, 0.5  # cosines above and below which the momentum grows and falls
 
 MOMENTUM: dict[str, Any] = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S}
-STEP = {"momentum": F64, "numbers": F32}
-STRESSES = dict.fromkeys(("now", "before", "point"), F32)
-CELLS = STRESSES | {"drive": F32, "stiff": F32, "openings": F32} | xyz("share", "mass", "inverse")
+KERNELS = KernelFile(Path(__file__).parent / "headers/stress.h", CONSTANTS | MOMENTUM | {"DAMPED": DAMPED})
 
 
 @functools.cache
@@ -34,23 +34,12 @@ def stress_passes(dimension: int, real: Any, *, box: bool = False, rate: bool = 
     """Return the passes for 2 or 3 dimensions: with velocities of float32 of a step, of float64 of what the natural residual would move."""
     residual = real is F64
     kind = ("residual" if residual else "step") + "_box" * box + "_rate" * rate + "_cut" * cut
-    words = {"BOX": box, "RATE": rate, "CUT": cut, "RESIDUAL": residual, "TRIAL": 0} | MOMENTUM
-    made = functools.partial(sand_pass, f"stress_{dimension}d_{real.__name__}_{kind}", dimension=dimension, real=real, **words)
-    u, edge, spans = xyz(u=[real] * 3), xyz(edge=[real] * 3), {"spans": I32}
-    faces, sums = xyz("start", "inverse") | {"openings": F32}, STEP | {"partials": F64}
-    entries = {**WALLS, **STRESSES, **edge, **xyz("share", "inverse"), **sums}
-    walls = {"walls": F32, "friction": F32, "flags": U8, "fraction": F32, "openings": F32, **STRESSES}
-    tractions = {**walls, "share_x": F32, **xyz("inverse"), **u, **sums}
-    return SimpleNamespace(
-        edge_stress=made("edge_stress", box=xyz("share") | {"y": F32} | edge, whole=spans),
-        face_velocity=made("face_velocity", box={"share_x": F32, "y": F32, **edge, **faces, **u}, whole=spans),
-        edge_strain=made("edge_strain", box={"share_x": F32, **u, **edge}, whole=spans),
-        step=made("step", box={"flags": U8, **CELLS, **edge, **u}, whole=spans | sums),
-        wall=made("wall_step", box={"active": I32}, whole=entries, numbers={"behind": int}),
-        traction=made("traction", box={"cells": I32, "numbers_of": I32}, whole=tractions, numbers={"behind": int}),
-        admit=made("admit", box={"flags": U8, "stiff": F32, **xyz("share"), **STRESSES}, numbers={"ratio": F32}),
-        damp=made("damp", box={"flags": U8, **xyz("share"), "source": F32, "now": F32}, DAMPED=DAMPED),
-    )
+    module = f"granular.stress_{dimension}d_{real.__name__}_{kind}"
+    words = {"DIM": dimension, "BOX": box, "RATE": rate, "CUT": cut, "RESIDUAL": residual, "TRIAL": 0}
+    names = ("edge_stress", "face_velocity", "edge_strain", "step", "traction", "admit", "damp")
+    made = {name: KERNELS.kernel(f"granular.stress.{name}", module=module, compute=real, constants=words) for name in names}
+    wall = KERNELS.kernel("granular.stress.wall_step", module=module, compute=real, constants=words)
+    return SimpleNamespace(**made, wall=wall)
 
 
 @wp.kernel(enable_backward=False, module="granular.momentum")

@@ -9,19 +9,16 @@ absolute value the weight) on a wall, 0 where there is no shear. Where solids cu
 cell, see `granular.cut_walls`.
 """
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import warp as wp
-
-from warp_lcp.rows import RowPass
 
 NEWTON = 4  # iterations for the multiplier of a yielding cell: 3 are exact to 2e-6 of the bound, 4 to rounding
 COLUMNS = 8  # of a row's sums, see `granular.stress_kernels`
 
 # what kernels read: the yield set, dt g [m/s] (three entries), the steps of a method relative to the diagonal, how far beyond the
-# stresses, in units of the momentum's displacement, it takes its gradient, dt / dx [s/m], what friction gains with the rate: `rate_bound.h`
+# stresses, in units of the momentum's displacement, it takes its gradient, dt / dx [s/m], what friction gains with the rate (snippet
+# `rate_bound` of `sand.h`)
 FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, STEP_OF_CELL = 0, 1, 2, 3, 6, 7, 8, 9
 GAIN, HALFWAY, NUMBERS = 10, 11, 12
 
@@ -29,7 +26,7 @@ HOLDS = 1  # bits of a cell: it holds sand, and so a pressure,
 SHEARS_HERE = 2  # enough of it to carry shear,
 FIRM = 4  # so much that cohesion may hold it together,
 PARTLY = 8  # and a solid cuts it, or a cell beside it
-NEARLY = 0.05  # of a cell free, below which what passes its faces counts as volume, whatever its neighbors hold, see `divergence.h`
+NEARLY = 0.05  # of a cell free, below which what passes its faces counts as volume, whatever its neighbors hold, see `sand.h`
 LEAST_RADIUS = 1e-30  # [m/s], of a yield set that holds only zero
 
 CONSTANTS = {
@@ -40,51 +37,8 @@ CONSTANTS = {
 }  # fmt: skip
 
 F32, F64, U8, I32 = wp.float32, wp.float64, wp.uint8, wp.int32
-WALLS = {"cells": I32, "sides": U8, "walls": I32, "friction": F32, "fraction": F32}
 
 
-def xyz(*names: str, **fields: Any) -> dict[str, Any]:
-    """Return entries `name_x`, `name_y`, `name_z` of vectors.
-
-    F32 for `names`, the components for `fields`, None for missing ones.
-    """
-    given = {name: [F32] * 3 for name in names} | fields
-    return {f"{name}_{axis}": field for name, three in given.items() for axis, field in zip("xyz", [*three, None, None], strict=False)}
-
-
-def sand_pass(
-    module: str,
-    name: str,
-    dimension: int,
-    real: Any,
-    box: Mapping[str, Any],
-    *,
-    numbers: Mapping[str, Any] | None = None,
-    whole: Mapping[str, Any] | None = None,
-    sums: tuple[str, ...] = (),
-    largest: tuple[str, ...] = (),
-    listed: str = "",
-    **words: Any,
-) -> RowPass:
-    """Return the declaration of a kernel over stresses.
-
-    Args:
-        module: Warp module, after the package.
-        name: of the pass and its header.
-        dimension: 2 or 3.
-        real: wp.float32 or wp.float64: of velocities.
-        box: fields of cells.
-        numbers: given by the host.
-        whole: arrays.
-        sums: what it sums.
-        largest: what it takes the largest of.
-        listed: which of the arrays has the cells.
-        words: constants: BOX, Narain's box instead of the cone; RATE, friction grows with the rate of shear; CUT, solids cut cells; others.
-    """
-    constants = CONSTANTS | {"DIM": dimension, "BOX": 0, "RATE": 0, "CUT": 0} | words
-    fields: dict[str, Any] = {"box": box, "whole": whole or {}, "numbers": numbers or {}}
-    absent = tuple(n for n in (*box, *fields["whole"]) if n[-2:] in ("_y", "_z") or n == "openings")
-    path = Path(__file__).parent / "headers" / f"{name}.h"
-    return RowPass(
-        f"granular.{module}.{name}", path, real, optional=absent, constants=constants, listed=listed, sums=sums, largest=largest, **fields
-    )
+def xyz(**fields: Any) -> dict[str, Any]:
+    """Return vector components by `name_x`, `name_y`, `name_z`; None if missing."""
+    return {f"{name}_{axis}": field for name, three in fields.items() for axis, field in zip("xyz", [*three, None, None], strict=False)}

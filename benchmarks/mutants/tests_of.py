@@ -29,7 +29,7 @@ def _users(root: Path) -> dict[str, set[str]]:
         for file in (root / package).rglob("*"):
             if file.suffix in (".py", ".h"):
                 places = [file.parent, file.parent / "headers", root / "warp_lcp/rows/headers"]
-                for header in re.findall(r"[\".](\w+?)(?:\.h)?\"", file.read_text()):  # some are named as their passes are, without the end
+                for header in re.findall(r"[\"/](\w+)\.h(?::[\w.]+)?\"", file.read_text()):
                     found = [place / f"{header}.h" for place in places if (place / f"{header}.h").exists()]
                     if found and found[0] != file:
                         users[str(found[0].relative_to(root))].add(str(file.relative_to(root)))

@@ -23,16 +23,13 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.particle_loops import launch, particle_pass
+from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.particles import SORT_EVERY, Particles, ParticleTotals
+from warp_lcp.rows import KernelFile
 
 INNER, BORDER, OUTSIDE = 0, 1, 2  # of a box: in it and away from its cuts, within reach of them, beyond them
-WHERE = particle_pass(
-    "warp_lcp.distributed.particles.where",
-    {"position": wp.vec3, "where": wp.uint8},
-    numbers=dict.fromkeys((f"{end}_{axis}" for end in ("low", "high") for axis in "xyz"), wp.float32) | {"reach": wp.float32},
-    headers=Path(__file__).parent / "headers",
-)
+KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
+WHERE = KERNELS["warp_lcp.distributed.particles.where"]
 
 
 MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next

@@ -22,20 +22,15 @@ from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.protocol import HasStencil
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros
 
 if TYPE_CHECKING:
     from petsc4py import PETSc
 
-HEADERS, VECTORS = Path(__file__).parent / "headers", {"v": wp.float64}
-ENTER = RowPass(
-    "vector_copies.enter", HEADERS / "enter.h", "S", reads={"d": "D"}, writes={"x": "S"}, other=VECTORS, numbers={"scale": wp.float64}
-)
-LEAVE = RowPass(
-    "vector_copies.leave", HEADERS / "leave.h", "S", reads={"d": "D", "x": "S"}, other={**VECTORS, "others": wp.float64},
-    optional=("others",), numbers={"scale": wp.float64},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
+ENTER = KERNELS["vector_copies.enter"]
+LEAVE = KERNELS["vector_copies.leave"]
 TRUE_RESIDUAL = frozenset({"cg", "cgne", "fcg", "pipefcg", "groppcg", "pipecg", "bcgs", "tfqmr", "fgmres", "richardson"})
 """Methods of KSP that measure b - A x if asked to; others know other norms only."""
 

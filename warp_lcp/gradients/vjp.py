@@ -33,24 +33,15 @@ from warp_lcp.problem.protocol import (
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveResult, SolveStatus
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import Array
 from warp_lcp.rows.vectors import ADD, Sums, Tally, rows_of
 
-HEADERS = Path(__file__).parent / "headers"
 f64, i8 = wp.float64, wp.int8
-STATE: dict[str, Any] = {"x": f64, "y": f64, "d": "D", "unknown": i8}
-LARGEST = RowPass(
-    "gradients.largest", HEADERS / "largest.h", f64, bounds=True, reads=STATE, numbers={"unit": f64}, sums=("square",), largest=("most",)
-)
-SETS = RowPass(
-    "gradients.sets", HEADERS / "sets.h", f64, bounds=True, reads={**STATE, "b": f64, "g": f64}, writes={"cells": i8, "side": i8},
-    numbers={"unit": f64, "tolerance": f64, "rounding": f64}, sums=("free", "degenerate", "wrong"),
-)  # fmt: skip
-HELD = RowPass(
-    "gradients.held", HEADERS / "held.h", f64, reads={"side": i8}, writes={"z": f64, "upper": f64}, optional=("upper",),
-    sums=("of_lower", "of_upper"),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/vjp.h")
+LARGEST = KERNELS["gradients.largest"]
+SETS = KERNELS["gradients.sets"]
+HELD = KERNELS["gradients.held"]
 ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of 2 |d x| + |b|, as of the residual's floor: what a sum of a few terms leaves
 CHANGED = 2.0  # times the result's residual: a larger one is that of another problem
 

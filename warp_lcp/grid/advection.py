@@ -22,14 +22,14 @@ interpolation 23 %. A distance is interpolated linearly, which is exact where it
 
 import functools
 import typing
-from typing import Any
+from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.grid.particle_loops import MARGIN, cell_pass, launch, particle_pass
+from warp_lcp.grid.particle_loops import MARGIN, launch
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile, RowPass
 from warp_lcp.rows.memory import Scalar, scaled
 
 MAX_CLEARANCE = 6  # cells; a particle that moves further in a step takes the careful way, which is always right
@@ -46,56 +46,35 @@ LEG = 0.25  # cells of such a search in one direction
 REACH = 1.0  # cells that a step may put a particle back: more than its stride and the diagonal of the walls' rounding
 PUSH = 3.0  # cells that a wall may push a particle in a step
 
-_WALLS = {"AIM": AIM, "SLACK": SLACK, "STRIDE": STRIDE, "SHORTEST": SHORTEST, "LEG": LEG, "REACH": REACH} | {
-    "STRIDES": STRIDES, "CORNER": CORNER, "BEND": BEND,
+_WALLS = {"MARGIN": MARGIN, "AIM": AIM, "SLACK": SLACK, "STRIDE": STRIDE, "SHORTEST": SHORTEST, "LEG": LEG, "REACH": REACH} | {
+    "STRIDES": STRIDES, "CORNER": CORNER, "BEND": BEND, "CENTERS": CENTERS,
 }  # fmt: skip
-
-PUSH_OUT = particle_pass(
-    "warp_lcp.grid.push_out.push_out",
-    {"position": wp.vec3},
-    whole={"distance": wp.float32, "moved": wp.int32, "left": wp.int32},
-    numbers={"open_sides": int},
-    constants={"MARGIN": MARGIN, "ENDLESS": 0, "LEG": LEG, "AIM": AIM, "PUSH": PUSH},
-)
-
-
-def _runge_kutta(module: str, name: str, walls: dict[str, Any], endless: int, **more: Any) -> RowPass:
-    """Return a pass that moves particles and counts those that were stopped.
-
-    Args:
-        module: of Warp, for a domain all of whose axes end.
-        name: of the pass.
-        walls: what stops them.
-        endless: has bit n set if axis n has no end; the header finds it as ENDLESS.
-        more: `numbers` and `constants` of the pass.
-    """
-    more["numbers"] = {"h": wp.float32} | more.get("numbers", {})
-    more["constants"] = {"MARGIN": MARGIN, "ENDLESS": endless} | more.get("constants", {})
-    whole = dict.fromkeys("uvw", wp.float32) | walls | {"stopped": wp.int32}
-    module += f"_{endless}" * (endless > 0)
-    return particle_pass(f"{module}.{name}", {"position": wp.vec3}, whole=whole, optional=("w",), **more)
+KERNELS = KernelFile(Path(__file__).parent / "headers/advection.h", _WALLS)
+PUSH_OUT = KernelFile(Path(__file__).parent / "headers/walls.h", {"MARGIN": MARGIN, "LEG": LEG, "AIM": AIM, "PUSH": PUSH})[
+    "warp_lcp.grid.push_out.push_out"
+]
 
 
 @functools.cache
 def advect_pass(endless: int) -> RowPass:
     """Return the kernel of `advect` for a set of periodic axes (bit n: axis n)."""
-    return _runge_kutta("warp_lcp.grid.advection", "advect", {"room": wp.int8}, endless)
+    module = "warp_lcp.grid.advection" + f"_{endless}" * (endless > 0)
+    return KERNELS.kernel("warp_lcp.grid.advection.advect", module=module, constants={"ENDLESS": endless})
 
 
 @functools.cache
 def distance_pass(endless: int) -> RowPass:
     """Return the kernel of `advect_with_distance` for a set of periodic axes."""
-    walls, more = {"distance": wp.float32}, {"numbers": {"open_sides": int}, "constants": _WALLS}
-    return _runge_kutta("warp_lcp.grid.distance_advection", "advect_with_distance", walls, endless, **more)
+    module = "warp_lcp.grid.distance_advection" + f"_{endless}" * (endless > 0)
+    name = "warp_lcp.grid.distance_advection.advect_with_distance"
+    return KERNELS.kernel(name, module=module, constants={"ENDLESS": endless})
 
 
 @functools.cache
 def carry_pass(axis: int) -> RowPass:
     """Return the kernel of `carry_field` for the faces of an axis or `CENTERS`."""
-    name, numbers = f"warp_lcp.grid.semi_lagrangian_{axis}.carry", {"planes": int, "h": wp.float32, "least": wp.float32}
-    numbers |= dict.fromkeys(("before_x", "before_y", "before_z"), int)
-    constants = {"AXIS": axis, "CENTERS": CENTERS, "ENDLESS": 0}
-    return cell_pass(name, "u v w level field out", numbers=numbers, constants=constants, optional=("w",))
+    module = f"warp_lcp.grid.semi_lagrangian_{axis}"
+    return KERNELS.kernel("warp_lcp.grid.semi_lagrangian.carry", module=module, constants={"AXIS": axis})
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.clearance")

@@ -2,32 +2,28 @@
 """What solids leave open of faces and cells, and how fast they move, from their distances at the nodes (`node_distance`)."""
 
 import itertools
+from pathlib import Path
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
 from warp_lcp.grid.node_distance_kernels import HOLLOW, Nearest
-from warp_lcp.grid.particle_loops import HEADERS, cell_pass
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.operators.grid_poisson import AIR, SOLID
-from warp_lcp.rows.row_pass import text
+from warp_lcp.rows import KernelFile
+from warp_lcp.rows.native import text
 
 DROP = 1.0e-3  # open fractions below become 0: raised, they would lift a flow along the wall; kept, they spoil the condition number
 CLOSED, OPEN, CUT = 0, 1, 2  # states of cells
 
-FRACTIONS = cell_pass(
-    "warp_lcp.grid.cut_cells.fractions", "d d2 ax ay az", {"marks": wp.int8, **dict.fromkeys(("o", "o2", "wx", "wy", "wz"), wp.int16)},
-    whole={"counts": wp.int32}, numbers={"planes": int}, constants={"DROP": DROP, "HOLLOW": HOLLOW},
-)  # fmt: skip
-STATES = cell_pass(
-    "warp_lcp.grid.cut_cells.states", "d ax ay az", {"base": wp.int8, "state": wp.int8}, numbers={"planes": int},
-    constants={"AIR": AIR, "SOLID": SOLID},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/cut_cells.h", {"DROP": DROP, "HOLLOW": HOLLOW, "AIR": AIR, "SOLID": SOLID})
+FRACTIONS = KERNELS["warp_lcp.grid.cut_cells.fractions"]
+STATES = KERNELS["warp_lcp.grid.cut_cells.states"]
 
 
 @wp.func_native(
     "\n"
-    + text(HEADERS / "cut_area.h")
+    + text(KERNELS.path, "cut_area")
     + """
     const float v[4] = {a, b, c, d};
     const bool open = a >= 0.0f && b >= 0.0f && c >= 0.0f && d >= 0.0f && a + b + c + d > 0.0f;
@@ -155,10 +151,10 @@ def velocity_kernel(
 options = {"enable_backward": False, "module": "warp_lcp.grid.capacity"}
 COLORS = 3  # along an axis: as many cells as a kernel reaches over
 
-OPEN_CELLS = cell_pass("warp_lcp.grid.capacity.open_cells", "capacity", {"state": wp.int8}, numbers={"planes": int})
+OPEN_CELLS = KERNELS["warp_lcp.grid.capacity.open_cells"]
 
 
-@wp.func_native("\n" + text(HEADERS / "cut_cell.h") + "\n")
+@wp.func_native("\n" + text(KERNELS.path, "cut_cell") + "\n")
 def cut_cell(near_: F32, out_: F32, planes: int, k: int, j: int, i: int): ...
 
 

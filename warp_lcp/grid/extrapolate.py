@@ -2,19 +2,21 @@
 
 import typing
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
-from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.rows import KernelFile
 
 BLOCKED = -1  # not to be filled
 UNKNOWN = 0  # to be filled; positive: known since that layer, 1 from the start
 REACH = 2  # layers around faces with weight: as far as the density of a cell tells of particles beyond its neighbors
 
-LAYER = cell_pass("warp_lcp.grid.extrapolate.fill_layer", "field", {"known": wp.int8}, numbers={"layer": int, "fill": int})
+KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
+LAYER = KERNELS["warp_lcp.grid.extrapolate.fill_layer"]
 
 
 @cell_kernel("warp_lcp.grid.extrapolate")

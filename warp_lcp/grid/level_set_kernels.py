@@ -6,11 +6,13 @@ filled up to s cells from its center holds, is a cubic in pieces: (s + 3/2)^3 / 
 G(-s) = 1 - G(s).
 """
 
+from pathlib import Path
+
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
-from warp_lcp.grid.particle_loops import cell_pass, particle_pass, scatter_pass
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows import KernelFile
 
 # Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and an empty wedge deep in the liquid would
 # count as air, into which the liquid falls. Such a cell is given its neighbors' distance.
@@ -18,21 +20,13 @@ MIN_CAPACITY = 0.25
 TAIL = 1e-4  # the least filled share whose quantile is taken after smoothing
 EXTENDED = 2  # layers of cells without a distance of their own that are given one
 
-_LEVEL_SET, _DENSITY = "warp_lcp.grid.level_set", "warp_lcp.grid.density"
 _CONSTANTS = {"MIN_CAPACITY": MIN_CAPACITY, "TAIL": TAIL, "SOLID": SOLID}
-BINOMIAL = cell_pass(f"{_LEVEL_SET}.binomial", "source out", numbers={"planes": int})
-DISTANCE = cell_pass(
-    f"{_LEVEL_SET}.level_set_distance", "phi density capacity smooth", {"known": wp.int8, "base": wp.int8},
-    numbers={"spread": wp.float32, "limit": wp.float32}, optional=("capacity", "smooth"), constants=_CONSTANTS,
-)  # fmt: skip
-VOLUME = cell_pass(  # in a module of its own: few runs ask for it
-    "warp_lcp.grid.volume.volume", "phi distance", {"known": wp.int8}, numbers={"planes": int, "parts": int}, optional=("distance",),
-    sums=("volume",),
-)  # fmt: skip
-SCATTER = scatter_pass("grid.density.scatter_density", {"position": wp.vec3, "density": wp.float32}, numbers={"each": wp.float32})
-GATHER = particle_pass(
-    f"{_DENSITY}.gather_density", {"density": wp.float32}, whole={"offsets": wp.int32, "position": wp.vec3}, numbers={"each": wp.float32}
-)
+KERNELS = KernelFile(Path(__file__).parent / "headers/level_set.h", _CONSTANTS)
+BINOMIAL = KERNELS["warp_lcp.grid.level_set.binomial"]
+DISTANCE = KERNELS["warp_lcp.grid.level_set.level_set_distance"]
+VOLUME = KERNELS["warp_lcp.grid.volume.volume"]
+SCATTER = KERNELS["grid.density.scatter_density"]
+GATHER = KERNELS["warp_lcp.grid.density.gather_density"]
 
 
 @wp.func

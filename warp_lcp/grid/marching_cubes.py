@@ -14,14 +14,14 @@ surface is closed. No triangle has an edge within a face that is no segment, so 
 import functools
 import itertools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.particle_loops import HEADERS
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 
 MOST = 5  # triangles of a cell
 EDGES = tuple((corner, corner | 1 << axis) for axis in range(3) for corner in range(8) if not corner >> axis & 1)
@@ -141,19 +141,12 @@ def segment_table() -> np.ndarray:
 
 CLOSEST = 0.01  # of an edge: how near to its end a point may come, so that no triangle shrinks to nothing
 
-_I32, _ROWS = wp.int32, {"ends": wp.int32, "counts": wp.int32}
 
-
-def _made(name: str, box: dict[str, Any], numbers: dict[str, Any], by_row: dict[str, Any], **whole: Any) -> RowPass:
-    box, numbers, constants = {"phi": wp.float32} | box, {"planes": int} | numbers, {"CLOSEST": CLOSEST}
-    area, path = "warp_lcp.grid.marching_cubes", HEADERS / f"cube_{name}.h"
-    return RowPass(f"{area}.{name}", path, wp.float32, box=box, numbers=numbers, by_row=by_row, whole=whole, constants=constants)
-
-
-COUNT = _made("count", {}, {}, {"owned": _I32, "made": _I32}, table=wp.int8)
+KERNELS = KernelFile(Path(__file__).parent / "headers/surface_mesh.h", {"CLOSEST": CLOSEST})
+COUNT = KERNELS["warp_lcp.grid.marching_cubes.count"]
 _PLACED = {"dx": wp.float32} | dict.fromkeys(("before_x", "before_y", "before_z", "most_x", "most_y", "most_z"), int)
-POINTS = _made("points", {"number": _I32}, _PLACED, _ROWS, into=wp.vec3)
-CORNERS = _made("corners", {"number": _I32}, {}, _ROWS, table=wp.int8, into=_I32)
+POINTS = KERNELS["warp_lcp.grid.marching_cubes.points"]
+CORNERS = KERNELS["warp_lcp.grid.marching_cubes.corners"]
 
 
 @dataclass(frozen=True)

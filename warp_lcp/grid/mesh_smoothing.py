@@ -4,13 +4,15 @@ A step of Laplacian smoothing, then a slightly longer one back.
 """
 
 import typing
+from pathlib import Path
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, POINTS, interpolated
 from warp_lcp.grid.marching_cubes import DeviceMesh
-from warp_lcp.grid.particle_loops import cell_pass, chunks
+from warp_lcp.grid.particle_loops import chunks
 from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.rows import KernelFile
 
 TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
 ON_SIDE, ON_SOLID = 1, 2  # bits of a mark
@@ -19,8 +21,8 @@ NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance th
 _SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
 _options = {"enable_backward": False, "module": "warp_lcp.grid.mesh_smoothing"}
 
-_WHOLE = {"points": wp.vec3, "sums": wp.float32}
-SEE_NEIGHBORS = cell_pass("warp_lcp.grid.mesh_smoothing.see_neighbors", "", {"corners": wp.int32}, whole=_WHOLE, ordered=True)
+KERNELS = KernelFile(Path(__file__).parent / "headers/surface_mesh.h")
+SEE_NEIGHBORS = KERNELS["warp_lcp.grid.mesh_smoothing.see_neighbors"]
 
 
 @wp.kernel(**_options)

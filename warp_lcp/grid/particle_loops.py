@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
 from warp_lcp.rows.program import is_recording
 from warp_lcp.rows.team import get_threads
@@ -25,59 +25,7 @@ CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs not
 SHARES = 2  # that a thread's planes are cut into where particles add to them: chunks that touch two shares are read twice
 PARTICLE = 16  # cells of a usual pass that a particle of one costs
 MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
-HEADERS = Path(__file__).parent / "headers"
-NONE: Mapping[str, Any] = {}
-
-
-def cell_pass(name: str, fields: str, box: Mapping[str, Any] = NONE, *, headers: Path = HEADERS, **more: Any) -> RowPass:
-    """Return a pass over the cells of a window in single precision, in the header that its name ends in.
-
-    Args:
-        name: of the pass, with its Warp module.
-        fields: names of its float32 fields.
-        box: other fields of cells.
-        headers: where the header is.
-        more: of the pass.
-    """
-    box = dict.fromkeys(fields.split(), wp.float32) | dict(box)
-    return RowPass(name, headers / f"{name.rpartition('.')[2]}.h", wp.float32, box=box, **more)
-
-
-def particle_pass(
-    name: str, box: Mapping[str, Any], *, real: Any = wp.float32, numbers: Mapping[str, Any] = NONE, headers: Path = HEADERS, **more: Any
-) -> RowPass:
-    """Return a pass that also takes `on_grid`, in the header that its name ends in.
-
-    Args:
-        name: of the pass, with its Warp module.
-        box: lists with an entry a particle, or fields of cells.
-        real: of coordinates.
-        numbers: others that it takes.
-        headers: where the header is.
-        more: of the pass.
-    """
-    return RowPass(name, headers / f"{name.rpartition('.')[2]}.h", real, box=box, numbers={**_grid_numbers(real), **numbers}, **more)
-
-
-def _grid_numbers(real: Any) -> dict[str, Any]:
-    return {"planes": int, "dx": real, "inverse_dx": real, "before_x": int, "before_y": int, "before_z": int}
-
-
-def scatter_pass(name: str, whole: Mapping[str, Any], *, real: Any = wp.float32, numbers: Mapping[str, Any] = NONE, **more: Any) -> RowPass:
-    """Return a pass for `scatter`, in the header that its name ends in, with `each_share` of `shares.h`.
-
-    Args:
-        name: of the pass.
-        whole: lists with an entry a particle, and the fields that they add to.
-        real: of coordinates.
-        numbers: others that it takes.
-        more: of the pass.
-    """
-    return RowPass(
-        name, HEADERS / f"{name.rpartition('.')[2]}.h", real, whole={**whole, "touched": wp.int32, "runs": wp.int32},
-        numbers={**_grid_numbers(real), **numbers, "count": int, "chunk": int}, optional=("touched", "runs", *more.pop("optional", ())),
-        **more,
-    )  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
 
 
 class ListMemory:
@@ -117,7 +65,7 @@ class ListMemory:
 
 
 TOUCHED: dict[Any, RowPass] = {
-    vector: particle_pass(f"warp_lcp.grid.touched_{real.__name__}.touched", {"position": vector}, real=real, whole={"touched": wp.int32})
+    vector: KERNELS.kernel("warp_lcp.grid.touched.touched", module=f"warp_lcp.grid.touched_{real.__name__}", compute=real)
     for vector, real in ((wp.vec3, wp.float32), (wp.vec3d, wp.float64))
 }
 
@@ -139,7 +87,7 @@ def scatter(
     """Launch a pass in which particles add to a field: on the CPU each task has planes of its own (rows in 2-D).
 
     Args:
-        passed: a `scatter_pass`.
+        passed: a kernel with `each_share` of `particles.h`.
         grid: of the particles.
         position: theirs.
         touched: what `touched_planes` returns for them.

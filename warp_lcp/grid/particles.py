@@ -2,7 +2,6 @@
 
 import typing
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -11,7 +10,7 @@ from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import MARGIN, ListMemory, launch, on_grid
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import RowsMemory, Scalar
 from warp_lcp.rows.program import LaunchGraph
@@ -23,11 +22,6 @@ THREADS = 1024  # the most threads of a sum, each a partial result that the host
 CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
 GROWTH = 1.5  # of the storage when it is full: n appended particles are copied 2 n times at most, a third of it lies idle at most
 SORT_EVERY = 8  # steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL 2, a sort costs 25 ns
-
-ADD_IN_ORDER = RowPass(
-    "warp_lcp.grid.particles.add_in_order", Path(__file__).parent / "headers" / "add_in_order.h", wp.float64,
-    whole={"partials": wp.float64, "results": wp.float64}, numbers={"places_of_sums": int, "sums_": int},
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -374,7 +368,7 @@ class Particles:
         kernels.TOTAL.bind(rows, position=self.position, velocity=self.velocity, **given, out=self._partials).launch()
         arrays: dict[str, typing.Any] = {"partials": self._partials, "results": self._found.array}
         numbers: dict[str, typing.Any] = {"places_of_sums": self._places, "sums_": len(kernels.TOTAL.sums)}
-        ADD_IN_ORDER.bind(Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True), **arrays, **numbers).launch()
+        kernels.ADD_IN_ORDER.bind(Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True), **arrays, **numbers).launch()
 
     def totals_stay(self, stay: bool) -> None:
         """Declare that positions and velocities are unchanged since `totals`.

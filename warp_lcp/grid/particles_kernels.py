@@ -1,17 +1,17 @@
 # mypy: ignore-errors
 """Kernels that number particles by cell, reorder them and add them up."""
 
+from pathlib import Path
+
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import list_kernel
-from warp_lcp.grid.particle_loops import particle_pass
+from warp_lcp.rows import KernelFile
 
-_PARTICLES, _COUNTS = "warp_lcp.grid.particles", {"nx": int, "ny": int, "nz": int}
-NUMBER = particle_pass(f"{_PARTICLES}.number", {"position": wp.vec3}, whole={"key": wp.int32}, numbers=_COUNTS)
-TOTAL = particle_pass(
-    f"{_PARTICLES}.total", {"position": wp.vec3, "velocity": wp.vec3}, sums=("energy", "x", "y", "z", "u", "v", "w", "lost", "wild"),
-    largest=("top", "high_x", "high_y", "high_z", "low_x", "low_y", "low_z"),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
+NUMBER = KERNELS["warp_lcp.grid.particles.number"]
+TOTAL = KERNELS["warp_lcp.grid.particles.total"]
+ADD_IN_ORDER = KERNELS["warp_lcp.grid.particles.add_in_order"]
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")

@@ -16,23 +16,19 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
 from warp_lcp.rows.layout import BLANK, grain
 from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
 from warp_lcp.rows.program import Launch, clear, launch_ranges
 from warp_lcp.settings import renamed_names
 
+KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
 CLEAR: dict[typing.Any, RowPass] = {
-    dtype: RowPass(
-        f"warp_lcp.grid.clear_{dtype.__name__}.clear", Path(__file__).parent / "headers" / "clear.h", dtype, box={"field": dtype}
-    )
+    dtype: KERNELS.kernel("warp_lcp.grid.clear.clear", module=f"warp_lcp.grid.clear_{dtype.__name__}", compute=dtype)
     for dtype in (wp.int8, wp.float32, wp.float64)
 }
-COPY = RowPass(
-    "warp_lcp.grid.copy_box.copy", Path(__file__).parent / "headers" / "copy_box.h", wp.float32,
-    box={"field": wp.float32, "source": wp.float32},
-)  # fmt: skip
+COPY = KERNELS["warp_lcp.grid.copy_box.copy"]
 SEGMENT = 8  # cells of a row that are visited together where a box is visited in part
 
 

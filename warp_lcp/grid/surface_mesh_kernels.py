@@ -1,11 +1,13 @@
 # mypy: ignore-errors
 """Kernels of the surface that a picture shows: its field on a lattice, what solids take away of it, and how fast it moves."""
 
+from pathlib import Path
+
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
-from warp_lcp.grid.particle_loops import cell_pass, particle_pass
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows import KernelFile
 
 FAR = 2.0  # lattice cells: a distance to solids that takes nothing from the liquid
 LEAST_OPEN = 0.25  # of a kernel: where less of it is open the distance is continued from outside the solid
@@ -17,22 +19,11 @@ THIN, POWER = 0.6, 0.4
 _options = {"enable_backward": False, "module": "warp_lcp.grid.surface_mesh"}
 
 
-_MODULE = "warp_lcp.grid.surface_mesh"
-DISTANCE = cell_pass(
-    f"{_MODULE}.surface_distance", "phi smooth thin capacity", {"known": wp.int8}, numbers={"planes": int, "spread": wp.float32},
-    optional=("capacity", "known"), constants={"LEAST_OPEN": LEAST_OPEN},
-)  # fmt: skip
-ROOM = cell_pass(f"{_MODULE}.room", "out", whole={"distance": wp.float32}, numbers={"planes": int, "parts": int})
-CARVE = cell_pass(f"{_MODULE}.carve", "room phi")
-BOOST = particle_pass(
-    f"{_MODULE}.boost",
-    {"position": wp.vec3},
-    ordered=True,
-    whole=dict.fromkeys(("smooth", "capacity", "thin"), wp.float32),
-    numbers=dict.fromkeys(("each", "gain", "most"), wp.float32),
-    constants={"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "POWER": POWER},
-    optional=("capacity",),
-)
+KERNELS = KernelFile(Path(__file__).parent / "headers/surface_mesh.h", {"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "POWER": POWER})
+DISTANCE = KERNELS["warp_lcp.grid.surface_mesh.surface_distance"]
+ROOM = KERNELS["warp_lcp.grid.surface_mesh.room"]
+CARVE = KERNELS["warp_lcp.grid.surface_mesh.carve"]
+BOOST = KERNELS["warp_lcp.grid.surface_mesh.boost"]
 
 
 @wp.kernel(**_options)

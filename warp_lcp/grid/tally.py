@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.grid.staggered import KERNELS, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Tally
@@ -15,12 +14,7 @@ from warp_lcp.rows.vectors import Tally
 CUDA_SUMS = 1 << 20  # columns of cells, a thread each, into which a GPU cuts a grid: some waves of the largest ones
 CUDA_PLANES = 16  # of one of them, at least
 
-_BOXES = ("first_k", "first_j", "planes", "rows_", "box_k", "box_j", "box_planes", "box_rows")
-ADD_ROWS = RowPass(
-    "warp_lcp.grid.tally.add_rows", Path(__file__).parent / "headers" / "add_rows.h", wp.float64,
-    whole={"partials": wp.float64, "host": wp.float64, "results": wp.float64, "pieces": wp.vec2i}, optional=("pieces",),
-    numbers=dict.fromkeys((*_BOXES, "hulls", "sums_", "all_planes", "all_rows"), int),
-)  # fmt: skip
+ADD_ROWS = KERNELS["warp_lcp.grid.tally.add_rows"]
 
 
 class WindowTally:

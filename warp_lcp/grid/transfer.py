@@ -15,21 +15,22 @@ part of a grid. In 2-D the nodes of one plane are used: the coordinate along z i
 import functools
 import typing
 from collections.abc import Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
-from warp_lcp.grid.particle_loops import launch, on_grid, particle_pass, scatter, scatter_pass, touched_planes
+from warp_lcp.grid.particle_loops import launch, on_grid, scatter, touched_planes
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.memory import Scalar, value_of
 
 TINY_WEIGHT = 1e-9  # below it a face counts as untouched
 # A particle that lies exactly on the boundary between cells would leave one face of its own cell without weight, hence without gravity.
 EDGE = {wp.float32: 1e-5, wp.float64: 1e-12}
-VECTORS = {wp.float32: wp.vec3, wp.float64: wp.vec3d}
+KERNELS = KernelFile(Path(__file__).parent / "headers/transfer.h")
 
 
 @functools.cache
@@ -38,13 +39,8 @@ def transfer_passes(real: Any) -> SimpleNamespace:
 
     Two forms of the sum over particles, its adjoint `interpolate`, and the division by the weights.
     """
-    name, vector = f"warp_lcp.grid.transfer_{real.__name__}", VECTORS[real]
-    constants, particles = {"EDGE": EDGE[real], "TINY_WEIGHT": TINY_WEIGHT}, dict.fromkeys(("position", "velocity", "gradient"), vector)
-
-    def made(which: str, box: dict[str, Any], whole: dict[str, Any], numbers: dict[str, Any]) -> RowPass:
-        absent = ("gradient", "saved")
-        more: dict[str, Any] = {"whole": whole, "numbers": {"axis": int} | numbers, "constants": constants, "optional": absent}
-        return particle_pass(f"{name}.{which}", box, real=real, **more)
+    name = f"warp_lcp.grid.transfer_{real.__name__}"
+    made = functools.partial(KERNELS.kernel, compute=real, constants={"EDGE": EDGE[real], "TINY_WEIGHT": TINY_WEIGHT})
 
     @cell_kernel(name)
     @typing.no_type_check
@@ -55,18 +51,10 @@ def transfer_passes(real: Any) -> SimpleNamespace:
         else:
             field[k, j, i] = real(0.0)
 
-    scattered = {**particles, "momentum": real, "weight": real}
     return SimpleNamespace(
-        scatter=scatter_pass(
-            f"grid.transfer_{real.__name__}.scatter",
-            scattered,
-            real=real,
-            numbers={"axis": int},
-            constants=constants,
-            optional=("gradient",),
-        ),
-        interpolate=made("interpolate", particles, {"field": real, "saved": real}, {"flip": real}),
-        gather_weights=made("gather_weights", {"field": real, "weight": real}, {"offsets": wp.int32, **particles}, {}),
+        scatter=made("grid.transfer.scatter", module=f"grid.transfer_{real.__name__}"),
+        interpolate=made("warp_lcp.grid.transfer.interpolate", module=name),
+        gather_weights=made("warp_lcp.grid.transfer.gather_weights", module=name),
         normalize=normalize,
     )
 

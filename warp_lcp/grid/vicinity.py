@@ -2,22 +2,22 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.particle_loops import launch, particle_pass
+from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import SEGMENT, StaggeredGrid, Window
+from warp_lcp.rows import KernelFile
 
 LEAST_CELLS = 1 << 17  # of a box that may be visited in part: finding the part costs as much as a pass over particles and one over segments
 MOST = 0.4  # of a box's segments that a part may have
 REST = 6  # steps after which one looks again whether a part has become smaller
 
-MARK = particle_pass(
-    "warp_lcp.grid.vicinity.mark_segments", {"position": wp.vec3}, whole={"marks": wp.uint8},
-    numbers={"in_z": int, "in_y": int, "in_x": int, "segment": int},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
+MARK = KERNELS["warp_lcp.grid.vicinity.mark_segments"]
 
 
 class Vicinity:

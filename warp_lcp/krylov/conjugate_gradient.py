@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import Across, Reduction, rows_of
@@ -68,15 +68,10 @@ def end_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)):
     going[0] = next_iteration(scalars, RR)
 
 
-HEADERS, PLACES = Path(__file__).parent / "headers", {"RZ": int(RZ), "RZ_OLD": int(RZ_OLD), "PQ": int(PQ)}
-DIRECTION = RowPass(
-    "conjugate_gradient.direction", HEADERS / "direction.h", "S", reads={"z": "S"}, writes={"direction": "S"},
-    whole={"scalars": wp.float64}, constants=PLACES,
-)  # fmt: skip
-UPDATE = RowPass(
-    "conjugate_gradient.update", HEADERS / "update.h", "S", reads={"direction": "S", "q": "S", "w": "S"}, writes={"x": "S", "r": "S"},
-    optional=("w",), whole={"scalars": wp.float64}, sums=("rr",), constants=PLACES,
-)  # fmt: skip
+PLACES = {"RZ": int(RZ), "RZ_OLD": int(RZ_OLD), "PQ": int(PQ)}
+KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h", PLACES)
+DIRECTION = KERNELS["conjugate_gradient.direction"]
+UPDATE = KERNELS["conjugate_gradient.update"]
 
 
 class LinearMap(Protocol):

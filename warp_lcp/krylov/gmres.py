@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.krylov.conjugate_gradient import HEADERS, LinearMap, Preconditioner
-from warp_lcp.rows import RowPass
+from warp_lcp.krylov.conjugate_gradient import LinearMap, Preconditioner
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.fields import zeros, zeros_like
 from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
-RESIDUAL = RowPass("gmres.residual", HEADERS / "residual.h", "S", reads={"b": "S", "w": "S"}, writes={"q": "S"}, optional=("w",))
-WEIGH = RowPass("gmres.weigh", HEADERS / "weigh.h", "S", reads={"w": "S"}, writes={"q": "S"}, numbers={"inverse": bool})
-NUMBERS = {"size": wp.int64, "count": int}
-DOTS = RowPass("gmres.dots", HEADERS / "dots.h", "S", whole={"basis": "S"}, reads={"x": "S"}, numbers=NUMBERS, sums=("first",))
-COMBINE = RowPass(
-    "gmres.combine", HEADERS / "combine.h", "S", whole={"basis": "S", "factors": wp.float64}, writes={"x": "S"},
-    numbers={**NUMBERS, "sign": wp.float64}, sums=("xx",),
-)  # fmt: skip
-STORE = RowPass(
-    "gmres.store", HEADERS / "store.h", "S", whole={"basis": "S", "sums": wp.float64}, reads={"x": "S"},
-    numbers={"size": wp.int64, "place": wp.int64, "last": int},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
+RESIDUAL = KERNELS["gmres.residual"]
+WEIGH = KERNELS["gmres.weigh"]
+DOTS = KERNELS["gmres.dots"]
+COMBINE = KERNELS["gmres.combine"]
+STORE = KERNELS["gmres.store"]
 KEPT = 8  # vectors of whom the preconditioned ones are kept: solves that take no more of them need no last preconditioning
 STALLED = 0.99  # a restart that leaves more than this share of the residual gains nothing that another one would not
 

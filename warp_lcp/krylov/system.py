@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.krylov.conjugate_gradient import HEADERS
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.vectors import Across, Sums, rows_of
 
-NORM = RowPass("krylov.norm", HEADERS / "norm.h", "S", reads={"r": "S", "w": "S"}, optional=("w",), sums=("rr",))
+KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
+NORM = KERNELS["krylov.norm"]
 
 
 class KrylovSystem:

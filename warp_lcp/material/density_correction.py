@@ -21,42 +21,32 @@ from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile, RowPass
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.rows.vectors import convert
 from warp_lcp.settings import renamed_names
 
-HEADERS = Path(__file__).parent / "headers"
-F32, F64, U8 = wp.float32, wp.float64, wp.uint8
+F32, F64 = wp.float32, wp.float64
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
     "LEAST_DENSITY": 0.5,  # that displacements are divided by: thin spray need not carry off what a full cell has too much
     "LEAST_CAPACITY": 0.1,  # that densities are divided by there
     "HALF": 0.5,  # of what a cell holds: with less it is at the surface
 }
-FILLED, PROBLEM = {"density": F32, "capacity": F32}, {"kind": wp.int8, "b": F64, "x": F64}
+FILLED = {"density": F32, "capacity": F32}
 
 
-def _made(
-    name: str, box: dict[str, Any], numbers: dict[str, Any], module: str = "density_correction", cut: bool = False, **found: Any
-) -> RowPass:
-    path, constants, absent = HEADERS / f"{name}.h", CONSTANTS | {"CUT": cut}, ("contact", "inside", "open")
-    return RowPass(f"warp_lcp.material.{module}.{name}", path, F64, box=box, numbers=numbers, optional=absent, constants=constants, **found)
-
-
-PREPARE = _made(
-    "prepare_correction", PROBLEM | FILLED | {"base": wp.int8, "contact": U8, "inside": U8}, {"most": F32, "gain": F32},
-    sums=("full",), largest=("densest",),
-)  # fmt: skip
-EVEN = _made("even", PROBLEM | FILLED | {"inside": U8, "lower": F64}, {"least": F32, "planes": int}, sums=("lacks",))
-CROWD = _made("crowd", FILLED | {"base": wp.int8}, {"most": F32}, "crowding", sums=("above", "all"), largest=("densest",))
+KERNELS = KernelFile(Path(__file__).parent / "headers/density_correction.h", CONSTANTS)
+PREPARE = KERNELS["warp_lcp.material.density_correction.prepare_correction"]
+EVEN = KERNELS["warp_lcp.material.density_correction.even"]
+CROWD = KERNELS["warp_lcp.material.crowding.crowd"]
 
 
 @functools.cache
 def displacement_pass(cut: bool) -> RowPass:
     """Return the kernel of the displacement; `cut`: faces have open fractions."""
-    fields, numbers = {"x": F64, "kind": wp.int8, "open": F32, "d": F32} | FILLED, {"axis": int, "most": F32, "dx": F32}
-    return _made("displace", fields, numbers, "density_correction" + "_cut" * cut, cut)
+    name = "warp_lcp.material.density_correction"
+    return KERNELS.kernel(f"{name}.displace", module=name + "_cut" * cut, constants={"CUT": cut})
 
 
 LONGEST = 0.5  # cells that a correction moves a particle at most

@@ -5,15 +5,14 @@ Sums are of int64, in fixed point: whole numbers add up to the same in any order
 """
 
 from pathlib import Path
-from typing import Any
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated, list_kernel
-from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows import KernelFile
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
@@ -49,18 +48,11 @@ class Flight:
     sums: wp.array2d(dtype=wp.int64)
 
 
-_MORE: dict[str, Any] = {
-    "headers": Path(__file__).parent / "headers",
-    "constants": {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT},
-}
-UNITE = cell_pass("warp_lcp.material.flight.unite", "u v w", whole={"parent": wp.int32}, optional=("w",), ordered=True, **_MORE)
-_TREES = {"parent": wp.int32, "held": wp.uint8, "several": wp.uint8}
-ALONE = cell_pass("warp_lcp.material.flight.alone", "", {"kind": wp.int8}, whole=_TREES, **_MORE)
-_NUMBERED = {**_TREES, "number": wp.int32, "count": wp.int32}
-NUMBER = cell_pass("warp_lcp.material.flight.number", "", {"kind": wp.int8}, whole=_NUMBERED, ordered=True, **_MORE)
-HOLD = cell_pass(
-    "warp_lcp.material.flight.hold", "", {"kind": wp.int8, "touch": wp.uint8}, whole=_TREES, **_MORE,
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/flight.h", {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT})
+UNITE = KERNELS["warp_lcp.material.flight.unite"]
+ALONE = KERNELS["warp_lcp.material.flight.alone"]
+NUMBER = KERNELS["warp_lcp.material.flight.number"]
+HOLD = KERNELS["warp_lcp.material.flight.hold"]
 
 
 @wp.func

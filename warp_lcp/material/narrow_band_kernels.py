@@ -6,9 +6,9 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, INTS, POINTS, U8, cell_kernel
-from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows import KernelFile
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces
@@ -18,10 +18,8 @@ _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 _RELEASED = wp.constant(wp.uint8(RELEASED))
 
-RELAX = cell_pass(
-    "warp_lcp.material.narrow_band.relax_depth", "depth", headers=Path(__file__).parent / "headers", whole={"changed": wp.int32},
-    numbers=dict.fromkeys(("planes", "last_plane", "last_row"), int),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/narrow_band.h")
+RELAX = KERNELS["warp_lcp.material.narrow_band.relax_depth"]
 
 
 @wp.func

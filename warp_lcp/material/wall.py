@@ -26,19 +26,20 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
-from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows import KernelFile
 
 Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity of a component
 
-HEADERS = Path(__file__).parent / "headers"
-KEEP_SPRAY = cell_pass(
-    "warp_lcp.material.wall.keep_spray", "weight open", {"known": wp.int8, "kind": wp.int8}, headers=HEADERS, numbers={"axis": int},
-    constants={"TINY_WEIGHT": TINY_WEIGHT, "SOLID": SOLID}, optional=("open",),
-)  # fmt: skip
+DEPTH = 2.0  # cells inside a wall beyond which no particle's tent reaches a face: sqrt(3), and what the distance errs
+_CONSTANTS = {"TINY_WEIGHT": TINY_WEIGHT, "DEPTH": DEPTH, "SOLID": SOLID, "FLUID": FLUID} | {
+    "TOUCHES_NOTHING": TOUCHES_NOTHING, "HELD": HELD, "RELEASED": RELEASED,
+}  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/wall.h", _CONSTANTS)
+KEEP_SPRAY = KERNELS["warp_lcp.material.wall.keep_spray"]
 _FLUID = wp.constant(wp.int8(FLUID))
 
 
@@ -131,24 +132,12 @@ def extend_velocity(
         extrapolate(window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED, join=join)
 
 
-DEPTH = 2.0  # cells inside a wall beyond which no particle's tent reaches a face: sqrt(3), and what the distance errs
-
-_F32, _I8, _I16 = wp.float32, wp.int8, wp.int16
-_CONSTANTS = {"TINY_WEIGHT": TINY_WEIGHT, "DEPTH": DEPTH, "SOLID": SOLID, "FLUID": FLUID} | {
-    "TOUCHES_NOTHING": TOUCHES_NOTHING, "HELD": HELD, "RELEASED": RELEASED,
-}  # fmt: skip
-_MARKS, _AXIS = {"known": _I8}, {"axis": int, "planes": int}
-_COMPONENTS = {f"{name}{c}": kind for name, kind in (("", _F32), ("known_", _I8), ("wall_", _I16), ("moving_", _F32)) for c in "uvw"}
-_NEAREST = {"owner": _I16, "next_near": _F32, "next_owner": _I16}
+_COMPONENTS = tuple(f"{name}{c}" for name in ("", "known_", "wall_", "moving_") for c in "uvw")
+_NEAREST = ("owner", "next_near", "next_owner")
 
 
-_ABSENT: dict[str, Any] = {"headers": HEADERS, "constants": _CONSTANTS, "optional": (*_COMPONENTS, *_NEAREST)}
-CONSTRAIN = cell_pass(
-    "warp_lcp.material.cut_wall.constrain", "open result distance", _MARKS | _COMPONENTS | _NEAREST | {"kind": _I8, "contact": wp.uint8},
-    numbers=_AXIS | {"dx": _F32, "before_x": int, "before_y": int, "before_z": int},
-    whole={"turn": wp.mat33, "shift": wp.vec3, "separating": wp.uint8}, **_ABSENT,
-)  # fmt: skip
-TAKE = cell_pass("warp_lcp.material.cut_wall.take", "open result field", _MARKS, numbers=_AXIS, **_ABSENT)
+CONSTRAIN = KERNELS["warp_lcp.material.cut_wall.constrain"]
+TAKE = KERNELS["warp_lcp.material.cut_wall.take"]
 
 
 def extend_velocity_cut(

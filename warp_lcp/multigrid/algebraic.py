@@ -21,30 +21,18 @@ from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
 from warp_lcp.multigrid.coarsest_kernels import PINNED
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
-from warp_lcp.operators.sparse import GATHER, PRODUCT, ROWS, SparseOperator
-from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.operators.sparse import GATHER, PRODUCT, SparseOperator
+from warp_lcp.rows import Bound, KernelFile, Rows
 from warp_lcp.rows.fields import kept, zeros
 from warp_lcp.rows.program import Launch, Program
 
-HEADERS = Path(__file__).parent / "headers"
-LEVEL = {**ROWS, "a": "S"}
-FILL = RowPass(
-    "algebraic.fill", HEADERS / "fill.h", "S", whole={**ROWS, "a": "A", "order": wp.int32, "free": wp.uint8, "m": "S"},
-    reads={"d": "A", "shift": wp.float64}, writes=dict.fromkeys(("inverse", "scale", "weight"), "S"), optional=("order", "shift"),
-)  # fmt: skip
-SCALE_ROWS = RowPass(
-    "algebraic.scale_rows", HEADERS / "scale_rows.h", "S", whole={"ptr": wp.int32, "a": "S", "scaled": "S"}, reads={"scale": "S"}
-)
-MULTIPLY = RowPass(
-    "algebraic.multiply", HEADERS / "multiply.h", "S", reads={"begins": wp.int64},
-    whole={**LEVEL, "right": wp.int32, "b": "S", "starts": wp.int32, "place": wp.uint16, "result": "S"},
-)  # fmt: skip
-INVERSE = RowPass("algebraic.inverse", HEADERS / "inverse.h", "S", whole={"ptr": wp.int32, "a": "S"}, writes={"inverse": "S"})
-SMOOTH = RowPass(
-    "algebraic.smooth", HEADERS / "smooth.h", "S", whole={**LEVEL, "x": "S"}, reads={"inverse": "S", "b": "S"}, writes={"y": "S"},
-    numbers={"omega": "S", "from_zero": bool},
-)  # fmt: skip
-REMAINDER = RowPass("algebraic.remainder", HEADERS / "remainder.h", "S", whole={**LEVEL, "x": "S"}, reads={"b": "S"}, writes={"y": "S"})
+KERNELS = KernelFile(Path(__file__).parent / "headers/algebraic.h")
+FILL = KERNELS["algebraic.fill"]
+SCALE_ROWS = KERNELS["algebraic.scale_rows"]
+MULTIPLY = KERNELS["algebraic.multiply"]
+INVERSE = KERNELS["algebraic.inverse"]
+SMOOTH = KERNELS["algebraic.smooth"]
+REMAINDER = KERNELS["algebraic.remainder"]
 WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
 Matrix = Any  # a scipy.sparse.csr_array
 

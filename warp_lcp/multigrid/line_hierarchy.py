@@ -21,48 +21,23 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.stencil import AROUND
 from warp_lcp.problem.protocol import HasStencil, Operator, has
-from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows import Bound, KernelFile, Rows
 from warp_lcp.rows.fields import Padding, zeros
 from warp_lcp.rows.program import Program
 
-HEADERS = Path(__file__).parent / "headers"
-WEIGHTS = {"weights": "S"}
-FILL = RowPass(
-    "lines.fill", HEADERS / "compact_fill.h", "S", stencil=("D", "W"), reads={"free": wp.uint8, "shift": wp.float64},
-    optional=("shift", "weight"), writes={"made": "S", "weight": "S"}, whole=WEIGHTS, numbers={"size": wp.int64},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/lines.h")
+FILL = KERNELS["lines.fill"]
 FACTORS = {"fx": int, "fy": int}
-EDGES = RowPass(
-    "lines.edges", HEADERS / "transfer_edges.h", "S", reads={"d": "S"}, whole={**WEIGHTS, "shares": "S"},
-    numbers={"size": wp.int64, **FACTORS}, constants={"SAME": 0, "RESTRICTION": 0},
-)  # fmt: skip
-CORNERS = RowPass(
-    "lines.corners", HEADERS / "transfer_corners.h", "S", reads={"d": "S"}, whole={**WEIGHTS, "shares": "S"},
-    numbers={"size": wp.int64, **FACTORS}, constants={"SAME": 0, "RESTRICTION": 0},
-)  # fmt: skip
-GALERKIN = RowPass(
-    "lines.galerkin", HEADERS / "galerkin.h", "S", finer=True, other={"unused": "S"}, writes={"coarse_d": "S"},
-    whole={**WEIGHTS, "diagonals": "S", "shares": "S", "restricts": "S", "coarse_weights": "S"},
-    numbers={"size": wp.int64, "coarse_size": wp.int64, "cells": int}, constants={"FX": 2, "FY": 2},
-)  # fmt: skip
-LINE = {**WEIGHTS, "diagonals": "S", "pivots": "S", "multiples": "S"}
-STRIDE = {"size": wp.int64, "step": wp.int64, "count": int}
-FACTOR = RowPass("lines.factor", HEADERS / "line_factors.h", "S", reads={"unused": "S"}, whole=LINE, numbers=STRIDE)
-LINES: dict[str, Any] = {
-    "stencil": ("S", "S"), "reads": {"b": "S", "pivots": "S", "multiples": "S"}, "writes": {"x": "S", "t": "S"}, "whole": WEIGHTS,
-}  # fmt: skip
-ZEBRA_X = RowPass("lines.zebra_x", HEADERS / "zebra_x.h", "S", **LINES, numbers={"size": wp.int64, "color": int})
-ZEBRA_Y = RowPass("lines.zebra_y", HEADERS / "zebra_y.h", "S", **LINES, numbers={**STRIDE, "color": int})
-RESIDUAL = RowPass("lines.residual", HEADERS / "compact_residual.h", "S", stencil=("S", "S"), reads={"x": "S", "b": "S"}, writes={"t": "S"})
-DOWN = RowPass(
-    "lines.down", HEADERS / "share_down.h", "S", finer=True, other={"t": "S", "shares": "S"}, writes={"coarse": "S"},
-    numbers={"size": wp.int64, "cells": int, **FACTORS},
-)  # fmt: skip
-UP = RowPass(
-    "lines.up", HEADERS / "share_up.h", "S", other={"coarse": "S"}, reads={"d": "S"}, writes={"x": "S"}, whole={"shares": "S"},
-    numbers={"size": wp.int64, "add": bool},
-)  # fmt: skip
-ZERO = RowPass("lines.zero", HEADERS / "zero.h", "S", writes={"x": "S"})
+EDGES = KERNELS["lines.edges"]
+CORNERS = KERNELS["lines.corners"]
+GALERKIN = KERNELS["lines.galerkin"]
+FACTOR = KERNELS["lines.factor"]
+ZEBRA_X = KERNELS["lines.zebra_x"]
+ZEBRA_Y = KERNELS["lines.zebra_y"]
+RESIDUAL = KERNELS["lines.residual"]
+DOWN = KERNELS["lines.down"]
+UP = KERNELS["lines.up"]
+ZERO = KERNELS["lines.zero"]
 SHORT = 3  # cells of an axis that is not coarsened any more
 COLUMNS = 256  # that one thread of a CPU solves for together: their cells of a row are vectors, and the rows stay in its cache
 EVEN = 0.5  # least ratio of weights along the two axes for point sweeps

@@ -12,7 +12,7 @@ import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.problem.protocol import FLUID
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.readings import Reading
 
 options: dict[str, Any] = {"enable_backward": False, "module": "warp_lcp.components"}
@@ -76,22 +76,13 @@ if TYPE_CHECKING:
 
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]
-HEADERS = Path(__file__).parent / "headers"
 ROUNDED = 1e-10  # of the terms of a sum whose weights were computed
 FACES, UNIFORM = dict.fromkeys(("face_x", "face_y", "face_z"), "F"), dict.fromkeys(("cx", "cy", "cz"), wp.float64)
-SINGLETONS = RowPass("components.singletons", HEADERS / "singletons.h", wp.float32, writes={"parent": wp.int32, "grounded": wp.uint8})
-UNITE = RowPass(
-    "components.unite", HEADERS / "unite.h", wp.float32, ordered=True, reads={"cells": wp.int8, **FACES}, optional=tuple(FACES),
-    whole={"parent": wp.int32}, numbers=UNIFORM,
-)  # fmt: skip
-GROUND = RowPass(
-    "components.ground", HEADERS / "ground.h", wp.float32, reads={"cells": wp.int8, **FACES, "shift": "F"}, optional=(*FACES, "shift"),
-    whole={"parent": wp.int32, "grounded": wp.uint8}, numbers=UNIFORM,
-)  # fmt: skip
-COUNT = RowPass(
-    "components.count", HEADERS / "count_floating.h", wp.float32, whole={"count": wp.int32},
-    reads={"cells": wp.int8, "parent": wp.int32, "grounded": wp.uint8},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/components.h")
+SINGLETONS = KERNELS["components.singletons"]
+UNITE = KERNELS["components.unite"]
+GROUND = KERNELS["components.ground"]
+COUNT = KERNELS["components.count"]
 
 
 class FloatingComponents:

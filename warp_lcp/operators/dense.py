@@ -13,18 +13,12 @@ from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, real_array, relative_rounding
 
-HEADERS, FIELDS = Path(__file__).parent / "headers", dict.fromkeys(("b", "lower", "upper"), "S")
-PRODUCT = RowPass(
-    "dense.product", HEADERS / "dense_product.h", "S", whole={"a": "A", "x": "S"}, writes={"y": "S"},
-    numbers={"size": wp.int64, "transposed": bool},
-)  # fmt: skip
-RELAX = RowPass(
-    "dense.relax", HEADERS / "dense_relax.h", "S", whole={"a": "A"}, reads=FIELDS, writes={"x": "S"},
-    numbers={"omega": wp.float64, "forward": bool},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
+PRODUCT = KERNELS["dense.product"]
+RELAX = KERNELS["dense.relax"]
 # of the largest entries of two rows: what J M^-1 J' and assembly in float64 leave of symmetry
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)
 

@@ -15,14 +15,14 @@ from warp_lcp.operators.cell_lists import cells_of
 from warp_lcp.operators.padded_stencil import Ghosts, PaddedStencil, find_spans_kernel
 from warp_lcp.problem.pickling import Pickled
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, checked_device, real_array, relative_rounding
 from warp_lcp.rows.program import LaunchGraph, launch
 from warp_lcp.rows.program import copy as copy_array
 from warp_lcp.rows.vectors import Across
 
-HEADERS = Path(__file__).parent / "headers"
-COPY_CELLS = RowPass("grid_poisson.copy_cells", HEADERS / "copy.h", wp.int8, reads={"source": wp.int8}, writes={"to": wp.int8})
+KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
+COPY_CELLS = KERNELS["grid_poisson.copy_cells"]
 
 
 class GridOperator(Pickled):

@@ -13,33 +13,15 @@ from warp_lcp.operators.grid_operator import GridOperator, check_coefficients
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import real_array
 from warp_lcp.rows.vectors import Sums
 
-HEADERS = Path(__file__).parent / "headers"
-CELLS = {"cells": wp.int8}
-FIELDS = ("fx", "fy", "fz")
-AROUND = dict.fromkeys(("around_x", "around_y", "around_z"), bool)
-
-COUNT_FACES = RowPass(
-    "grid_poisson.count_faces", HEADERS / "count_faces.h", wp.uint8, reads=CELLS, writes={"diagonal": wp.uint8}, numbers=AROUND
-)
-FACES: dict[str, Any] = {"optional": (*FIELDS, "shift"), "numbers": dict.fromkeys(("nx", "ny", "nz"), "S")}
-GIVEN = dict.fromkeys(("FIELD_X", "FIELD_Y", "FIELD_Z"), 0)  # which of them are fields
-DIAGONAL = RowPass(
-    "grid_poisson.diagonal", HEADERS / "diagonal.h", "S", reads={**CELLS, **dict.fromkeys((*FIELDS, "shift"), "S")},
-    writes={"diagonal": "S"}, constants=GIVEN | {"SHIFTED": 0}, **FACES,
-)  # fmt: skip
-WEIGHTS = RowPass(
-    "grid_poisson.weights", HEADERS / "weights.h", "S", reads={**CELLS, **dict.fromkeys(FIELDS, "S")},
-    writes=dict.fromkeys(("wx", "wy", "wz"), "S"), constants=GIVEN, **FACES,
-)  # fmt: skip
-FACE_GRADIENT = RowPass(
-    "grid_poisson.face_gradient", HEADERS / "face_gradient.h", wp.float64, reads={**CELLS, "multiplier": wp.float64, "x": wp.float64},
-    writes=dict.fromkeys(("face_x", "face_y", "face_z", "shift"), wp.float64), optional=("face_x", "face_y", "face_z", "shift"),
-    sums=("sum_x", "sum_y", "sum_z", "sum_shift"),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
+COUNT_FACES = KERNELS["grid_poisson.count_faces"]
+DIAGONAL = KERNELS["grid_poisson.diagonal"]
+WEIGHTS = KERNELS["grid_poisson.weights"]
+FACE_GRADIENT = KERNELS["grid_poisson.face_gradient"]
 
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.protocol import layout_of
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Across, Reduction, add_across
@@ -27,20 +27,11 @@ def weigh_kernel(weights: wp.array2d(dtype=wp.float64), c: wp.array(dtype=wp.flo
     out[i] = s
 
 
-HEADERS = Path(__file__).parent / "headers"
 ENTRIES = {"entry_rows": wp.int32, "blocks": wp.int32, "values": "V", "count": wp.int32}
-GATHER = RowPass(
-    "low_rank.gather", HEADERS / "gather_entries.h", wp.float64, whole={**ENTRIES, "x": "S", "mask": "K"}, optional=("mask",),
-    numbers={"width": int, "rank": int}, sums=("first",), constants={"FUSED": 1},
-)  # fmt: skip
-SCATTER = RowPass(
-    "low_rank.scatter", HEADERS / "scatter_entries.h", wp.float64, optional=("mask",), numbers={"width": int, "sign": wp.float64},
-    whole={**ENTRIES, "factors": wp.float64, "mask": "K", "base": "S", "result": "S"}, constants={"FUSED": 1},
-)  # fmt: skip
-DIAGONAL = RowPass(
-    "low_rank.diagonal", HEADERS / "diagonal_entries.h", wp.float64, whole={**ENTRIES, "weights": wp.float64, "result": wp.float64},
-    numbers={"width": int, "rank": int},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
+GATHER = KERNELS["low_rank.gather"]
+SCATTER = KERNELS["low_rank.scatter"]
+DIAGONAL = KERNELS["low_rank.diagonal"]
 CUDA_THREADS = 1024  # of a gather; each keeps sums for all columns
 
 

@@ -14,16 +14,13 @@ from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import StoredStencil
 from warp_lcp.problem.protocol import FLUID
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import Padding, zeros
 from warp_lcp.rows.layout import Pattern
 from warp_lcp.rows.vectors import Sums
 
-RECOGNIZE = RowPass(
-    "matrix_stencil.recognize", Path(__file__).parent / "headers" / "recognize.h", wp.float64, writes={"made": wp.float64},
-    whole={"ptr": wp.int32, "col": wp.int32, "a": wp.float64, "middle": wp.float64, "weights": wp.float64}, optional=("weights",),
-    numbers={**dict.fromkeys(("nx", "ny", "nz", "full", "kept"), int), "size": wp.int64}, sums=("wrong", "centers", "differ", "positive"),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
+RECOGNIZE = KERNELS["matrix_stencil.recognize"]
 LEAST = 3  # cells of an axis: with fewer, offsets along it and across it are the same
 LOWER = ((-1, 0, 0), (0, -1, 0), (0, 0, -1))  # neighbors of lower faces
 SAMPLED = 8  # rows from the middle one on whose offsets tell the box: side by side, for most are not on its border then

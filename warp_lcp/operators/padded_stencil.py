@@ -16,21 +16,15 @@ from typing import Any, Protocol, no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows import Bound, KernelFile, Rows
 from warp_lcp.rows.fields import CPU_CHUNK, Padding
 from warp_lcp.rows.layout import Pattern, check_memory, put, stencil_struct
 from warp_lcp.rows.program import Launch, Task
 
-HEADERS = Path(__file__).parent / "headers"
-PRODUCT = RowPass(
-    "stencil.product", HEADERS / "stencil_product.h", "S", stencil=("D", "W"), reads={"x": "S", "b": "S"}, optional=("b",),
-    writes={"y": "S"},
-)  # fmt: skip
-RELAX = RowPass(
-    "stencil.relax", HEADERS / "stencil_relax.h", "S", stencil=("D", "W"), reads={"b": "S", "lower": "S", "upper": "S"},
-    writes={"x": "S"}, numbers={"omega": "S", "color": int},
-)  # fmt: skip
-WRAP = RowPass("stencil.wrap", HEADERS / "wrap.h", "S", writes={"x": "S"}, numbers={"cells": int, "step": wp.int64})
+KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
+PRODUCT = KERNELS["stencil.product"]
+RELAX = KERNELS["stencil.relax"]
+WRAP = KERNELS["stencil.wrap"]
 CHUNK = wp.constant(CPU_CHUNK)
 SPAN_CELLS = wp.constant(16)  # spans begin at multiples of this, so that rows stay whole vectors and aggregates whole
 

@@ -16,7 +16,7 @@ from warp_lcp.operators.renumbering import Renumbering, renumbering
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, kept, real_array, relative_rounding, zeros, zeros_like
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
@@ -39,22 +39,13 @@ def color_kernel(ptr: INDICES, col: INDICES, taken: INDICES, color: INDICES, n: 
         color[i] = c
 
 
-HEADERS = Path(__file__).parent / "headers"
 ROWS = {"ptr": wp.int32, "col": wp.int32}  # of a matrix: where each begins, columns of the entries
-PRODUCT = RowPass(
-    "sparse.product", HEADERS / "product.h", "S", whole={**ROWS, "a": "A", "x": "S"}, reads={"plus": "S"}, optional=("plus",),
-    writes={"y": "S"},
-)  # fmt: skip
-RELAX = RowPass(
-    "sparse.relax", HEADERS / "relax.h", "S", optional=("list",), numbers={"omega": wp.float64, "forward": bool, "first": int},
-    whole={**ROWS, "a": "A", "d": "A", "list": wp.int32, **dict.fromkeys(("b", "lower", "upper", "x"), "S")},
-)  # fmt: skip
-SURVEY = RowPass(
-    "sparse.survey", HEADERS / "survey.h", wp.float64, whole={**ROWS, "a": wp.float64},
-    writes=dict.fromkeys(("largest", "diagonal"), wp.float64), sums=("differ", "more"),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/sparse.h")
+PRODUCT = KERNELS["sparse.product"]
+RELAX = KERNELS["sparse.relax"]
+SURVEY = KERNELS["sparse.survey"]
 BLOCKS, FILL = (6, 5, 4, 3, 2), 1.2  # sizes of nodes' blocks, and the most entries that these may have in units of A's
-GATHER = RowPass("sparse.gather", HEADERS / "gather.h", "S", whole={"source": "S"}, reads={"order": wp.int32}, writes={"taken": "S"})
+GATHER = KERNELS["sparse.gather"]
 
 
 class SparseOperator(Pickled):

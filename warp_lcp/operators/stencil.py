@@ -19,21 +19,15 @@ from warp_lcp.operators.grid_operator import GridOperator
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import check_kept, check_storable, real_array
 from warp_lcp.rows.layout import Pattern
 from warp_lcp.rows.vectors import Sums
 
-HEADERS = Path(__file__).parent / "headers"
-DIAGONAL = RowPass(
-    "stencil.diagonal", HEADERS / "compact_diagonal.h", "S", stencil=("S", "W"), reads={"cells": wp.int8, "center": "S", "shift": "S"},
-    optional=("center", "shift"), writes={"made": "S"}, numbers={"number": "S"},
-)  # fmt: skip
-TRANSPOSED = RowPass("stencil.transposed", HEADERS / "stencil_transposed.h", "S", stencil=("D", "W"), reads={"x": "S"}, writes={"y": "S"})
-GRADIENT = RowPass(
-    "stencil.gradient", HEADERS / "stencil_gradient.h", wp.float64, reads={"cells": wp.int8, "multiplier": wp.float64, "x": wp.float64},
-    writes={"part": wp.float64}, optional=("part",), numbers=dict.fromkeys(("step", "row", "plane"), int), sums=("sum",),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
+DIAGONAL = KERNELS["stencil.diagonal"]
+TRANSPOSED = KERNELS["stencil.transposed"]
+GRADIENT = KERNELS["stencil.gradient"]
 MOST_IN_PLANE, MOST_IN_SPACE = 1 << 17, 1 << 14  # unknowns of a component whose null vectors are had by sparse factors, in a second or two
 CENTER = (0, 0, 0)
 AROUND = Pattern(tuple((x, y, 0) for y in (-1, 0, 1) for x in (-1, 0, 1) if x or y), symmetric=False, kind="arrays")  # all neighbors in 2-D

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
 from warp_lcp.rows.vectors import Sums
 
@@ -19,17 +19,10 @@ NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 INFINITY = 1e20  # a bound of this magnitude is infinite in files and to SciPy's and qpsolvers' users, as OSQP and CPLEX take it
 LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
 BITS = (1, 2)  # of a code: the lower bound is finite, the upper one is
-HEADERS, SIDES = Path(__file__).parent / "headers", {"lower": wp.float64, "upper": wp.float64}
-ENCODE = RowPass(
-    "bounds.encode", HEADERS / "encode.h", wp.float64, reads=SIDES, optional=("lower", "upper"), writes={"code": wp.uint8},
-    numbers={"least": wp.float64, "most": wp.float64}, sums=("others",),
-)  # fmt: skip
-FINITE = {"value": wp.float64, "infinite": wp.float64, "bit": int}
-CODE_ROWS = RowPass(
-    "bounds.code_rows", HEADERS / "code_rows.h", wp.float64, whole={"source": wp.float64}, writes={"code": wp.uint8}, numbers=FINITE,
-    sums=("others",),
-)  # fmt: skip
-DECODE = RowPass("bounds.decode", HEADERS / "decode.h", wp.float64, reads={"code": wp.uint8}, writes={"field": wp.float64}, numbers=FINITE)
+KERNELS = KernelFile(Path(__file__).parent / "headers/bound_codes.h")
+ENCODE = KERNELS["bounds.encode"]
+CODE_ROWS = KERNELS["bounds.code_rows"]
+DECODE = KERNELS["bounds.decode"]
 
 
 class Bounds:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, singledispatch
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem.bounds import HEADERS, INFINITE, LAUNCHED, Bounds
+from warp_lcp.problem.bounds import INFINITE, LAUNCHED, Bounds
 from warp_lcp.problem.pickling import OnHost, Pickled
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
 from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
-CHECK = RowPass(
-    "problem.check", HEADERS / "check.h", wp.float64, bounds=True, reads={"b": wp.float64, "unknown": wp.int8},
-    sums=("bad", "nan_lower", "nan_upper", "crossed", "no_lower", "no_upper"),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
+CHECK = KERNELS["problem.check"]
 
 
 @singledispatch

@@ -18,25 +18,17 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.problem.scale import estimated_scale
-from warp_lcp.rows import Known, RowPass, Rows
+from warp_lcp.rows import KernelFile, Known, Rows
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Sums
 
-HEADERS = Path(__file__).parent / "headers"
 EPS = float(np.finfo(np.float64).eps)
-f64, i8 = wp.float64, wp.int8
-NATURAL = RowPass(
-    "residual.natural", HEADERS / "natural.h", f64, bounds=True, reads={"x": f64, "y": f64, "d": "D", "unknown": i8},
-    numbers={"unit": f64}, sums=("square",),
-)  # fmt: skip
-UNKNOWN_SQUARE = RowPass("residual.unknown_square", HEADERS / "unknown_square.h", f64, reads={"b": f64, "unknown": i8}, sums=("square",))
-WITHIN = RowPass(
-    "residual.within", HEADERS / "within.h", f64, bounds=True, reads={"unknown": i8}, writes={"x": f64}, numbers={"keep": bool}
-)
-SETTLE_ISOLATED = RowPass(
-    "residual.settle_isolated", HEADERS / "settle_isolated.h", f64, bounds=True, reads={"d": "D", "b": f64, "unknown": i8},
-    writes={"x": f64},
-)  # fmt: skip
+f64 = wp.float64
+KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
+NATURAL = KERNELS["residual.natural"]
+UNKNOWN_SQUARE = KERNELS["residual.unknown_square"]
+WITHIN = KERNELS["residual.within"]
+SETTLE_ISOLATED = KERNELS["residual.settle_isolated"]
 
 
 class NaturalResidual:

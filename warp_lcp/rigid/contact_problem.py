@@ -21,23 +21,15 @@ from scipy.sparse.csgraph import connected_components
 
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_newton import ContactNewton
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 
 if TYPE_CHECKING:
     from warp_lcp.rigid.joints import JointRows
 
 YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
 MANY = 20_000  # sweeps, where nothing else helps
-_INDICES = ("one", "other", "starts")  # a contact's bodies, an island's first contact
-NNCG = RowPass(
-    "warp_lcp.rigid.contacts.nncg",
-    Path(__file__).parent / "headers" / "nncg.h",
-    wp.float64,
-    box={"residual": wp.float64, "rounds": wp.float64},  # of each island: relative to that of x = 0; iterations taken
-    whole=dict.fromkeys(("J", "b", "e", "d", "mu", "w", "g", "way", "best", "x"), wp.float64) | dict.fromkeys(_INDICES, wp.int32),
-    numbers={"q": int, "dim": int, "rtol": wp.float64, "most": int},
-    constants={"EACH": 8},  # iterations between looks at the residual, which costs as much as a sweep
-)
+KERNELS = KernelFile(Path(__file__).parent / "headers/contact_nncg.h")
+NNCG = KERNELS["warp_lcp.rigid.contacts.nncg"]
 
 
 class ContactImpulses(NamedTuple):

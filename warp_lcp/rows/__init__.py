@@ -1,7 +1,8 @@
 """Rows: what owns layout, bounds, sums, waves and launches of passes over grids; a method supplies what is done to a cell."""
 
+from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.layout import Known, Rows
 from warp_lcp.rows.row_pass import Bound, RowPass, Wave
 from warp_lcp.rows.sequence import Sequence
 
-__all__ = ["Bound", "Known", "RowPass", "Rows", "Sequence", "Wave"]
+__all__ = ["Bound", "KernelFile", "Known", "RowPass", "Rows", "Sequence", "Wave"]

@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
-from warp_lcp.rows.native import HEADERS, shared, text
+from warp_lcp.rows.native import HEADERS, sections, shared, text
 from warp_lcp.rows.program import Launch, is_recording, perform
 from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, ranges, team
 
@@ -46,7 +46,7 @@ class RowPass:
 
     Args:
         name: of the kernel, with the area before it: `projected_multigrid.assess`.
-        header: C++ row function.
+        header: C++ row function, or the header of an area in which it is `declared`.
         compute: what T stands for.
         stencil: types of the diagonal and the weights of `stencil.h`, if it has one. `affine` there is A x + b: of the stencil, or known.
         bounds: whether it has those of `bounds.h`.
@@ -68,6 +68,7 @@ class RowPass:
         largest: likewise, of which the largest counts; after the sums.
         ordered: whether tasks write what others read or write: on the CPU one thread takes them, in order.
         constants: numbers that are known when the kernel is made, with their usual values; those that are given are integers, and macros.
+        declared: the kernel's name in the header, see `kernel_file.py`; empty: the header is the row function alone.
 
     Raises:
         ValueError: a name cannot be one in C++, is the layer's own, or stands for two things; a role or a letter is of no array.
@@ -94,6 +95,7 @@ class RowPass:
     box: Mapping[str, Any] = field(default_factory=dict)
     listed: str = ""
     ordered: bool = False
+    declared: str = ""
 
     def __post_init__(self) -> None:
         """Check names, and make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
@@ -115,9 +117,19 @@ class RowPass:
         wrong |= {kind for kind in (self.compute, *numbers.values()) if isinstance(kind, str) and kind not in known}
         if wrong:
             expected = "names that are free, rings of fields, letters of arrays, a first field of a box that is not optional"
-            raise ValueError(f"{self.name}: {sorted(wrong)}: expected {expected}")
+            raise ValueError(f"{self.label}: {sorted(wrong)}: expected {expected}")
         if others := {name for name, kind in numbers.items() if not isinstance(kind, str) and kind not in PACKED}:
-            raise TypeError(f"{self.name}: {sorted(others)}: expected numbers of the types {', '.join(t.__name__ for t in PACKED)}")
+            raise TypeError(f"{self.label}: {sorted(others)}: expected numbers of the types {', '.join(t.__name__ for t in PACKED)}")
+
+    @functools.cached_property
+    def source(self) -> str:
+        """File and line of the declaration."""
+        return f"{self.header}:{sections(self.header)[self.declared].line if self.declared else 1}"
+
+    @functools.cached_property
+    def label(self) -> str:
+        """The name and where it is declared, for messages."""
+        return f"{self.name} ({self.source})" if self.declared else self.name
 
     @functools.cached_property
     def found(self) -> tuple[str, ...]:
@@ -145,7 +157,7 @@ class RowPass:
         """
         if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
             verb = {True: "needs", False: "takes no"}
-            raise TypeError(f"{self.name}: {verb[self.stencil is not None]} stencil, {verb[self.bounds]} bounds")
+            raise TypeError(f"{self.label}: {verb[self.stencil is not None]} stencil, {verb[self.bounds]} bounds")
         if self.box:
             given |= rows.place
             constants = tuple(self.constants.values())
@@ -153,10 +165,10 @@ class RowPass:
             try:
                 constants = tuple([index(given.pop(n)) if n in given else v for n, v in self.constants.items()]) if self.constants else ()
             except TypeError as error:
-                raise TypeError(f"{self.name}: {', '.join(self.constants)} are integers where given: {error}") from None
+                raise TypeError(f"{self.label}: {', '.join(self.constants)} are integers where given: {error}") from None
         if given.keys() != self._wanted:
             missing, unknown = sorted(self._wanted - given.keys()), sorted(given.keys() - self._wanted)
-            raise TypeError(f"{self.name}: missing {missing}, unknown {unknown}")
+            raise TypeError(f"{self.label}: missing {missing}, unknown {unknown}")
         types = [getattr(given[n], "dtype", None) for n in self.arrays]
         kind, weights, stored = NUMBERS, None, ()
         if bounds:
@@ -164,12 +176,12 @@ class RowPass:
             if length := code.size or lower.size or upper.size:
                 kind = "coded" if code.size else "fields"
                 if length != rows.size:
-                    raise ValueError(f"{self.name}: bounds have {length} elements, not {rows.size}")
+                    raise ValueError(f"{self.label}: bounds have {length} elements, not {rows.size}")
         if stencil is not None:
             d, weights, pattern = stencil.d, stencil.weights, getattr(stencil, "pattern", None)
             stored = (type(stencil), pattern, d.dtype, weights[0].dtype if weights else None)
             if d.size != (rows.other_size if self.finer else rows.size):
-                raise ValueError(f"{self.name}: the stencil has {d.size} elements, not {rows.other_size if self.finer else rows.size}")
+                raise ValueError(f"{self.label}: the stencil has {d.size} elements, not {rows.other_size if self.finer else rows.size}")
         key = (constants, kind, *stored, *types)
         made = self._forms.get(key)
         if made is None:
@@ -204,11 +216,11 @@ class RowPass:
             expected = letters.setdefault(kind, found) if isinstance(kind, str) else kind
             if not isinstance(value, wp.array) or found is not expected:
                 why = f", as {seen[kind]}" if isinstance(kind, str) and kind in seen else ""
-                raise TypeError(f"{self.name}: {name} is {found.__name__}, not an array of {expected.__name__}{why}")
+                raise TypeError(f"{self.label}: {name} is {found.__name__}, not an array of {expected.__name__}{why}")
             seen.setdefault(kind, name)
         used = {kind for kind in (*self.arrays.values(), *(self.stencil or ())) if isinstance(kind, str)}
         if others := [f"{seen[kind]} is {found.__name__}" for kind, found in letters.items() if found not in C]:
-            raise TypeError(f"{self.name}: {others[0]}: a letter stands for {', '.join(t.__name__ for t in C)}")
+            raise TypeError(f"{self.label}: {others[0]}: a letter stands for {', '.join(t.__name__ for t in C)}")
         return letters | dict.fromkeys(used - letters.keys(), wp.float32)  # of what is absent
 
     @functools.cached_property
@@ -228,23 +240,23 @@ class RowPass:
                 if not found and name in self.optional:
                     given[name] = None  # a slice of nothing has an address
                 if found != expected is not None and (found or name not in self.optional):
-                    raise ValueError(f"{self.name}: {name} has {found} elements, not {expected}")
+                    raise ValueError(f"{self.label}: {name} has {found} elements, not {expected}")
                 if found and not (value.is_contiguous and value.device is device):
                     why = f"on {value.device}, not {device}" if value.is_contiguous else "strided"
-                    raise ValueError(f"{self.name}: {name} is {why}")
+                    raise ValueError(f"{self.label}: {name} is {why}")
         if self.box:
             self._check_box(rows, {tuple(given[n].shape[-3:]) for n in self.box if given[n] is not None})
         if self.found and given["out"].size < len(self.found) * rows.places:
             least = f"fewer than {len(self.found) * rows.places}: {rows.places} threads for each sum"
-            raise ValueError(f"{self.name}: out has {given['out'].size} elements, {least}")
+            raise ValueError(f"{self.label}: out has {given['out'].size} elements, {least}")
 
     def _check_box(self, rows: Rows, shapes: set[tuple[int, ...]]) -> None:
         if len(shapes) > 1:
-            raise ValueError(f"{self.name}: fields have the shapes {', '.join(map(str, sorted(shapes)))}")
+            raise ValueError(f"{self.label}: fields have the shapes {', '.join(map(str, sorted(shapes)))}")
         for shape in shapes:
             k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # else a list
             if not self.listed and (rows.ends[0] > k or rows.ends[1] > j or rows.ends[2] > i):
-                raise ValueError(f"{self.name}: fields have the shape {shape}, the box ends at {rows.ends}")
+                raise ValueError(f"{self.label}: fields have the shape {shape}, the box ends at {rows.ends}")
 
 
 @functools.cache
@@ -333,7 +345,7 @@ class Form:
         sums += ["#undef EACH_FOUND"]
         common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
         before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', *each]
-        body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass
+        body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]  # there names may be those of the pass
         closed = ["}"] * bool(d.listed)
         macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
         tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
@@ -355,7 +367,7 @@ class Form:
             made.__dict__.update(scalars)  # which recorded launches read
             return made
         except struct.error as error:
-            raise TypeError(f"{self.declared.name}: {', '.join(f'{n} = {v!r}' for n, v in values.items())}: {error}") from None
+            raise TypeError(f"{self.declared.label}: {', '.join(f'{n} = {v!r}' for n, v in values.items())}: {error}") from None
 
     @functools.cached_property
     def kernel(self) -> Any:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol, no_type_check
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.native import HEADERS, text
 from warp_lcp.rows.program import Launch, Task, copy
 from warp_lcp.rows.readings import Reading
@@ -20,16 +22,14 @@ from warp_lcp.rows.team import Operation
 
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
-DOT = RowPass("vectors.dot", HEADERS / "dot.h", wp.float64, reads={"a": "A", "b": "B"}, sums=("ab",))
-ADD = RowPass("vectors.add", HEADERS / "add.h", "S", reads={"z": "S"}, writes={"x": "S"})  # x += z
-ADD_UP = RowPass(
-    "vectors.add_up", HEADERS / "add_up_columns.h", wp.float64, whole={"partials": wp.float64, "scalars": wp.float64},
-    numbers={"count": int, "slot": int},
-)  # fmt: skip
-CONVERT = RowPass("vectors.convert", HEADERS / "convert.h", "B", reads={"a": "A"}, writes={"b": "B"})
+KERNELS = KernelFile(Path(__file__).parent / "headers/vectors.h")
+DOT = KERNELS["vectors.dot"]
+ADD = KERNELS["vectors.add"]
+ADD_UP = KERNELS["vectors.add_up"]
+CONVERT = KERNELS["vectors.convert"]
 
 
-@wp.func_native("\n".join(["", text(HEADERS / "native.h"), text(HEADERS / "add_up.h"), ""]))
+@wp.func_native("\n".join(["", text(HEADERS / "native.h"), text(KERNELS.path, "add_up"), ""]))
 def add_up_span(partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int) -> wp.float64:
     """The sum of every stride-th of the partial sums from `offset` + `start` on."""
 

@@ -12,21 +12,14 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import version_of
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Settings
 from warp_lcp.solvers.spectrum import positive_diagonal, scaled_spectrum
 
-HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
-PROGRESS = RowPass(
-    "accelerated.progress", HEADERS / "progress.h", f64,
-    reads=dict.fromkeys(("x", "x_old", "y", "z", "y_z", "d"), f64) | {"unknown": wp.int8},
-    sums=("curvature", "metric", "turned", "size"),
-)  # fmt: skip
-EXTRAPOLATE = RowPass(
-    "accelerated.extrapolate", HEADERS / "extrapolate.h", f64, bounds=True, reads={"y": f64, "d": f64, "unknown": wp.int8},
-    writes=dict.fromkeys(("x", "x_old", "y_old", "z", "y_z"), f64), numbers={"beta": f64, "lipschitz": f64},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
+PROGRESS = KERNELS["accelerated.progress"]
+EXTRAPOLATE = KERNELS["accelerated.extrapolate"]
 MARGIN = 1.05  # Lanczos' estimate is from below
 FAR = 1.5  # times L: a step of more curvature is taken back
 NOISE = 1e-20  # relative (squared) length of a step below which its curvature is rounding

@@ -15,7 +15,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, check_taken, has
 from warp_lcp.problem.solve import PrecisionName, Solver, Step
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_sweep_kernel
@@ -30,11 +30,8 @@ MOST = 6  # unknowns of a block that a thread solves by active sets
 CHANGES = 60  # of a line's set; few are needed, and what is left is projected
 
 f64 = wp.float64
-SOLVE_LINE = RowPass(  # of each line's first cell
-    "grid_lines.solve", Path(__file__).parent / "headers" / "solve_line.h", f64, stencil=("D", "W"),
-    reads=dict.fromkeys(("b", "l", "u"), f64), writes={**dict.fromkeys(("x", "c", "q", "z"), f64), "s": wp.uint8},
-    numbers={"s1": wp.int64, "s2": wp.int64, "cells": int, "most": int, "color": int, "omega": f64}, constants={"AXIS": 0},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/gauss_seidel.h")
+SOLVE_LINE = KERNELS["grid_lines.solve"]
 
 
 class GridLines(Enum):

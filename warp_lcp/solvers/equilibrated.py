@@ -17,7 +17,7 @@ from warp_lcp.problem.protocol import HasRows, HasScale, has, version_of
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scaled
 from warp_lcp.problem.solve import IterateMemory, Step
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.dense_problem import (
     DenseProblem,
@@ -28,10 +28,8 @@ from warp_lcp.solvers.dense_problem import (
     without_contact,
 )
 
-UNITS = RowPass(
-    "equilibrated.units", Path(__file__).parent / "headers" / "units.h", wp.float64, reads={"x": wp.float64, "units": wp.float64},
-    writes={"scaled": wp.float64}, numbers={"inverse": bool},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
+UNITS = KERNELS["equilibrated.units"]
 ALIKE = 4.0  # rows whose units differ by no more stay as they are
 WAIT = 6  # steps without a residual below FALL times the smallest after which it is asked whether there is a solution
 FALL = 0.9

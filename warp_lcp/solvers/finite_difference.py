@@ -12,17 +12,14 @@ from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
-HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
-DIFFERENCE = RowPass(
-    "finite_difference.difference", HEADERS / "difference.h", f64, reads={"free": wp.uint8, "f": f64}, writes={"q": f64},
-    numbers={"over": f64},
-)  # fmt: skip
-SCALE = RowPass("finite_difference.scale", HEADERS / "divide_by_size.h", f64, reads={"r": f64, "d": f64}, writes={"z": f64})
+KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
+DIFFERENCE = KERNELS["finite_difference.difference"]
+SCALE = KERNELS["finite_difference.scale"]
 STEP = 1e-7  # relative to ||x|| / ||p||: half the digits of float64
 
 

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.krylov.conjugate_gradient import first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
-from warp_lcp.rows import RowPass, Wave
+from warp_lcp.rows import KernelFile, Wave
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Program
 from warp_lcp.rows.vectors import Reduction
@@ -23,15 +23,9 @@ SQUARE = wp.constant(STEP_SLOTS)  # slots of the device scalars after those of a
 ITERATIONS = wp.constant(STEP_SLOTS + 3)
 SLOTS = STEP_SLOTS + 5
 
-HEADERS = Path(__file__).parent / "headers"
-DIRECT = RowPass(
-    "grid_conjugate_gradient.direct", HEADERS / "conjugate_direction.h", "S", reads={"z": "S"}, writes={"q": "S"},
-    whole={"scalars": wp.float64}, constants={"BETA": BETA},
-)  # fmt: skip
-STEP_ALONG = RowPass(
-    "grid_conjugate_gradient.step", HEADERS / "conjugate_step.h", "S", stencil=("F", "S"), reads={"q": "S"}, writes={"x": "S", "r": "S"},
-    whole={"scalars": wp.float64}, numbers={"weighted": bool}, sums=("square",), constants={"STEP": STEP, "ITERATIONS": ITERATIONS},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h", {"BETA": BETA, "STEP": STEP, "ITERATIONS": ITERATIONS})
+DIRECT = KERNELS["grid_conjugate_gradient.direct"]
+STEP_ALONG = KERNELS["grid_conjugate_gradient.step"]
 ADVANCE = Wave("grid_conjugate_gradient.advance", (DIRECT, 0), (STEP_ALONG, 1))  # both planes are in the cache
 
 f64 = wp.array(dtype=wp.float64)

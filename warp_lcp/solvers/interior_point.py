@@ -21,7 +21,7 @@ from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
-from warp_lcp.rows import Known, RowPass, Wave
+from warp_lcp.rows import KernelFile, Known, RowPass, Wave
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
@@ -30,39 +30,15 @@ from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspac
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
-f64 = wp.float64
-HEADERS = Path(__file__).parent / "headers"
 LARGEST_START = 1e6  # of the residual's norm: ||b|| up to which it gives the start's size
-PAIRS = dict.fromkeys(("w", "v", "s", "t"), f64)
-DIRECTION = dict.fromkeys(("scale", "second", "joined", "tau"), f64)
-FORM = {"UPPER": 0, "FUSED": 0}  # whether there are upper bounds
 
-INSIDE = RowPass(
-    "interior_point.inside", HEADERS / "path_inside.h", f64, bounds=True, reads={"unknown": wp.int8, "d": "D"},
-    writes={"x": f64, "w": f64, "v": f64, "free": wp.uint8}, numbers={"unit": f64, "width": f64}, constants=FORM,
-)  # fmt: skip
-MULTIPLIERS = RowPass(
-    "interior_point.multipliers", HEADERS / "path_multipliers.h", f64, reads={"y": f64, "w": f64, "v": f64}, writes={"s": f64, "t": f64},
-    numbers={"least": f64}, sums=("total", "count"), constants=FORM,
-)  # fmt: skip
-CONDENSE = RowPass(
-    "interior_point.condense", HEADERS / "path_condense.h", f64, stencil=("F", "W"), bounds=True,
-    reads={"x": f64, "b": f64, "unknown": wp.int8, "free": wp.uint8, **PAIRS}, writes={"D": "Q", "r": "S"},
-    numbers={"scale": f64, "tau": f64}, sums=("square", "weighted"), constants=FORM,
-)  # fmt: skip
-MOVE = RowPass(
-    "interior_point.move", HEADERS / "path_move.h", f64, bounds=True, reads={"a": "S", "e": "S"}, writes={"x": f64, **PAIRS},
-    numbers=DIRECTION | {"length": f64}, sums=("total",), constants=FORM,
-)  # fmt: skip
-RATIOS = RowPass(
-    "interior_point.ratios", HEADERS / "path_ratios.h", f64, reads={"a": "S", "e": "S", **PAIRS}, whole={"longest": f64},
-    numbers=DIRECTION, sums=("products",), constants=FORM,
-)  # fmt: skip
-CENTER = RowPass(
-    "interior_point.center", HEADERS / "path_center.h", f64, reads={"e": "S", "y": f64, "free": wp.uint8, "D": "S", **PAIRS},
-    optional=("y", "D"), writes={"a": "S", "r": "S"}, numbers={"scale": f64, "tau": f64, "carried": bool},
-    sums=("weighted",), constants=FORM,
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/interior_point.h")
+INSIDE = KERNELS["interior_point.inside"]
+MULTIPLIERS = KERNELS["interior_point.multipliers"]
+CONDENSE = KERNELS["interior_point.condense"]
+MOVE = KERNELS["interior_point.move"]
+RATIOS = KERNELS["interior_point.ratios"]
+CENTER = KERNELS["interior_point.center"]
 ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))  # a plane is condensed when the one above it has moved
 
 

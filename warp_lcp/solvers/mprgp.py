@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,7 +21,7 @@ from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
@@ -32,18 +32,11 @@ from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system, 
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.sweep import Diagonal
 
-HEADERS, f64, u8 = Path(__file__).parent / "headers", wp.float64, wp.uint8
-SPLIT = RowPass(  # on grids: y = A x + b is computed on the way and not stored
-    "mprgp.split", HEADERS / "split.h", f64, stencil=("D", "W"), bounds=True, reads={"x": f64, "b": f64, "unknown": wp.int8},
-    writes={"free": u8, "g": "S", "step": "S"}, numbers={"inverse": f64, "slack": f64},
-    sums=("norm", "chopped", "reduced", "release", "moved", "active", "energy"),
-)  # fmt: skip
-SPLIT_KNOWN = replace(SPLIT, name="mprgp.split_known", header=HEADERS / "split_known.h")
-RELEASE = RowPass(
-    "mprgp.release", HEADERS / "release.h", f64, stencil=("D", "W"), bounds=True, reads={"x": f64, "step": "S", "q": "S"},
-    writes={"to": f64, "free": u8, "g": "S"}, numbers={"part": f64, "length": f64},
-)  # fmt: skip
-GAIN = RowPass("mprgp.gain", HEADERS / "gain.h", f64, reads={"along": "S", "q": "S", "g": "S"}, sums=("gain", "curvature"))
+KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
+SPLIT = KERNELS["mprgp.split"]
+SPLIT_KNOWN = KERNELS["mprgp.split_known"]
+RELEASE = KERNELS["mprgp.release"]
+GAIN = KERNELS["mprgp.gain"]
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
 ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding
 NOISE = 1e-14  # of the energy: falls of less, over as many steps as patience lasts, are what rounding its sum may pretend

@@ -13,18 +13,15 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.residual import WITHIN
 from warp_lcp.problem.solve import PrecisionName, Step
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
 
-HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
-TAKEN = RowPass("nncg.taken", HEADERS / "taken.h", f64, reads={"x": f64, "unknown": wp.int8}, writes={"g": f64}, sums=("square",))
-CARRY_ON = RowPass(
-    "nncg.carry_on", HEADERS / "carry_on.h", f64, bounds=True, reads={"g": f64, "unknown": wp.int8}, writes={"x": f64, "along": f64},
-    whole={"squares": f64},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
+TAKEN = KERNELS["nncg.taken"]
+CARRY_ON = KERNELS["nncg.carry_on"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,47 +19,26 @@ import warp as wp
 from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.rows import RowPass, Rows, Wave
+from warp_lcp.rows import KernelFile, RowPass, Rows, Wave
 from warp_lcp.rows.fields import PaddedLayout
 from warp_lcp.rows.vectors import Sums, convert
 
 LEAST_Q = 1e-6  # of q where it divides: measured; less makes D needlessly large, more slows convergence
 
-f64, u8 = wp.float64, wp.uint8
-HEADERS = Path(__file__).parent / "headers"
+f64 = wp.float64
 NUMBERS = {"share": f64, "over": f64, "kinks": f64, "seed": wp.int64}
 FORM = {"NATURAL": 0, "UPPER": 0, "PENALIZED": 0, "RANDOM": 0, "FUSED": 0}  # what of the maps a problem needs: the rest is not computed
 
 
-def _flat(name: str, writes: dict[str, Any], sums: tuple[str, ...], **numbers: Any) -> RowPass:
-    """Return a pass over the values of a map."""
-    reads = {"x": f64, "y": f64, "unknown": wp.int8, "d": "D"}
-    declared = NUMBERS | {"unit": f64} | numbers
-    header = HEADERS / f"map_{name}.h"
-    return RowPass(
-        f"nonsmooth_map.{name}", header, f64, bounds=True, reads=reads, writes=writes, numbers=declared, sums=sums, constants=FORM
-    )
-
-
-CONDENSING = {"scale": f64, "least": f64, "drop": bool}
-MERIT = _flat("merit", {}, ("merit",))
-VALUES = _flat("values", {"values": f64}, ())
-CONDENSE = _flat("condense", {"D": f64, "r": "S", "free": u8}, ("merit",), **CONDENSING)
-WEIGHTED = _flat("weighted", {"by_x": f64, "by_y": f64}, ("merit",))
-GRADIENT = RowPass(
-    "nonsmooth_map.gradient", HEADERS / "map_gradient.h", f64, reads={"product": f64, "last": f64, "unknown": wp.int8, "d": "D"},
-    writes={"gradient": f64}, numbers={"unit": f64}, sums=("square", "inner"),
-)  # fmt: skip
-ADVANCE = RowPass(
-    "nonsmooth_map.advance", HEADERS / "map_advance.h", f64, bounds=True, reads={"base": f64, "e": "S", "unknown": wp.int8},
-    writes={"x": f64}, numbers={"scale": f64, "projected": bool},
-)  # fmt: skip
-MOVE = RowPass("nonsmooth_map.move", HEADERS / "map_move.h", f64, reads={"e": "S"}, writes={"x": f64}, numbers={"step": f64})
-CONDENSE_AT_ROWS = RowPass(
-    "nonsmooth_map.condense_at_rows", HEADERS / "map_condense.h", f64, stencil=("F", "W"), bounds=True,
-    reads={"x": f64, "b": f64, "unknown": wp.int8}, writes={"D": "S", "r": "S"}, numbers=NUMBERS | CONDENSING,
-    sums=("square", "merit", "weighted"), constants=FORM | {"FUSED": 1},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/nonsmooth_map.h")
+MERIT = KERNELS["nonsmooth_map.merit"]
+VALUES = KERNELS["nonsmooth_map.values"]
+CONDENSE = KERNELS["nonsmooth_map.condense"]
+WEIGHTED = KERNELS["nonsmooth_map.weighted"]
+GRADIENT = KERNELS["nonsmooth_map.gradient"]
+ADVANCE = KERNELS["nonsmooth_map.advance"]
+MOVE = KERNELS["nonsmooth_map.move"]
+CONDENSE_AT_ROWS = KERNELS["nonsmooth_map.condense_at_rows"]
 STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))  # a plane is condensed when the one above it has moved
 
 

@@ -15,14 +15,12 @@ from warp_lcp.operators.sparse import SparseOperator, greedy_colors
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.protocol import HasBlocks, HasRows, described, has, version_of
 from warp_lcp.problem.result import SolveResult
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import rows_of
 
 Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
-SELECT = RowPass(
-    "partition.select", Path(__file__).parent / "headers" / "select.h", wp.float64, optional=("less",), numbers={"kept": bool},
-    reads={"x": wp.float64, "less": wp.float64, "member": wp.uint8}, writes={"target": wp.float64},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
+SELECT = KERNELS["partition.select"]
 
 
 def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:

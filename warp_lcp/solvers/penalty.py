@@ -14,23 +14,16 @@ from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.principal_system import ON_FREE, principal_system
 
-HEADERS, f64, u8 = Path(__file__).parent / "headers", wp.float64, wp.uint8
-MOVE = RowPass(
-    "penalty.move", HEADERS / "penalty_move.h", f64, reads={"e": "S", "unknown": wp.int8, "side": wp.int8}, writes={"x": f64},
-    numbers={"size": f64},
-)  # fmt: skip
-SORT = RowPass(
-    "penalty.sort", HEADERS / "penalty_sort.h", f64, bounds=True, reads={"y": f64, "d": "D", "unknown": wp.int8},
-    writes={"x": f64, "side": wp.int8, "shift": f64, "free": u8, "inside": u8},
-    numbers={"rho": f64, "unit": f64, "first": bool, "keep": bool}, sums=("moved", "active", "square"),
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
+MOVE = KERNELS["penalty.move"]
+SORT = KERNELS["penalty.sort"]
 DOMINANT = 4.0  # residual over the springs' error from which on something else is to be mended; |A D^-1| <= 2 on grids
 SHARE = 0.1  # of the tolerance that the penalty's own error may take
 LEAST_RAISE = 10.0  # factor by which rho grows at least

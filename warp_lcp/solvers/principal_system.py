@@ -31,7 +31,7 @@ from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import HasStencil, has
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import rows_of
@@ -42,41 +42,22 @@ from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.principal_system_sparse import MatrixSystem, SparseSystem
 
 NUDGES = (0.0, 1e-12, 1e-9, 1e-6)  # shifts of a singular banded block, in units of the matrix's largest column sum
-HEADERS = Path(__file__).parent / "headers"
-f64, i8, u8 = wp.float64, wp.int8, wp.uint8
-ANY_STENCIL = ("D", "W")
 
-CLASSIFY = RowPass(
-    "active_set.classify", HEADERS / "classify.h", f64, stencil=ANY_STENCIL, bounds=True, reads={"unknown": i8},
-    writes={"x": f64, "free": u8, "g": "S"}, numbers={"scale": f64}, sums=("moved", "active", "shifted", "square"),
-)  # fmt: skip
-ALL_FREE = RowPass("active_set.all_free", HEADERS / "all_free.h", f64, reads={"unknown": i8}, writes={"free": u8})
-ON_FREE = RowPass(
-    "active_set.on_free", HEADERS / "on_free.h", f64, reads={"y": f64, "free": u8}, writes={"g": "S"}, numbers={"scale": f64},
-    sums=("square",),
-)  # fmt: skip
-STEP = RowPass(
-    "active_set.step", HEADERS / "step.h", f64, bounds=True, reads={"x": f64, "z": "S"}, writes={"along": "S", "to": f64, "kept": f64},
-    optional=("x", "z", "to", "kept"), numbers={"beta": f64, "step": f64, "guarded": bool},
-)  # fmt: skip
-SHIFT = RowPass(
-    "principal_system.shift", HEADERS / "shift.h", "S", reads={"d": "D", "free": wp.uint8, "shift": wp.float64}, optional=("shift",),
-    writes={"diagonal": "S", "weight": "S"}, numbers={"unit": wp.float64},
-)  # fmt: skip
-MASK = RowPass(
-    "principal_system.mask", HEADERS / "mask.h", wp.float64, reads={"direction": wp.float64, "free": wp.uint8, "shift": wp.float64},
-    optional=("shift",), writes={"q": wp.float64},
-)  # fmt: skip
-DIVIDE = RowPass(
-    "principal_system.divide", HEADERS / "divide.h", wp.float64, reads={"r": wp.float64, "d": wp.float64}, writes={"z": wp.float64}
-)
+KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
+CLASSIFY = KERNELS["active_set.classify"]
+ALL_FREE = KERNELS["active_set.all_free"]
+ON_FREE = KERNELS["active_set.on_free"]
+STEP = KERNELS["active_set.step"]
+SHIFT = KERNELS["principal_system.shift"]
+MASK = KERNELS["principal_system.mask"]
+DIVIDE = KERNELS["principal_system.divide"]
 
 
 def projected_move(
     rows: Rows, bounds: list[Any], x: Any, along: Any, length: float, to: Any, *, z: Any = None, beta: float = 0.0, kept: Any = None,
     guarded: bool = True,
 ) -> None:  # fmt: skip
-    """Set `to` = clip(x + length along, l, u) where the direction is not 0; see `step.h`."""
+    """Set `to` = clip(x + length along, l, u) where the direction is not 0; see `active_set.h`."""
     fields = {"x": x, "z": z, "along": along, "to": to, "kept": kept}
     STEP.bind(rows, bounds=bounds, beta=beta, step=length, guarded=guarded, **fields).launch()
 

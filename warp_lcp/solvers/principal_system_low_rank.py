@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.operators.low_rank import ENTRIES, LowRankOperator
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.operators.low_rank import LowRankOperator
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers.projected_multigrid_kernels import ZAP, ZAZ
@@ -58,17 +58,10 @@ def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
     scalars[ZAP] += zp
 
 
-HEADERS = Path(__file__).parent / "headers"
-SQUARES = RowPass(
-    "low_rank_correction.squares", HEADERS / "square_entries.h", wp.float64, whole={**ENTRIES, "d": "D", "squares": wp.float64},
-    numbers={"width": int, "rank": int},
-)  # fmt: skip
-SLOTS = {"slots": int, "size": wp.int64}
-DOTS = RowPass("low_rank_correction.dots", HEADERS / "slot_dots.h", "S", whole={"Z": "S"}, reads={"r": "S"}, numbers=SLOTS, sums=("first",))
-SUBTRACT = RowPass(
-    "low_rank_correction.subtract", HEADERS / "slot_subtract.h", "S", whole={"Z": "S", "factors": wp.float64}, reads={"d": "D"},
-    writes={"z": "S"}, numbers=SLOTS,
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/low_rank_correction.h")
+SQUARES = KERNELS["low_rank_correction.squares"]
+DOTS = KERNELS["low_rank_correction.dots"]
+SUBTRACT = KERNELS["low_rank_correction.subtract"]
 STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
 SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
 FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts

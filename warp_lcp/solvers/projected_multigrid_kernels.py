@@ -1,7 +1,6 @@
 # mypy: ignore-errors
 """Passes of the projected multigrid method: a CG step, and the residual, active set and right-hand side after it; plans of the step."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_passes import ASCEND
 from warp_lcp.multigrid.hierarchy import Level
-from warp_lcp.rows import Bound, RowPass, Wave
+from warp_lcp.rows import Bound, KernelFile, Wave
 from warp_lcp.solvers.descent import CREEP, STALL
 
 # Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, and so are ZAZ ... GP.
@@ -32,47 +31,20 @@ LEAST_REST = wp.constant(wp.float64(1e-3))  # of a correction's energy that must
 
 f64 = wp.array(dtype=wp.float64)
 
-HEADERS = Path(__file__).parent / "headers"
 SLOT = {"SIZE": SIZE, "BETA": BETA, "STEP": STEP, "PER_SIZE": PER_SIZE}
-PRODUCTS = ("zaz", "zap", "gz", "gp")
 
-UPDATE = RowPass(
-    "projected_multigrid.update", HEADERS / "update.h", wp.float64, bounds=True, reads={"z": "S"}, writes={"x": wp.float64, "q": "S"},
-    whole={"scalars": wp.float64}, constants=SLOT,
-)  # fmt: skip
-ASSESS = RowPass(
-    "projected_multigrid.assess", HEADERS / "assess.h", wp.float64, stencil=("D", "W"), bounds=True,
-    reads={"x": wp.float64, "b": wp.float64, "unknown": wp.int8}, writes={"free": "F", "g": "S"},
-    by_row={"changed": wp.uint8, "away": wp.uint8}, optional=("away",), whole={"scalars": wp.float64}, numbers={"classify": bool},
-    sums=("norm", "moved", "active", "energy"), constants=SLOT | {"MINIMUM_MAP": 0, "ROUNDED": 0},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/projected_multigrid.h", SLOT)
+UPDATE = KERNELS["projected_multigrid.update"]
+ASSESS = KERNELS["projected_multigrid.assess"]
 ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))  # a plane is assessed when the one above it has moved
-MEASURE = RowPass(
-    "projected_multigrid.measure", HEADERS / "measure.h", "S", stencil=("F", "S"), reads={"z": "S", "q": "S", "g": "S"}, sums=PRODUCTS,
-)  # fmt: skip
-MEASURE_AGAIN = replace(
-    MEASURE, name="projected_multigrid.measure_again", header=HEADERS / "measure_again.h", sums=(), whole={"sums": wp.float64},
-    numbers={"place": int, "lines": int, "places": int},
-)  # fmt: skip
+MEASURE = KERNELS["projected_multigrid.measure"]
+MEASURE_AGAIN = KERNELS["projected_multigrid.measure_again"]
 CLIMB = Wave("projected_multigrid.climb", *ASCEND.stages, (MEASURE, 3))  # the last leg of a cycle: z is still in the cache
-HOLD = RowPass(
-    "projected_multigrid.hold", HEADERS / "hold.h", wp.float64, bounds=True, reads={"g": "S"}, writes={"x": wp.float64},
-    by_row={"away": wp.uint8}, constants={"ROUNDED": 0},
-)  # fmt: skip
-RIGHT_SIDE = RowPass(
-    "projected_multigrid.right_side", HEADERS / "right_side.h", wp.float64, stencil=("D", "W"),
-    reads={"x": wp.float64, "b": wp.float64, "free": "F"}, writes={"g": "S"}, by_row={"away": wp.uint8},
-    whole={"scalars": wp.float64}, numbers={"around_y": bool, "around_z": bool}, constants=SLOT,
-)  # fmt: skip
-GAPS = RowPass(
-    "projected_multigrid.gaps", HEADERS / "gaps.h", wp.float64, bounds=True, reads={"x": wp.float64, "unknown": wp.int8},
-    writes={"lo": "S", "hi": "S"}, optional=("hi",), whole={"scalars": wp.float64}, constants=SLOT,
-)  # fmt: skip
-MASK = RowPass("projected_multigrid.mask", HEADERS / "free_mask.h", wp.uint8, reads={"free": "F"}, writes={"mask": wp.uint8})
-UNDO = RowPass(
-    "projected_multigrid.undo", HEADERS / "undo.h", wp.float64, bounds=True, reads={"x": wp.float64, "q": "S", "unknown": wp.int8},
-    writes={"before": wp.float64}, whole={"scalars": wp.float64}, constants=SLOT,
-)  # fmt: skip
+HOLD = KERNELS["projected_multigrid.hold"]
+RIGHT_SIDE = KERNELS["projected_multigrid.right_side"]
+GAPS = KERNELS["projected_multigrid.gaps"]
+MASK = KERNELS["projected_multigrid.mask"]
+UNDO = KERNELS["projected_multigrid.undo"]
 
 
 def measuring(finest: Level, direction: Any, out: Any) -> Bound:

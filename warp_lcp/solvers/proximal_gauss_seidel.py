@@ -13,12 +13,13 @@ import warp as wp
 
 from warp_lcp.problem.frictional_contact import FrictionalContact
 from warp_lcp.problem.solve import Precision, Step
-from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import Reduction, rows_of
 from warp_lcp.settings import Count, Settings, Share
 
-HEADERS, f64, i32 = Path(__file__).parent / "headers", wp.float64, wp.int32
+f64, i32 = wp.float64, wp.int32
+KERNELS = KernelFile(Path(__file__).parent / "headers/proximal_gauss_seidel.h")
 GRAIN, COST = 32, 128  # contacts of a task on the CPU, and how many cells of a usual pass one costs as much as
 FACTOR, LEFT, STATE = 2, 3, 4  # of the state: two squared changes, what multiplies all r-factors, the squared residual
 BETTER = 0.9  # of the least residual: progress
@@ -28,28 +29,15 @@ LEAST = 0.05  # of the first r-factors
 @cache
 def passes(dim: int, q: int) -> SimpleNamespace:
     """Return the passes over contacts of `dim` rows between bodies of q velocities."""
-    contacts = {"contact": i32, "one": i32, "other": i32}
-    reals = dict.fromkeys(("J", "b", "e", "laws", "w", "r"), f64)
-
-    def declared(name: str, **roles: Any) -> RowPass:
-        constants = {"DIM": dim, "Q": q, "FACTOR": FACTOR}
-        return RowPass(f"warp_lcp.proximal_gauss_seidel_{dim}_{q}.{name}", HEADERS / f"contact_{name}.h", f64, constants=constants, **roles)
-
+    module, constants = f"warp_lcp.proximal_gauss_seidel_{dim}_{q}", {"DIM": dim, "Q": q, "FACTOR": FACTOR}
+    names = ("sweep", "residual", "gather")
     return SimpleNamespace(
-        sweep=declared("sweep", box=contacts, whole={**reals, "g": f64, "state": f64}, numbers={"bodies": int}),
-        residual=declared("residual", box=contacts, whole=reals, sums=("square",)),
-        gather=declared("gather", box={"starts": i32}, whole={"sides": i32, "contact": i32, **dict.fromkeys(("J", "r", "w"), f64)}),
+        **{name: KERNELS.kernel(f"warp_lcp.proximal_gauss_seidel.{name}", module=module, constants=constants) for name in names}
     )
 
 
-CARRY = RowPass(
-    "proximal_gauss_seidel.carry", HEADERS / "contact_carry.h", f64, reads={"g": f64}, writes={"r": f64, "way": f64},
-    whole={"state": f64}, numbers={"now": int},
-)  # fmt: skip
-FOLLOW = RowPass(
-    "proximal_gauss_seidel.follow", HEADERS / "contact_follow.h", f64, writes={"w": f64, "before": f64, "way": f64},
-    whole={"state": f64}, numbers={"now": int},
-)  # fmt: skip
+CARRY = KERNELS["proximal_gauss_seidel.carry"]
+FOLLOW = KERNELS["proximal_gauss_seidel.follow"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,19 +14,16 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.solve import PrecisionName, Step
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
 from warp_lcp.solvers.principal_system import ON_FREE, principal_system, projected_move
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
 
-HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
-BETWEEN = RowPass(
-    "subspace.between", HEADERS / "between.h", f64, bounds=True, reads={"x": f64, "unknown": wp.int8}, writes={"free": wp.uint8},
-    sums=("moved", "held"),
-)  # fmt: skip
-FOLLOW = RowPass("subspace.follow", HEADERS / "follow.h", f64, bounds=True, reads={"old_lower": f64, "old_upper": f64}, writes={"x": f64})
+KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
+BETWEEN = KERNELS["subspace.between"]
+FOLLOW = KERNELS["subspace.follow"]
 ROUNDING = 1e-14  # relative change of the energy that is none
 
 

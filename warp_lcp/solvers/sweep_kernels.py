@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.problem.affine_bounds import AffineSide, bound_at
-from warp_lcp.rows import RowPass
+from warp_lcp.rows import KernelFile
 
 f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)
 ZERO = wp.constant(wp.float64(0.0))
@@ -138,7 +138,5 @@ def jacobi_kernel(d_type: Any) -> Any:
     return jacobi
 
 
-CHANGE = RowPass(  # out_of[0] is 0 before
-    "sweep.change", Path(__file__).parent / "headers" / "change.h", wp.float64, reads={"x": wp.float64}, writes={"old": wp.float64},
-    whole={"out_of": wp.float64},
-)  # fmt: skip
+KERNELS = KernelFile(Path(__file__).parent / "headers/gauss_seidel.h")
+CHANGE = KERNELS["sweep.change"]

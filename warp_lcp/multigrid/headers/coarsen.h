@@ -1,5 +1,17 @@
-// Diagonals and weights of aggregates from the rows of the finer level, if one of those or one beside them has changed: their faces depend on
-// both their cells. A row is the same to the last bit whichever kernel makes it. Equal weights: faces are counted in bytes, scaled at the end.
+// Kernels that build coarser levels: Galerkin products over aggregates, and the matrix of the
+// coarsest one.
+
+// kernel coarsen.aggregates: Diagonals and weights of aggregates from the rows of the finer level,
+// if one of those or one beside them has changed: their faces depend on both their cells. A row is
+// the same to the last bit whichever kernel makes it. Equal weights: faces are counted in bytes,
+// scaled at the end.
+//   compute    S
+//   stencil    F, S
+//   writes     S coarse_d, coarse_wx, coarse_wy, coarse_wz
+//   finer
+//   by_row     uint8 coarse_changed
+//   whole      uint8 changed
+//   numbers    int cells; bool periodic_x, periodic_y, periodic_z; S stiffen, held
 const int fx = pairs ? 2 : 1, z0 = L.fz*P.k, y0 = L.fy*P.j, z_last = z0 + deep - 1, y_last = y0 + wide - 1;
 const bool all = fx*L.fy*L.fz == 8, begins_y = y0 == 0, ends_y = y_last == L.n2 - 1, begins_z = z0 == 0, ends_z = z_last == L.n1 - 1;
 const auto due = [&]() {
@@ -85,3 +97,186 @@ if (make) {
         }
     }
 }
+
+// kernel coarsen.compact: As coarsen.aggregates, of a compact stencil: an aggregate's weights by offset,
+// sums over what its cells share with those of others
+//   compute    S
+//   stencil    F, W
+//   writes     S coarse_d
+//   finer
+//   by_row     uint8 coarse_changed
+//   whole      uint8 changed; S coarse_weights
+//   numbers    int cells; int64 coarse_size; bool periodic_x, periodic_y, periodic_z; S stiffen,
+//              held
+//   constants  MASK = 0
+const int fx = pairs ? 2 : 1, z0 = L.fz*P.k, y0 = L.fy*P.j;
+const auto due = [&]() {
+    for (int a = -1; a <= deep; ++a) for (int b = -1; b <= wide; ++b) {
+        int z = z0 + a, y = y0 + b;
+        if (periodic_z) z = (z + L.n1) % L.n1;
+        if (periodic_y) y = (y + L.n2) % L.n2;
+        if (z >= 0 && z < L.n1 && y >= 0 && y < L.n2 && changed[z*L.n2 + y]) return true; }
+    return false; };
+const bool make = due();
+coarse_changed[P.row] = make;
+if (make) {
+    EXACT_MATH
+    constexpr T least = sizeof(T) == 4 ? (T)1e-6 : (T)1e-14;  // of a diagonal: an excess below it is what rounding left
+    const bool all = fx*L.fy*L.fz == 8 || (L.n1 == 1 && fx*L.fy >= 4);
+    const int counts[3] = {cells, L.n2, L.n1}, factors[3] = {fx, L.fy, L.fz}; const bool turns[3] = {periodic_x, periodic_y, periodic_z};
+    for (int k = 0; k < n; ++k) {
+        const int first[3] = {fx*(P.first + k), y0, z0}; T sums[27], excess = 0, outer = 0;
+        for (int o = 0; o < 27; ++o) sums[o] = 0;
+        for (int z = 0; z < deep; ++z) for (int y = 0; y < wide; ++y) for (int x = 0; x < fx && first[0] + x < cells; ++x) {
+            const long long i = fx*k + x + y*yp + z*zp; const T e = diagonal((int)i); T rest = e;
+            if (e == 0) continue;
+            const auto visit_turning = [&](int X, int Y, int Z, T w) {  // along which axes a neighbor is in another aggregate, and whether it is free
+                const int at[3] = {first[0] + x + X, first[1] + y + Y, first[2] + z + Z}; const int steps[3] = {X, Y, Z};
+                const long long strides[3] = {1, yp, zp}; long long q = i; int place = 13;
+                for (int a = 0; a < 3; ++a) {
+                    const int beyond = at[a] < 0 ? -1 : at[a] >= counts[a] ? 1 : 0;
+                    q += steps[a]*strides[a];
+                    if (beyond && !turns[a]) return;
+                    if (beyond) q -= beyond*counts[a]*strides[a];
+                    const int there = at[a] / factors[a], here = first[a] / factors[a], o = beyond ? beyond : there - here;
+                    if (!(beyond && counts[a] <= factors[a])) place += o*(a == 0 ? 1 : a == 1 ? 3 : 9); }  // else one aggregate, beside itself
+                if (d[q] == 0) return;
+                rest -= w; sums[place] += w; };
+            const auto visit = [&](int X, int Y, int Z, T w) {
+                const int a = x + X, b = y + Y, c = z + Z, place = 13 + (a >= fx) - (a < 0) + 3*((b >= L.fy) - (b < 0)) + 9*((c >= L.fz) - (c < 0));
+                const T v = d[i + X + Y*yp + Z*zp] != 0 ? w : (T)0; rest -= v; sums[place] += v; };
+            const auto visit_all = [&](auto visit) {
+#define BEFORE(W, X, Y, Z) visit(X, Y, Z, (T)W(i));
+#define AND_AFTER(W, X, Y, Z) BEFORE(W, X, Y, Z) visit(-(X), -(Y), -(Z), (T)W(i - (X) - (Y)*yp - (Z)*zp));
+                if constexpr (SYMMETRIC) { EACH_WEIGHT(AND_AFTER) } else { EACH_WEIGHT(BEFORE) }
+#undef BEFORE
+#undef AND_AFTER
+            };
+            if (periodic_x || periodic_y || periodic_z) visit_all(visit_turning); else visit_all(visit);
+            excess += rest > least*e || rest < -least*e ? rest : (T)0; }
+        int slot = 0;
+        for (int o = 0; o < 27; ++o) if (o != 13) {
+            const bool along_x = o % 3 != 1 && fx == 2, along_y = o / 3 % 3 != 1 && L.fy == 2, along_z = o / 9 != 1 && L.fz == 2;
+            const T w = along_x || along_y || along_z ? sums[o] : stiffen*sums[o];
+            outer += w;
+            if (MASK >> o & 1) coarse_weights[(slot++)*coarse_size + p + k] = w; }
+        coarse_d[k] = (all ? held : stiffen)*excess + outer; } }
+
+// kernel coarsen.hold: out = d where `free`, else 0; the row is marked if that changes it
+//   compute    B
+//   reads      A d; uint8 free
+//   writes     B out_d
+//   by_row     uint8 changed
+unsigned char moved = 0;
+const auto hold = [&](int k) -> unsigned char {
+    const auto v = free[k] != 0 ? (B)d[k] : (B)0; const unsigned char differs = v != out_d[k]; out_d[k] = v; return differs; };
+const int bytes = sizeof(B) == 1 ? n/64*64 : 0;
+SIMD64 for (int k = 0; k < bytes; ++k) moved |= hold(k);
+SIMD for (int k = bytes; k < n; ++k) moved |= hold(k);
+if (moved) changed[P.row] = 1;
+
+// kernel coarsen.assemble: Rows of a small level's matrix, of a compact stencil; cells that are no
+// unknowns have a row of zeros
+//   compute    float64
+//   stencil    F, W
+//   whole      float64 matrix
+//   numbers    int cells, lines, planes; bool periodic_x, periodic_y, periodic_z
+const int m = planes*lines*cells;
+for (int k = 0; k < n; ++k) {
+    const int at[3] = {P.first + k, P.j, P.k}, counts[3] = {cells, lines, planes}, r = (at[2]*lines + at[1])*cells + at[0];
+    const bool turns[3] = {periodic_x, periodic_y, periodic_z}; const T e = diagonal(k); double* row = matrix + (long long)r*m;
+    for (int c = 0; c < m; ++c) row[c] = 0;
+    if (e == 0) continue;
+    row[r] = e;
+    const auto visit = [&](int X, int Y, int Z, T w) {
+        const int steps[3] = {X, Y, Z}; const long long strides[3] = {1, yp, zp}; int c = 0; long long q = k;
+        for (int a = 2; a >= 0; --a) {
+            int i = at[a] + steps[a]; q += steps[a]*strides[a];
+            if (i < 0 || i >= counts[a]) {
+                if (!turns[a]) return;
+                const int turn = i < 0 ? counts[a] : -counts[a]; i += turn; q += turn*strides[a]; }
+            c = c*counts[a] + i; }
+        if (d[q] != 0) row[c] -= w; };
+    const auto visit_all = [&](auto) {
+#define BEFORE(W, X, Y, Z) visit(X, Y, Z, (T)W(k));
+#define AND_AFTER(W, X, Y, Z) BEFORE(W, X, Y, Z) visit(-(X), -(Y), -(Z), (T)W(k - (X) - (Y)*yp - (Z)*zp));
+        if constexpr (SYMMETRIC) { EACH_WEIGHT(AND_AFTER) } else { EACH_WEIGHT(BEFORE) }
+#undef BEFORE
+#undef AND_AFTER
+    };
+    visit_all(0); }
+
+// kernel coarsen.eliminate: The inverse, transposed, of a small level's matrix by Gauss-Jordan
+// elimination; where there is no unknown, or a pivot is what rounding left of its diagonal, the
+// inverse has a row of zeros.
+//   compute    float64
+//   whole      float64 matrix, inverse, own
+//   numbers    int m; float64 least
+for (int r = 0; r < m; ++r) { own[r] = matrix[r*m + r]; for (int c = 0; c < m; ++c) inverse[c*m + r] = r == c; }
+for (int c = 0; c < m; ++c) {
+    const double pivot = matrix[c*m + c], f = own[c] > 0 && pivot > least*own[c] ? 1/pivot : 0.0;
+    for (int j = 0; j < m; ++j) { matrix[c*m + j] *= f; inverse[j*m + c] *= f; }
+    for (int r = 0; r < m; ++r) if (r != c) {
+        const double g = matrix[r*m + c];
+        if (g != 0) { for (int j = 0; j < m; ++j) { matrix[r*m + j] -= g*matrix[c*m + j]; inverse[j*m + r] -= g*inverse[j*m + c]; } } } }
+
+// kernel coarsen.invert: Columns of the inverse from the factors L D L' (L has ones on its
+// diagonal, where it stores the pivots), if a row of cells has changed
+//   compute    float64
+//   whole      uint8 changed; float64 matrix, inverse
+//   numbers    int m, flags
+const auto due = [&]() { for (int r = 0; r < flags; ++r) if (changed[r]) return true; return false; };
+if (due()) {
+    const int first = (int)p, end = first + n; const double* factors = matrix; double* X = inverse;
+    for (int r = 0; r < m; ++r) {
+        SIMD8 for (int c = first; c < end; ++c) X[r*m + c] = r == c ? 1.0 : 0.0;
+        for (int s = 0; s < r; ++s) { const double l = factors[r*m + s]; SIMD8 for (int c = first; c < end; ++c) X[r*m + c] -= l*X[s*m + c]; } }
+    for (int r = m - 1; r >= 0; --r) {
+        const double pivot = factors[r*m + r];
+        SIMD8 for (int c = first; c < end; ++c) X[r*m + c] = pivot > 0 ? X[r*m + c]/pivot : 0.0;
+        for (int s = r + 1; s < m; ++s) {
+            const double l = pivot > 0 ? factors[s*m + r] : 0.0; SIMD8 for (int c = first; c < end; ++c) X[r*m + c] -= l*X[s*m + c]; } } }
+
+// kernel coarsen.solve: x = inverse b of the cells nx, ny, nz of a small grid, by its dense
+// symmetric inverse; each thread reads columns beside its neighbor's
+//   compute    float64
+//   whole      float64 inverse; S b, x
+//   numbers    int nx, ny, nz
+const long long s2 = nx + 2, s1 = (ny + 2)*s2; const int m = nz*ny*nx;
+enum { R = BUFFERED == 1 ? 1 : 64 };
+double v[R];
+for (int begin = 0; begin < n; begin += R) {
+    const int count = n - begin < R ? n - begin : (int)R;
+    for (int r = 0; r < count; ++r) v[r] = 0;
+    const double* row = inverse + p + begin;
+    for (int k = 1; k <= nz; ++k) for (int j = 1; j <= ny; ++j) UNROLLED for (int i = 1; i <= nx; ++i, row += m) {
+        const double value = (double)b[k*s1 + j*s2 + i];
+        SIMD8 for (int r = 0; r < count; ++r) v[r] += row[r]*value; }
+    for (int r = 0; r < count; ++r) {
+        const int q = (int)p + begin + r; x[(q / (ny*nx) + 1)*s1 + (q / nx % ny + 1)*s2 + q % nx + 1] = v[r]; } }
+
+// kernel renew.clear: Clear what lies in a row's old span and not in its new one, and mark the row
+//   compute    S
+//   writes     S x, b, t; F diagonals; S lower_x?, lower_y?, lower_z?
+//   by_row     vec2i spans, known; uint8 changed
+const auto old = known[P.row], now = spans[P.row];
+if (old[0] != now[0] || old[1] != now[1]) {
+    const auto clear = [&](auto* field) {
+        if (field) for (int k = old[0]; k < old[1]; ++k) if (k < now[0] || k >= now[1]) field[k] = 0; };
+    clear(x); clear(b); clear(t); clear(diagonals); clear(lower_x); clear(lower_y); clear(lower_z);
+    known[P.row] = now; changed[P.row] = 1; }
+
+// kernel renew.sign: Mark the row if 64 bits that its weights hash to are others than they were
+//   compute    S
+//   reads      S weight_x, weight_y, weight_z
+//   by_row     uint64 signs; uint8 changed
+unsigned one = 0, two = 0;
+const auto add = [&](const auto* w, unsigned seed) {
+    const unsigned* bits = (const unsigned*)w; const int words = (n + 1)*(int)(sizeof(*w)/4);  // the last cell's upper face as well
+    SIMD for (int k = 0; k < words; ++k) {
+        unsigned v = bits[k]*0x9E3779B1u + ((unsigned)k + seed)*0x85EBCA77u; v ^= v >> 15; v *= 0x2C1B3C6Du; v ^= v >> 12; one += v;
+        unsigned u = (bits[k] ^ 0xC2B2AE3Du)*0x27D4EB2Fu + ((unsigned)k + seed)*0x165667B1u; u ^= u >> 13; u *= 0x297A2D39u; u ^= u >> 16;
+        two += u; } };
+add(weight_x, 1u << 20); add(weight_y, 2u << 20); add(weight_z, 3u << 20);
+const unsigned long long sign = ((unsigned long long)one << 32) | two;
+if (sign != signs[P.row]) { signs[P.row] = sign; changed[P.row] = 1; }

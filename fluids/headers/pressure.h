@@ -1,0 +1,172 @@
+// Kernels of the pressure projection.
+
+// snippet pressure_face: Solids on a cell's lower faces, and the free surface between cells. In
+// 2-D the third axis repeats the first with a step of 0, so that what enters also leaves.
+const long long sz = planes == 2 ? s1 : 0;
+const float* a[3] = {open_x, open_y, planes == 2 ? open_z : open_x};
+const float* solid[3] = {solid_x, solid_y, planes == 2 ? solid_z : solid_x};
+// the open fraction of a cell's lower face, what the solid adds to what passes it, and the reciprocal of theta between two cells
+auto fraction = [&](int axis, long long i, long long s) {
+    return CUT ? a[axis][CUT ? i : 0] : (((kind[i] == SOLID) | (kind[i - s] == SOLID)) ? 0.0f : 1.0f);
+};
+auto passes = [&](const float* u, int axis, long long i, long long s) {
+    const double open = fraction(axis, i, s);
+    return open*u[i] + (MOVING ? (1.0 - open)*solid[axis][MOVING ? i : 0] : 0.0);
+};
+auto inverse_theta = [&](long long i, long long n) {  // FLUID i, AIR n
+    const float inverse = GHOST ? 1.0f - phi[GHOST ? n : 0]/phi[GHOST ? i : 0] : 1.0f;
+    const float least = inverse > 1.0f ? inverse : 1.0f;  // beyond an open side there is air whatever phi says
+    return least < (float)(1.0/THETA_MIN) ? least : (float)(1.0/THETA_MIN);
+};
+auto outflow = [&](const float* u, const float* v, const float* w, long long i) {
+    return passes(u, 0, i + 1, 1) - passes(u, 0, i, 1) + passes(v, 1, i + s2, s2) - passes(v, 1, i, s2)
+        + passes(w, 2, i + sz, sz) - passes(w, 2, i, sz);
+};
+
+// kernel fluids.pressure.prepare: Right-hand side b, lower bound, first guess and what the free
+// surface adds to the diagonal of every cell
+//   compute    float64
+//   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi?, u,
+//              v, w?; uint8 touch; float64 previous, b, lower?, start; float32 shift?, jump?
+//   numbers    int planes; float64 ratio, adhesion
+//   constants  FLUID, SOLID, AIR, LETS_GO, CUT, MOVING, GHOST, BOUNDED, THETA_MIN
+#include "pressure_face"
+if (planes != 2) w = u;
+SIMD8 for (int i = first; i < last; ++i) {
+    const int fluid = kind[i] == FLUID;
+    const double y = outflow(u, v, w, i), bound = BOUNDED && (touch[i] & LETS_GO) ? 0.0 - adhesion : -INFINITY, x = previous[i]*ratio;
+    b[i] = fluid ? y : 0.0;
+    if (BOUNDED) lower[i] = fluid ? bound : -INFINITY;
+    start[i] = fluid ? (x < bound ? bound : x) : 0.0;
+}
+// Where the surface itself pulls by more, with a pressure below that of the air, no air gets to the wall before the pressure is below that.
+if (BOUNDED && jump) {
+    const long long steps[6] = {-1, 1, -s2, s2, -sz, sz};
+    for (int i = first; i < last; ++i) {
+        if (lower[i] == -INFINITY) continue;
+        double least = lower[i];
+        for (int n = 0; n < 2*planes + 2; ++n) {
+            const long long air = i + steps[n];
+            if (kind[air] != AIR) continue;
+            const float pull = jump[i] < jump[air] ? jump[i] : jump[air];
+            least = pull < least ? pull : least;
+        }
+        const double x = previous[i]*ratio;
+        lower[i] = least;
+        start[i] = x < least ? least : x;
+    }
+}
+// What the diagonal of a FLUID cell has more than the operator knows: air nearer than a cell away, and the air beyond open sides.
+if (shift) {
+    const int nx = given.kind.shape[2] - 2, ny = given.kind.shape[1] - 2, nz = given.kind.shape[0] - 2;
+    auto nearer = [&](int axis, long long face, long long s, long long i, long long n, bool side) {
+        return kind[n] == AIR ? fraction(axis, face, s)*(inverse_theta(i, n) - (side ? 0.0f : 1.0f)) : 0.0f;
+    };
+    SIMD for (int i = first; i < last; ++i) {
+        const float more = nearer(0, i + 1, 1, i, i + 1, i == nx) + nearer(0, i, 1, i, i - 1, i == 1)
+            + nearer(1, i + s2, s2, i, i + s2, j == ny) + nearer(1, i, s2, i, i - s2, j == 1)
+            + nearer(2, i + sz, sz, i, i + sz, k == nz) + nearer(2, i, sz, i, i - sz, k == 1);
+        shift[i] = kind[i] == FLUID ? more : 0.0f;
+    }
+}
+
+// kernel fluids.pressure.subtract_gradient: Project the open faces that touch FLUID and mark them
+// 1; other faces become 0, or -1 inside solids of whole cells
+//   compute    float64
+//   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi?;
+//              float64 x; float32 field; int8 known
+//   numbers    int planes, axis
+//   constants  FLUID, SOLID, AIR, CUT, MOVING, GHOST, THETA_MIN
+#include "pressure_face"
+const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
+const int edge = (axis == 1 && j == 0) || (axis == 2 && k == 0) ? last : (axis == 0 && first == 0 ? 1 : first);
+for (int i = first; i < edge; ++i) known[i] = -1;  // the ring's own lower faces lie in the wall
+SIMD8 for (int i = edge; i < last; ++i) {
+    const int here = kind[i], below = kind[i - s], wet = (here == FLUID) | (below == FLUID);
+    const float open = fraction(axis, i, s);
+    const float inverse = !GHOST ? 1.0f : (here == AIR ? inverse_theta(i - s, i) : (below == AIR ? inverse_theta(i, i - s) : 1.0f));
+    const int projected = wet & (open > 0.0f) & (here != SOLID) & (below != SOLID);  // a source's cells are SOLID, their faces open
+    field[i] -= projected ? (float)(x[i] - x[i - s])*inverse : 0.0f;
+    const int hidden = CUT ? 0 : (here == SOLID) & (below == SOLID);
+    known[i] = projected ? 1 : (hidden ? -1 : 0);
+}
+
+// kernel fluids.pressure.support: Give faces with weight beside projected ones their change, up to
+// `limit` [m/s] and not beyond them; they become 2. Open faces between AIR cells that particles
+// gave weight, beside projected ones. All that a face reads of others is of projected ones, which
+// nobody writes here, so that the order does not matter.
+//   compute    float64
+//   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi?;
+//              float64 x; float32 field; int8 known; float32 weight, jump?
+//   numbers    int planes, axis; float32 limit
+//   constants  FLUID, SOLID, AIR, CUT, MOVING, GHOST, THETA_MIN, TINY_WEIGHT
+#include "pressure_face"
+const int nx = given.kind.shape[2], ny = given.kind.shape[1], nz = given.kind.shape[0];
+const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1), steps[6] = {-1, 1, -s2, s2, -s1, s1};
+auto over = [&](long long liquid, long long air) {  // of the jump of surface tension, see `fluids.surface_tension.push`
+    return jump[liquid]*(inverse_theta(liquid, air) - 1.0f) + jump[air];
+};
+const bool inside_y = j > 0 && j < (axis == 1 ? ny : ny - 1), inside_z = planes != 2 || (k > 0 && k < (axis == 2 ? nz : nz - 1));
+const int low = first > 1 ? first : 1, end = axis == 0 ? nx : nx - 1, high = last < end ? last : end;
+for (int i = low; i < high && inside_y && inside_z; ++i) {
+    if (known[i] != 0 || !(weight[i] > (float)TINY_WEIGHT)) continue;
+    if (kind[i] == SOLID || kind[i - s] == SOLID || !(fraction(axis, i, s) > 0.0f)) continue;
+    const bool there[6] = {true, i + 1 < nx, true, j + 1 < ny, planes == 2, planes == 2 && k + 1 < nz};
+    float change = 0.0f, velocity = 0.0f; int found = 0;
+    for (int n = 0; n < 6; ++n) {
+        const long long e = there[n] ? i + steps[n] : i;
+        if (known[e] != 1) continue;
+        const float inverse = kind[e] == AIR ? inverse_theta(e - s, e) : (kind[e - s] == AIR ? inverse_theta(e, e - s) : 1.0f);
+        change -= (float)(x[e] - x[e - s])*inverse;
+        if (jump && kind[e] != kind[e - s]) change += kind[e] == AIR ? -over(e - s, e) : over(e, e - s);
+        velocity += field[e]; ++found;
+    }
+    if (found == 0) continue;
+    change /= (float)found;
+    const float gap = velocity/(float)found - field[i], size = change < 0.0f ? -change : change, most = gap < 0.0f ? -gap : gap;
+    const float nearer = change*gap > 0.0f ? (size < most ? change : gap) : 0.0f, low = nearer > -limit ? nearer : -limit;
+    field[i] += low < limit ? low : limit;
+    known[i] = 2;
+}
+
+// kernel fluids.pressure.contact: Find the released cells, their number, and the largest |outflow|
+// of the other FLUID cells [m/s], `worst`
+//   compute    float64
+//   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi?, u,
+//              v, w?; uint8 touch; float64 x; uint8 contact
+//   numbers    int planes; float64 threshold
+//   sums       released
+//   largest    worst
+//   constants  FLUID, SOLID, AIR, TOUCHES, LETS_GO, RELEASED, HELD, CUT, MOVING, GHOST, BOUNDED,
+//              THETA_MIN
+#include "pressure_face"
+if (planes != 2) w = u;
+int found = 0; double rest[M]; unsigned char leaves[M];
+for (int from = first; from < last; from += M) {
+    const int n = last - from < M ? last - from : M;
+    SIMD8 for (int m = 0; m < n; ++m) {
+        const int i = from + m, fluid = kind[i] == FLUID;
+        const double y = outflow(u, v, w, i), size = y < 0.0 ? -y : y;
+        const int leaving = BOUNDED & fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
+        contact[i] = leaving ? RELEASED : ((fluid & (touch[i] & TOUCHES)) ? HELD : 0);
+        leaves[m] = leaving;
+        rest[m] = (fluid & !leaving) ? size : 0.0;
+    }
+    for (int m = 0; m < n; ++m) { found += leaves[m]; worst = rest[m] > worst ? rest[m] : worst; }
+}
+released = found;
+
+// kernel fluids.pressure.count_fluid: How many cells are FLUID
+//   compute    float64
+//   box        int8 kind
+//   sums       fluid
+//   constants  FLUID
+int found = 0;
+SIMD for (int i = first; i < last; ++i) found += kind[i] == FLUID;
+fluid = found;
+
+// kernel tolerance.change: the first guess becomes what the solve changed
+//   compute    float64
+//   reads      float64 x
+//   writes     float64 guess
+SIMD for (int k = 0; k < n; ++k) guess[k] = x[k] - guess[k];

@@ -1,2 +1,0 @@
-// Nothing.
-for (int i = first; i < last; ++i) field[i] = 0;

@@ -1,0 +1,219 @@
+// Kernels of particles, and what passes over particles share.
+
+// snippet origin: cells of a larger grid before the first one of this, and a particle's grid
+// coordinate
+#include "snippets.h:grid_coordinate"
+const int origin[3] = {before_x, before_y, before_z};  // cells of a larger grid before the first one of this
+
+// snippet floor: The cell that a coordinate along an axis lies in, also where those of a part of a
+// larger grid are below 0.
+auto floor_of = [=](T x, int axis) { const int from = axis == 0 ? before_x : axis == 1 ? before_y : before_z; return (int)(x - (T)from) + from; };
+
+// snippet nodes: i, j, k: the lowest of the nodes around a particle; f: how far it lies beyond
+// them, in cells
+#include "snippets.h:grid_coordinate"
+const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5, hz = axis == 2 ? (T)0 : (T)0.5;
+const T lx = axis == 0 ? (T)EDGE : (T)0, ly = axis == 1 ? (T)EDGE : (T)0, lz = axis == 2 ? (T)EDGE : (T)0;
+auto nodes = [&](long long p, int& i, int& j, int& k, T& fx, T& fy, T& fz) {
+    EXACT_MATH
+    const T x = grid_coordinate(position[3*p], before_x) - hx, y = grid_coordinate(position[3*p + 1], before_y) - hy;
+    const T z = planes == 2 ? grid_coordinate(position[3*p + 2], before_z) - hz : (T)1;
+    i = (int)x; j = (int)y; k = (int)z;
+    fx = x - (T)i; fy = y - (T)j; fz = z - (T)k;
+    fx = fx < lx ? lx : fx; fy = fy < ly ? ly : fy; fz = fz < lz ? lz : fz;
+    fx = fx > 1 - lx ? 1 - lx : fx; fy = fy > 1 - ly ? 1 - ly : fy; fz = fz > 1 - lz ? 1 - lz : fz;
+};
+
+// snippet weigh: The cell c of a coordinate and the weights of cells c - 1, c, c + 1.
+auto weigh = [&](T x, int count, T* w) {
+    EXACT_MATH
+    const T from = x > 1 ? x : (T)1, e = count; const int c = (int)(from < e ? from : e);
+    const T f = from - (T)c - (T)0.5, a = (T)0.5 - f, b = (T)0.5 + f;
+    w[0] = (T)0.5*a*a; w[1] = fused(-f, f, (T)0.75); w[2] = (T)0.5*b*b;
+    return c;
+};
+
+// snippet add: Add to an element that other threads may add to on CUDA; a product as it is there,
+// or fused.
+auto add = [](auto& element, auto value) {
+#ifdef __CUDA_ARCH__
+    atomicAdd(&element, value);
+#else
+    element += value;
+#endif
+};
+auto add_product = [&](auto& element, auto a, auto b) {
+#ifdef __CUDA_ARCH__
+    atomicAdd(&element, a*b);
+#else
+    element = fused(a, b, element);
+#endif
+};
+
+// snippet shares: Particles add to fields around them. On CUDA a task has its own particles, on
+// the CPU the planes of the fields (rows in 2-D) from P.first on: all particles that touch those
+// are added there in their order, so that each sum is the one that a single thread makes. Where
+// the order is not that in which they lie, `runs` has the begin and the end of what lies in order,
+// one run after another. visit(begin, end, ours): `ours` tells of a plane whether it is the
+// task's. Its arithmetic is EXACT_MATH with `fused`: else the compiler might round in one form of
+// it otherwise than in the other.
+const auto each_share = [&](auto visit) {
+    const auto all = [](int) { return true; };
+#ifdef __CUDA_ARCH__
+    visit((long long)P.first, (long long)P.first + n, all);
+#else
+    const int from = P.first, to = P.first + n;
+    const auto ours = [=](int plane) { return plane >= from && plane < to; };
+    const int whole[2] = {0, (int)count}, *run = runs ? runs : whole, *end = run + (runs ? given.runs.shape[0] : 2);
+    if (!touched) { for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], all); return; }
+    if (runs) { for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], ours); return; }
+    for (long long c = 0; c*chunk < count; ++c) {
+        const int low = touched[2*c], high = touched[2*c + 1]; const long long begin = c*chunk, end = begin + chunk < count ? begin + chunk : count;
+        if (low >= from && high <= to) visit(begin, end, all);
+        else if (low < to && high > from) visit(begin, end, ours); }
+#endif
+};
+
+// snippet numbered_cells: Cells of fields of a SHAPE have the numbers of the larger grid where
+// this is a part of one, from `first_cell` to `nx`, `ny`, `nz`; a stored field begins `back`
+// elements before the first one of the larger grid's. So coordinates are rounded alike in all
+// parts.
+const int nx = SHAPE[2] - 2 + origin[0], ny = SHAPE[1] - 2 + origin[1], nz = SHAPE[0] - 2 + origin[2];
+const long long s2 = SHAPE[2], s1 = s2*SHAPE[1], up = planes == 2 ? s1 : 0, back = origin[2]*s1 + origin[1]*s2 + origin[0];
+const int first_cell[3] = {1 + origin[0], 1 + origin[1], 1 + origin[2]};
+#include "floor"
+const T lx = first_cell[0], ly = first_cell[1], lz = first_cell[2];
+
+// snippet particle_blocks: What the steps of particles see.
+#include "origin"
+typedef T Block[3][M];
+const T margin = (T)MARGIN;
+T* position = (T*)given.position.data;
+#define SHAPE given.u.shape
+#include "numbered_cells"
+Block from, to, k1, k2, k3;
+int hit[M], list[M];
+auto abs_of = [](T x) { return x < 0 ? -x : x; };
+
+// snippet sample: Interpolate the velocity at grid coordinates; points outside the domain and NaN
+// are brought inside, along axes without an end from the other side.
+auto sample = [&](const Block& at, Block& result, int n) {
+    const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
+    for (int axis = 0; axis <= planes; ++axis) {
+        const T* g = (axis == 0 ? given.u.data : (axis == 1 ? given.v.data : given.w.data)) - back;
+        const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5, hz = axis == 2 ? (T)0 : (T)0.5;
+        SIMD for (int m = 0; m < n; ++m) {
+            T x = at[0][m], y = at[1][m], z = at[2][m];
+            if (ENDLESS & 1) { x = x < 1 ? x + (T)nx : x; x = x < ex ? x : x - (T)nx; }
+            if (ENDLESS & 4) { z = z < 1 ? z + (T)nz : z; z = z < ez ? z : z - (T)nz; }
+            x = x > lx ? x : lx; y = y > ly ? y : ly; z = z > lz ? z : lz;
+            x = (x < ex ? x : ex) - hx; y = (y < ey ? y : ey) - hy; z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
+            int i = floor_of(x, 0), j = floor_of(y, 1), k = floor_of(z, 2);
+            i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;  // the next node is stored, too
+            const T fx = x - (T)i, fy = y - (T)j, fz = z - (T)k;
+            const T* a = g + (k*s1 + j*s2 + i); const T* b = a + up;
+            const T a0 = a[0] + fx*(a[1] - a[0]), a1 = a[s2] + fx*(a[s2 + 1] - a[s2]);
+            const T b0 = b[0] + fx*(b[1] - b[0]), b1 = b[s2] + fx*(b[s2 + 1] - b[s2]);
+            const T low = a0 + fy*(a1 - a0), high = b0 + fy*(b1 - b0);
+            result[axis][m] = low + fz*(high - low);
+        }
+    }
+};
+
+// kernel warp_lcp.grid.touched.touched: The planes (rows in 2-D) of a field that some particles
+// may add to: the first, one past the last
+//   compute    float32 | float64
+//   whole      int32 touched
+//   box        vec3<T> position
+//   numbers    int planes; T dx, inverse_dx; int before_x, before_y, before_z
+#include "snippets.h:grid_coordinate"
+const T* position = (const T*)given.position.data + (planes == 2 ? 2 : 1);
+const int before = planes == 2 ? before_z : before_y;
+T low = (T)1e9, high = (T)-1e9;
+SIMD for (int p = first; p < last; ++p) {
+    const T x = grid_coordinate(position[3*(long long)p], before), from = x > (T)-1e6 ? x : (T)-1e6, at = from < (T)1e6 ? from : (T)1e6;
+    low = at < low ? at : low; high = at > high ? at : high;
+}
+touched[2*c_] = (int)low - 1; touched[2*c_ + 1] = (int)high + 2;
+
+// kernel warp_lcp.grid.particles.number: Number the stored cell that each particle lies in; in 2-D
+// its plane is k = 1 whatever z is
+//   compute    float32
+//   whole      int32 key
+//   box        vec3 position
+//   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z, nx, ny, nz
+#include "origin"
+const T* position = (const T*)given.position.data;
+auto cell_of = [](T x, int count) { x = x > 1 ? x : (T)1; const T e = count; return (int)(x < e ? x : e); };
+SIMD for (int p = first; p < last; ++p) {
+    const long long q = 3*(long long)p;
+    const int i = cell_of(grid_coordinate(position[q], origin[0]), nx), j = cell_of(grid_coordinate(position[q + 1], origin[1]), ny);
+    const int k = planes == 2 ? cell_of(grid_coordinate(position[q + 2], origin[2]), nz) : 1;
+    key[p] = (k*(ny + 2) + j)*(nx + 2) + i;
+}
+
+// kernel warp_lcp.grid.particles.total: Add up particles: |v|^2, x, bad x and v, v; the largest
+// |v|^2, highest x and lowest x with the other sign. On CUDA a thread takes every `chunks`-th, its
+// neighbor the next.
+//   compute    float32
+//   box        vec3 position, velocity
+//   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z
+//   sums       energy, x, y, z, u, v, w, lost, wild
+//   largest    top, high_x, high_y, high_z, low_x, low_y, low_z
+#ifdef __CUDA_ARCH__
+enum { LANES = 1 };
+#else
+enum { LANES = 16 };
+#endif
+const T* position = (const T*)given.position.data; const T* velocity = (const T*)given.velocity.data;
+#ifdef __CUDA_ARCH__
+const int begin = c_, end = L.nx, stride = L.chunks;
+#else
+const int begin = first, end = last, stride = LANES;
+#endif
+double squares[LANES], sum[3][LANES], way[3][LANES]; T low[3][LANES], high[3][LANES], fastest[LANES]; int bad_x[LANES], bad_v[LANES];
+for (int m = 0; m < LANES; ++m) {
+    squares[m] = 0; fastest[m] = 0; bad_x[m] = 0; bad_v[m] = 0;
+    for (int d = 0; d < 3; ++d) { sum[d][m] = way[d][m] = 0; low[d][m] = high[d][m] = position[3*(long long)begin + d]; }
+}
+for (int start = begin; start < end; start += stride) {
+    const int n = end - start < LANES ? end - start : (int)LANES;
+    const T* X = position + 3*(long long)start; const T* V = velocity + 3*(long long)start;
+    SIMD for (int m = 0; m < n; ++m) {
+        const T x = X[3*m], y = X[3*m + 1], z = X[3*m + 2], u = V[3*m], v = V[3*m + 1], w = V[3*m + 2];
+        const T speed = u*u + v*v + w*w, most = (T)3.4028234e38;
+        squares[m] += (double)speed; sum[0][m] += (double)x; sum[1][m] += (double)y; sum[2][m] += (double)z;
+        way[0][m] += (double)u; way[1][m] += (double)v; way[2][m] += (double)w;
+        low[0][m] = x < low[0][m] ? x : low[0][m]; high[0][m] = x > high[0][m] ? x : high[0][m];
+        low[1][m] = y < low[1][m] ? y : low[1][m]; high[1][m] = y > high[1][m] ? y : high[1][m];
+        low[2][m] = z < low[2][m] ? z : low[2][m]; high[2][m] = z > high[2][m] ? z : high[2][m];
+        fastest[m] = speed > fastest[m] ? speed : fastest[m];
+        bad_v[m] += !(speed <= most);
+        const int fine = (int)(x <= most) & (int)(x >= -most) & (int)(y <= most) & (int)(y >= -most);
+        bad_x[m] += !(fine & (int)(z <= most) & (int)(z >= -most));
+    }
+}
+for (int m = 1; m < LANES; ++m) {
+    squares[0] += squares[m]; bad_x[0] += bad_x[m]; bad_v[0] += bad_v[m];
+    fastest[0] = fastest[m] > fastest[0] ? fastest[m] : fastest[0];
+    for (int d = 0; d < 3; ++d) {
+        sum[d][0] += sum[d][m]; way[d][0] += way[d][m];
+        low[d][0] = low[d][m] < low[d][0] ? low[d][m] : low[d][0]; high[d][0] = high[d][m] > high[d][0] ? high[d][m] : high[d][0];
+    }
+}
+energy = squares[0]; top = fastest[0]; lost = bad_x[0]; wild = bad_v[0];
+x = sum[0][0]; y = sum[1][0]; z = sum[2][0]; u = way[0][0]; v = way[1][0]; w = way[2][0];
+high_x = high[0][0]; high_y = high[1][0]; high_z = high[2][0]; low_x = -low[0][0]; low_y = -low[1][0]; low_z = -low[2][0];
+
+// kernel warp_lcp.grid.particles.add_in_order: Add up the sums of threads in the order of the
+// threads, a column each; of the last columns take the largest
+//   compute    float64
+//   whole      float64 partials, results
+//   numbers    int places_of_sums, sums_
+for (int column = P.first; column < P.first + n; ++column) {
+    EXACT_MATH
+    const double* found = partials + column*(long long)places_of_sums; double s = found[0];
+    for (int t = 1; t < places_of_sums; ++t) {
+        if (column < sums_) s += found[t];
+        else s = found[t] > s || found[t] != found[t] ? found[t] : s; }
+    results[column] = s; }

@@ -1,1 +1,0 @@
-SIMD64 for (int k = 0; k < n; ++k) x[k] = 0;

@@ -1,2 +1,0 @@
-#include "entries.h"
-ROWS { const T f = scale[k]; ENTRIES scaled[e] = f*a[e]; }

@@ -1,0 +1,75 @@
+// Kernels of dense matrices, and of matrices of low rank.
+
+// kernel dense.product: y = A x or A' x, in the order of the columns
+//   compute    S
+//   writes     S y
+//   whole      A a; S x
+//   numbers    int64 size; bool transposed
+for (int k = 0; k < n; ++k) {
+    EXACT_MATH const auto* row = a + (transposed ? p + k : (p + k)*size); const long long step = transposed ? size : 1; T s = 0;
+    for (long long j = 0; j < size; ++j) s += (T)row[j*step]*x[j];
+    y[k] = s; }
+
+// kernel dense.relax: x = clip(x - omega (A x + b) / d, lower, upper), row after row forward or
+// backwards, so that each sees those before it
+//   compute    S
+//   reads      S b, lower, upper
+//   writes     S x
+//   whole      A a
+//   numbers    float64 omega; bool forward
+for (int k = 0; k < n; ++k) {
+    EXACT_MATH const long long i = forward ? k : n - 1 - k; const auto* row = a + i*n; T s = b[i];
+    if (row[i] == 0) continue;
+    for (int j = 0; j < n; ++j) s += (T)row[j]*x[j];
+    x[i] = wp::clamp(x[i] - (T)omega*s/(T)row[i], lower[i], upper[i]); }
+
+// snippet times: a product that is rounded with the sum that it is added to, or not
+const auto times = [](double u, double f) { if constexpr (FUSED) return u*f; else { EXACT_MATH return u*f; } };
+
+// kernel low_rank.gather: U'x over the columns' entries, a column of sums each; rows whose mask is
+// 0 count for nothing
+//   compute    float64
+//   whole      int32 entry_rows, blocks; V values; int32 count; S x; K mask?
+//   numbers    int width, rank
+//   sums       first
+//   constants  FUSED = 1
+#include "times"
+double* sums = given.out.data + P.t; const int last = count[0];
+if (!P.more) for (int q = 0; q < rank; ++q) sums[q*places] = 0;
+for (int k = 0; k < n && p + k < last; ++k) {
+    const long long e = p + k, column = (long long)blocks[e]*width; const double v = mask && mask[entry_rows[e]] == 0 ? 0.0 : (double)x[entry_rows[e]];
+    for (int q = 0; q < width; ++q) sums[(column + q)*places] += times((double)values[e*width + q], v); }
+const double first = P.more ? 0 : sums[0];
+
+// kernel low_rank.scatter: result = base + sign U f on U's rows where the mask is not 0; the first
+// entry of a row writes for all of them
+//   compute    float64
+//   whole      int32 entry_rows, blocks; V values; int32 count; float64 factors; K mask?; S base,
+//              result
+//   numbers    int width; float64 sign
+//   constants  FUSED = 1
+#include "times"
+const int last = count[0];
+for (int k = 0; k < n && p + k < last; ++k) {
+    const long long e = p + k; const int row = entry_rows[e]; double s = 0;
+    if ((e > 0 && entry_rows[e - 1] == row) || (mask && mask[row] == 0)) continue;
+    for (long long m = e; m < last && entry_rows[m] == row; ++m) {
+        const auto* u = values + m*width; const double* f = factors + (long long)blocks[m]*width;
+        for (int q = 0; q < width; ++q) s += times((double)u[q], f[q]); }
+    result[row] = sign > 0 ? base[row] + s : base[row] - s; }
+
+// kernel low_rank.diagonal: result += the diagonal of U W U'
+//   compute    float64
+//   whole      int32 entry_rows, blocks; V values; int32 count; float64 weights, result
+//   numbers    int width, rank
+const int last = count[0];
+for (int k = 0; k < n && p + k < last; ++k) {
+    EXACT_MATH const long long e = p + k; const int row = entry_rows[e]; double s = 0;
+    if (e > 0 && entry_rows[e - 1] == row) continue;
+    for (long long m = e; m < last && entry_rows[m] == row; ++m)
+        for (long long o = e; o < last && entry_rows[o] == row; ++o)
+            for (int i = 0; i < width; ++i)
+                for (int j = 0; j < width; ++j)
+                    s += (double)values[m*width + i]*(double)values[o*width + j]
+                        *weights[((long long)blocks[m]*width + i)*rank + (long long)blocks[o]*width + j];
+    result[row] += s; }

@@ -1,0 +1,25 @@
+// Snippets for kernels of several areas.
+
+// snippet entries: A matrix in compressed rows: ROWS {...} visits rows i, cells k of the piece,
+// ENTRIES the entries e of row i, too few for vectors.
+#define ROWS for (long long i = p, k = 0; k < n; ++i, ++k)
+#ifdef __CUDA_ARCH__
+#define ENTRIES for (int e = ptr[i]; e < ptr[i + 1]; ++e)
+#else
+#define ENTRIES PRAGMA(clang loop vectorize(disable)) for (int e = ptr[i]; e < ptr[i + 1]; ++e)
+#endif
+
+// snippet grid_coordinate: A particle's grid coordinate. It is rounded after each operation,
+// unlike the rest, so that every pass finds a particle in the same cell. Taking off the cells
+// before a part of a grid is exact, as they are a whole number below the coordinate.
+auto grid_coordinate = [=](T x, int before = 0) -> T {
+#ifdef __CUDA_ARCH__
+    if (sizeof(T) == 4) return (T)__fsub_rn(__fadd_rn(__fmul_rn((float)x, (float)inverse_dx), 1.0f), (float)before);
+    return (T)__dsub_rn(__dadd_rn(__dmul_rn((double)x, (double)inverse_dx), 1.0), (double)before);
+#else
+    #pragma clang fp contract(off) reassociate(off)
+    const T scaled = x*inverse_dx;
+    const T coordinate = scaled + (T)1;
+    return coordinate - (T)before;
+#endif
+};

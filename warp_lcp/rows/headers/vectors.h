@@ -1,0 +1,35 @@
+// Kernels of vectors.
+
+// kernel vectors.dot: a'b
+//   compute    float64
+//   reads      A a; B b
+//   sums       ab
+double ab = 0;
+SIMD for (int k = 0; k < n; ++k) ab += (double)a[k]*(double)b[k];
+
+// kernel vectors.add: x += z
+//   compute    S
+//   reads      S z
+//   writes     S x
+SIMD for (int k = 0; k < n; ++k) x[k] += z[k];
+
+// snippet add_up: The sum of every stride-th of n partials from `start` on.
+const double* v = partials.data + offset; double s = 0;
+if (stride == 1) { SIMD8 for (int i = start; i < n; ++i) s += v[i]; }
+else for (int i = start; i < n; i += stride) s += v[i];
+return s;
+
+// kernel vectors.add_up: Sums of columns of partial sums
+//   compute    float64
+//   whole      float64 partials, scalars
+//   numbers    int count, slot
+for (int k = 0; k < n; ++k) {
+    const double* v = partials + (P.first + k)*(long long)count; double s = 0;
+    SIMD8 for (int i = 0; i < count; ++i) s += v[i];
+    scalars[slot + P.first + k] = s; }
+
+// kernel vectors.convert: b = a, in another type
+//   compute    B
+//   reads      A a
+//   writes     B b
+SIMD for (int k = 0; k < n; ++k) b[k] = a[k];

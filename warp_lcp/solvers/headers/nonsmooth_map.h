@@ -1,0 +1,186 @@
+// Kernels of nonsmooth Newton methods: the maps, their derivatives, and steps.
+
+// snippet map_numbers: The type R of a map's values, its numbers, and a root that is vectorized in
+// that type.
+#if FUSED
+typedef S R;
+const R part = (R)share, over_b = (R)(over/scale), tiny = (R)(kinks*scale);
+#else
+typedef double R;
+const R part = share, over_b = over, tiny = kinks;
+#endif
+const auto root = [](R v) -> R {
+#ifdef __CUDA_ARCH__
+    return sqrt(v);
+#else
+    if constexpr (sizeof(R) == 4) return (R)__builtin_sqrtf((float)v); else return sqrt(v);
+#endif
+};
+
+// snippet map: Of cell i: f, p, q, whether there is a kink, and what they are made of; R is the
+// type of it. FUSED: in units of `scale`, which makes them of order one; the map is free of
+// cancellation.
+#if FUSED
+const double at_ = diagonal(i), size = at_ != 0 ? at_ : 1.0, low_ = lower(i), high_ = upper(i), value = y[i - begin];
+const bool inside = unknown[i] == 1, low = low_ > -(double)INFINITY, high = high_ < (double)INFINITY;
+const double below_ = size*(x[i] - low_), above_ = size*(x[i] - high_);
+const double natural = inside ? natural_residual(value, below_, above_) + 0.0*x[i] : 0.0; square += natural*natural;
+const R w = (R)(scale*value), a = low ? (R)(scale*below_) : (R)0, c = high ? (R)(-scale*above_) : (R)0;
+#else
+const double at_ = unit*(double)d[i], above_ = at_ < 0 ? -at_ : at_, size = above_ == 0 ? 1.0 : above_, low_ = lower(i), high_ = upper(i);
+const bool inside = unknown[i] == 1, low = low_ > -(double)INFINITY, high = high_ < (double)INFINITY;
+const R a = low ? size*(x[i] - low_) : 0.0, c = high ? size*(high_ - x[i]) : 0.0, w = y[i];
+#endif
+#if RANDOM  // an element of the unit disc's first quadrant for each kink, a hash of its index
+const unsigned long long z0 = ((unsigned long long)(p + i) + seed)*0x9E3779B97F4A7C15ull, z1 = (z0 ^ (z0 >> 29))*0xBF58476D1CE4E5B9ull;
+const R first = (double)(unsigned int)(z1 >> 32)*2.3283064365386963e-10;
+const R second = (double)(unsigned int)((z1*0x94D049BB133111EBull) >> 32)*2.3283064365386963e-10;
+const R kp = 1 - 0.7071067811865476*first, kq = 1 - 0.7071067811865476*second;
+#else
+const R kp = (R)0, kq = (R)1;
+#endif
+#if NATURAL
+const R least = (low & (a < w)) ? a : w;
+const bool top = high & (-c > least), bottom = low & (a < w), kink = false;
+const R f = inside ? (top ? -c : least) : (R)0, p = (top | bottom) ? (R)1 : (R)0, q = (R)1 - p;
+#else  // 2 a b / (a + b + sqrt) and b^2 / (rho (rho + a)) are psi and 1 - a / rho without cancellation
+const R c0 = c > 0 ? c : (R)0, w0 = -w > 0 ? -w : (R)0;
+#if UPPER
+const R e = root(w*w + c*c), es = e > tiny ? e : (R)1, n = c - w;
+const R below = n > 0 ? -2*w*c/(n + es) : n - e, h = high ? -below : w;
+const bool kink2 = high & (e <= tiny);
+const R p2 = high ? (kink2 ? kp : (c > 0 ? w*w/(es*(es + c0)) : 1 - c/es)) : (R)0;
+const R q2 = high ? (kink2 ? kq : (w < 0 ? c*c/(es*(es + w0)) : 1 + w/es)) : (R)1;
+#else
+const R h = w, p2 = 0, q2 = 1; const bool kink2 = false;
+#endif
+const R rho = root(a*a + h*h), rs = rho > tiny ? rho : (R)1, t = a + h;
+const R a0 = a > 0 ? a : (R)0, h0 = h > 0 ? h : (R)0;
+const bool kink1 = low & (rho <= tiny), flat1 = a > 0, flat2 = h > 0;
+const R f1 = low ? (t > 0 ? 2*a*h : t - rho)/(t > 0 ? t + rs : (R)1) : h;
+const R p1 = low ? (kink1 ? kp : (flat1 ? h*h : rs - a)/(rs*(flat1 ? rs + a0 : (R)1))) : (R)0;
+const R q1 = low ? (kink1 ? kq : (flat2 ? a*a : rs - h)/(rs*(flat2 ? rs + h0 : (R)1))) : (R)1;
+const bool kink = inside & (kink1 | kink2);
+#if PENALIZED
+const R yp = w > 0 ? w : (R)0, g = (1 - part)*over_b;
+const R extra = (low ? a0*yp : (R)0) - (high ? c0*w0 : (R)0);
+const R ep = ((low & (a > 0)) ? yp : (R)0) + ((high & (c > 0)) ? w0 : (R)0);
+const R eq = ((low & (w > 0)) ? a0 : (R)0) + ((high & (w < 0)) ? c0 : (R)0);
+const R f = inside ? part*f1 + g*extra : (R)0;
+const R p = part*(p1 + q1*p2) + g*ep, q = part*q1*q2 + g*eq;
+#else
+const R f = inside ? f1 : (R)0, p = p1 + q1*p2, q = q1*q2;
+#endif
+#endif
+
+// kernel nonsmooth_map.merit: The sum of f^2
+//   compute    float64
+//   bounds
+//   reads      float64 x, y; int8 unknown; D d
+//   numbers    float64 share, over, kinks; int64 seed; float64 unit
+//   sums       merit
+//   constants  NATURAL = 0, UPPER = 0, PENALIZED = 0, RANDOM = 0, FUSED = 0
+#include "map_numbers"
+double merit = 0;
+with_bounds([&](auto lower, auto upper) { SIMD for (int i = 0; i < n; ++i) {
+#include "map"
+    merit += f*f; } });
+
+// kernel nonsmooth_map.values: f
+//   compute    float64
+//   bounds
+//   reads      float64 x, y; int8 unknown; D d
+//   writes     float64 values
+//   numbers    float64 share, over, kinks; int64 seed; float64 unit
+//   constants  NATURAL = 0, UPPER = 0, PENALIZED = 0, RANDOM = 0, FUSED = 0
+#include "map_numbers"
+with_bounds([&](auto lower, auto upper) { SIMD for (int i = 0; i < n; ++i) {
+#include "map"
+    values[i] = f; } });
+
+// kernel nonsmooth_map.condense: Newton's system over q: D = d p / q, on top of A's diagonal if
+// FUSED, and -scale f / q; sums of f^2, of the natural residual and of the right-hand side in the
+// norm of its system.
+//   compute    float64
+//   bounds
+//   reads      float64 x, y; int8 unknown; D d
+//   writes     float64 D; S r; uint8 free
+//   numbers    float64 share, over, kinks; int64 seed; float64 unit, scale, least; bool drop
+//   sums       merit
+//   constants  NATURAL = 0, UPPER = 0, PENALIZED = 0, RANDOM = 0, FUSED = 0
+#include "map_numbers"
+#if FUSED
+double square = 0; S merit = 0, weighted = 0; const S least_q = (S)least;
+for (int begin = 0; begin < n; begin += M) {
+    const int end = n - begin < M ? n : begin + (int)M; T y[M];
+    fetch(begin, end, x + zp, b, r, D, d, unknown);
+    SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = affine(x, b, k);
+    with_bounds([&](auto lower, auto upper) { SIMD for (int i = begin; i < end; ++i) {
+#include "map"
+        const S qs = q > least_q ? q : least_q, inverse = (S)1/qs; const bool solved = inside & !(drop & kink);
+        const S shifted = solved ? (S)at_ + (S)size*p*inverse : (S)0, right = solved ? -f*inverse : (S)0;
+        merit += f*f; D[i] = shifted; r[i] = right; weighted += right*right/(shifted > 0 ? shifted : (S)1); } }); }
+#else
+double merit = 0, square = 0, weighted = 0; const double least_q = least;
+with_bounds([&](auto lower, auto upper) { SIMD for (int i = 0; i < n; ++i) {
+#include "map"
+    const double qs = q > least_q ? q : least_q; const bool solved = inside & !(drop & kink);
+    merit += f*f; D[i] = solved ? size*p/qs : 0.0; r[i] = solved ? -scale*f/qs : 0.0; free[i] = solved; } });
+#endif
+
+// kernel nonsmooth_map.condense_at_rows: the same where y = A x + b is computed on the way
+//   compute    float64
+//   stencil    F, W
+//   bounds
+//   reads      float64 x, b; int8 unknown
+//   writes     S D, r
+//   numbers    float64 share, over, kinks; int64 seed; float64 scale, least; bool drop
+//   sums       square, merit, weighted
+//   constants  NATURAL = 0, UPPER = 0, PENALIZED = 0, RANDOM = 0, FUSED = 1
+#include "nonsmooth_map.condense"
+
+// kernel nonsmooth_map.weighted: d p f and q f, of which the gradient is made, and the sum of f^2
+//   compute    float64
+//   bounds
+//   reads      float64 x, y; int8 unknown; D d
+//   writes     float64 by_x, by_y
+//   numbers    float64 share, over, kinks; int64 seed; float64 unit
+//   sums       merit
+//   constants  NATURAL = 0, UPPER = 0, PENALIZED = 0, RANDOM = 0, FUSED = 0
+#include "map_numbers"
+double merit = 0;
+with_bounds([&](auto lower, auto upper) { SIMD for (int i = 0; i < n; ++i) {
+#include "map"
+    by_x[i] = inside ? size*p*f : 0.0; by_y[i] = inside ? q*f : 0.0; merit += f*f; } });
+
+// kernel nonsmooth_map.gradient: The gradient over d^2, from what stands in it and A' q f; squares
+// of it over d, and its product with the last one
+//   compute    float64
+//   reads      float64 product, last; int8 unknown; D d
+//   writes     float64 gradient
+//   numbers    float64 unit
+//   sums       square, inner
+double square = 0, inner = 0;
+SIMD for (int i = 0; i < n; ++i) {
+    const double e = unit*(double)d[i], least = e < 0 ? -e : e, size = least == 0 ? 1.0 : least;
+    const double g = unknown[i] == 1 ? (gradient[i] + product[i])/size : 0.0;
+    gradient[i] = g/size; square += g*g; inner += g*size*last[i]; }
+
+// kernel nonsmooth_map.advance: x = base + scale e, onto the bounds if projected
+//   compute    float64
+//   bounds
+//   reads      float64 base; S e; int8 unknown
+//   writes     float64 x
+//   numbers    float64 scale; bool projected
+if (projected) with_bounds([&](auto lower, auto upper) {
+    SIMD for (int i = 0; i < n; ++i) {
+        const double v = base[i] + scale*(double)e[i], c = clipped(v, lower(i), upper(i)); x[i] = unknown[i] == 1 ? c : 0.0; } });
+else SIMD for (int i = 0; i < n; ++i) x[i] = base[i] + scale*(double)e[i];
+
+// kernel nonsmooth_map.move: x += step e
+//   compute    float64
+//   reads      S e
+//   writes     float64 x
+//   numbers    float64 step
+fetch(0, n, x, e);
+SIMD8 for (int k = 0; k < n; ++k) x[k] += step*(double)e[k];
