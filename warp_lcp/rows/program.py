@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -66,6 +67,17 @@ def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
         run_table(Table([what]))
     else:
         what()
+
+
+@contextmanager
+def together(device: wp.Device) -> Iterator[Launch]:
+    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches at once."""
+    if device.is_cuda or team() is None:
+        yield wp.launch
+        return
+    program = Program(device)
+    yield program.launch
+    program.run()
 
 
 def run_table(table: Table) -> None:

@@ -168,7 +168,14 @@ class Table:
         total, made = 0, []
         for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
             total += operation.chunks
-            made += [total, *operation.words, count, self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count), operation.condition]
+            made += [
+                total,
+                *operation.words,
+                count,
+                self.address + 8 * at,
+                self.address + 8 * (at + LANE_WORDS * count),
+                operation.condition,
+            ]
             at += size
         self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = made
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
