@@ -61,6 +61,12 @@ def seconds_left() -> float:
     return math.inf if running is None else running.left()
 
 
+def is_collective() -> bool:
+    """Return whether ranks must look at the deadline of the solve under way together, so as often as each other."""
+    running = _running.get()
+    return running is not None and running.ends != math.inf and running._across is not None
+
+
 def time_is_up() -> bool:
     """Return whether the solve under way has no time left: for loops that have something to return when they end early."""
     return seconds_left() == 0

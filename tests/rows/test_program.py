@@ -1,10 +1,14 @@
 """Recorded launches, with tasks of the host between them."""
 
 import numpy as np
+import pytest
 import warp as wp
 
-from warp_lcp.rows.program import Program, perform
-from warp_lcp.rows.vectors import Reduction
+import warp_lcp as wl
+from warp_lcp.deadline import Deadline, TimeIsUp
+from warp_lcp.rows import team
+from warp_lcp.rows.program import Conditional, Program, loops_on_device, perform
+from warp_lcp.rows.vectors import ADD, Reduction, rows_of
 
 DEVICE = wp.get_device("cpu")
 
@@ -37,3 +41,67 @@ def test_sums_are_of_all_parts():
     scalars = wp.full(3, 7.0, dtype=wp.float64, device=DEVICE)
     Reduction(3, DEVICE, scalars, across=Others()).dot(a, a, 1)
     assert scalars.numpy().tolist() == [7.0, 56.0, 7.0]
+
+
+@wp.kernel(enable_backward=False, module="test_program")
+def count_down_kernel(left: wp.array(dtype=wp.int32), odd: wp.array(dtype=wp.int32)):
+    """One run less is left."""
+    left[0] = left[0] - 1
+    odd[0] = left[0] % 2
+
+
+@pytest.fixture(params=[1, 2, 3, 7])
+def threads(request, monkeypatch):
+    """Have so many threads, and cut what is small."""
+    before = wl.get_threads()
+    wl.set_threads(request.param)
+    for module in ("team", "row_pass", "program"):
+        monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 64)
+    yield request.param
+    wl.set_threads(before)
+
+
+def counting(left: wp.array, odd: wp.array) -> tuple[Program, wp.array, wp.array]:
+    """Return a program that adds 1 to a field in each run, and doubles another after every odd number of runs left."""
+    ones, a, b = (wp.full(5000, value, dtype=wp.float64, device=DEVICE) for value in (1.0, 0.0, 1.0))
+    program, double = Program(DEVICE), Program(DEVICE)
+    ADD.bind(rows_of(a), z=ones, x=a).launch(program.launch)
+    program.launch(count_down_kernel, 1, [left, odd], device=DEVICE)
+    ADD.bind(rows_of(b), z=b, x=b).launch(double.launch)
+    program.record(Conditional(odd, double))
+    return program, a, b
+
+
+@pytest.mark.cpu_form("the team is the CPU's")
+@pytest.mark.parametrize("runs", [0, 1, 2, 9])
+def test_a_loop_runs_while_its_condition_holds(runs, threads, monkeypatch):
+    """The same where native code comes back every few microseconds."""
+    left, odd = (wp.zeros(1, dtype=wp.int32, device=DEVICE) for _ in range(2))
+    assert loops_on_device(DEVICE)
+    program, a, b = counting(left, odd)
+    for patience in (team.PATIENCE, 20_000):
+        monkeypatch.setattr(team, "PATIENCE", patience)
+        a.fill_(0.0)
+        b.fill_(1.0)
+        left.fill_(runs)
+        program.run_while(left)
+        assert (a.numpy() == runs).all()
+        assert (b.numpy() == 2.0 ** (runs // 2)).all()
+    assert program._runs == 0
+    left.fill_(3)
+    program.run()
+    assert left.numpy()[0] == 2
+
+
+@pytest.mark.cpu_form("the team is the CPU's")
+def test_a_loop_ends_with_the_deadline(threads):
+    left, odd = (wp.zeros(1, dtype=wp.int32, device=DEVICE) for _ in range(2))
+    program, a, _ = counting(left, odd)
+    left.fill_(2_000_000_000)
+    with Deadline(0.05), pytest.raises(TimeIsUp):
+        program.run_while(left)
+    done = a.numpy()[0]
+    assert 0 < done < 1e9
+    left.fill_(4)
+    program.run_while(left)
+    assert (a.numpy() >= done + 4).all()

@@ -14,7 +14,7 @@ from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.rows.readings import BYTES, LINE, Reading, board_of
 from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
-pytestmark = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
+emulated = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
 SOLVER = wl.ProjectedMultigrid()
 
 
@@ -68,6 +68,7 @@ def test_solves_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch
     assert begun == 5 * (ahead.problem.layout.across is None)
 
 
+@emulated
 def test_a_warm_solve_is_read_once() -> None:
     from benchmarks.emulated_cuda import meter
 
@@ -95,6 +96,7 @@ def test_criteria_of_the_mean_are_known_once_unknowns_are_counted() -> None:
     assert (result.status, result.iterations, result.residual) == (plain.status, plain.iterations, plain.residual)
 
 
+@emulated
 def test_readings_come_together_and_their_places_are_used_again() -> None:
     from benchmarks.emulated_cuda import meter
 

@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_lcp.problem.protocol import FLUID
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.program import Launch, together
 from warp_lcp.rows.readings import Reading
 
 options: dict[str, Any] = {"enable_backward": False, "module": "warp_lcp.components"}
@@ -251,18 +252,37 @@ class ComponentFinder:
 
     def look(self, scratch: Scratch | None = None) -> Callable[[], bool]:
         """Launch the search; return what tells whether there are none, and waits for the device; `scratch` as of `find`."""
-        version = self._A.version
-        if self._none_at != version:
+        if self.wanted():
             self._scratch = self._grow(scratch, self._A.cells_around)
+        return self.none
 
-        def none() -> bool:
-            if self._none_at != version and not self._count.numpy()[0]:
-                self._none_at = version
-            return self._none_at == version
+    def wanted(self) -> bool:
+        """Return whether there must be a search: the cells have changed since there were none. It counts from 0 then."""
+        if self._none_at == self._A.version:
+            return False
+        self._count.array.zero_()
+        return True
 
-        return none
+    def none(self) -> bool:
+        """Return whether there are none, once the search is launched; waits for the device."""
+        version = self._A.version
+        if self._none_at != version and not self._count.numpy()[0]:
+            self._none_at = version
+        return self._none_at == version
+
+    def record(self, scratch: Scratch | None, launch: Launch) -> None:
+        """Record the launches of a search, which are for when it is `wanted`; `scratch` as of `find`."""
+        self._search(scratch, self._A.cells_around, launch)
 
     def _grow(self, scratch: Scratch | None, joined: wp.array[Any]) -> Scratch:
+        """Search now; returns what `_search` does."""
+        self._count.array.zero_()
+        with together(self._A.device) as launch:
+            found = self._search(scratch, joined, launch)
+        self._count.changed()
+        return found
+
+    def _search(self, scratch: Scratch | None, joined: wp.array[Any], launch: Launch) -> Scratch:
         """Return each cell's parent in the tree of its component, and which roots something holds; their number is `_count`.
 
         Args:
@@ -278,14 +298,12 @@ class ComponentFinder:
                 )
             scratch = self._own
         parent, grounded = scratch[0].view(wp.int32), scratch[1]
-        self._count.array.zero_()
         cells, coefficients = A.cells_around.flatten(), dict(zip(UNIFORM, A.uniform, strict=True))
         given = coefficients | {name: face.flatten() for name, face in zip(FACES, A.faces, strict=True)}
-        SINGLETONS.bind(rows, parent=parent, grounded=grounded).launch()
-        UNITE.bind(rows, cells=joined.flatten(), parent=parent, **given).launch()
-        GROUND.bind(rows, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded, **given).launch()
-        COUNT.bind(rows, cells=cells, parent=parent, grounded=grounded, count=self._count.array).launch()
-        self._count.changed()
+        SINGLETONS.bind(rows, parent=parent, grounded=grounded).launch(launch)
+        UNITE.bind(rows, cells=joined.flatten(), parent=parent, **given).launch(launch)
+        GROUND.bind(rows, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded, **given).launch(launch)
+        COUNT.bind(rows, cells=cells, parent=parent, grounded=grounded, count=self._count.array).launch(launch)
         return parent, grounded
 
     def _label(self, parent: np.ndarray, grounded: np.ndarray) -> FloatingComponents:

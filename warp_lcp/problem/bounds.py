@@ -13,6 +13,7 @@ from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
+from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
@@ -106,7 +107,7 @@ class Bounds:
             self.encode()
             self.code = self._no_code if self._other_values() else self._memory
 
-    def encode(self) -> None:
+    def encode(self, launch: Launch = wp.launch) -> None:
         """Launch the coding of fields that are in place; `stays` then tells, and waits for the device."""
         if not self.in_place:
             return
@@ -115,7 +116,7 @@ class Bounds:
             self._others = Sums(Rows.of_fields(self.layout))
         least, most = (0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True))
         given = {"lower": self.fields[0], "upper": self.fields[1], "least": least, "most": most, "code": self._memory}
-        self._others.launch(ENCODE, **given)
+        self._others.launch(ENCODE, launch=launch, **given)
 
     @property
     def stays(self) -> bool:

@@ -16,6 +16,7 @@ from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
+from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
@@ -137,12 +138,12 @@ class LCP(Pickled):
         """Return the number of unknowns of a stored field that are not finite."""
         return self._faults(field, Bounds(self.layout, *INFINITE))[0]
 
-    def look_at(self, field: wp.array[Any]) -> Callable[[], int]:
+    def look_at(self, field: wp.array[Any], launch: Launch = wp.launch) -> Callable[[], int]:
         """Launch the check of `not_finite`; return a function that reads its result.
 
         For a problem in one process.
         """
-        self._counts.launch(CHECK, bounds=Bounds(self.layout, *INFINITE).operands, b=field, unknown=self.unknown)
+        self._counts.launch(CHECK, launch=launch, bounds=Bounds(self.layout, *INFINITE).operands, b=field, unknown=self.unknown)
         return lambda: int(self._counts.reading.numpy()[0])
 
     def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:

@@ -19,6 +19,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.problem.scale import estimated_scale
 from warp_lcp.rows import KernelFile, Known, Rows
+from warp_lcp.rows.program import Launch
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Sums
 
@@ -76,7 +77,7 @@ class NaturalResidual:
         """Compute y = A x + b."""
         self.problem.apply_plus(x, self.problem.b, self.y)
 
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+    def start(self, x: wp.array[Any], *, keep: bool, launch: Launch = wp.launch) -> None:
         """Project x onto the bounds, or set it to clip(0, l, u).
 
         0 where there is no unknown.
@@ -87,7 +88,7 @@ class NaturalResidual:
             self.rescale()
         for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
             p.bounds.follow(x)
-            WITHIN.bind(Rows.of_fields(p.layout), bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=keep).launch()
+            WITHIN.bind(Rows.of_fields(p.layout), bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=keep).launch(launch)
         self.current = False
 
     def rescale(self) -> None:
@@ -139,9 +140,9 @@ class NaturalResidual:
         """||b||^2 over the unknowns as last launched, in the first entry."""
         return self._sums.reading
 
-    def launch_square_of_b(self) -> None:
+    def launch_square_of_b(self, launch: Launch = wp.launch) -> None:
         """Launch the evaluation of `square_of_b`."""
-        self._sums.launch(UNKNOWN_SQUARE, b=self.problem.b, unknown=self.problem.unknown)
+        self._sums.launch(UNKNOWN_SQUARE, launch=launch, b=self.problem.b, unknown=self.problem.unknown)
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
         """Return an estimate of the residual that rounding x to `epsilon` leaves.

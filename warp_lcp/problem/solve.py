@@ -143,7 +143,6 @@ class Workspace(Protocol):
         """Make x the best iterate again."""
 
 
-@runtime_checkable
 class BeginsAhead(Protocol):
     """A workspace whose device may begin a solve, and go on, before the host knows of it."""
 
@@ -409,7 +408,7 @@ class _LoopInBox(_Loop):
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
         """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
-        if isinstance(self.work, BeginsAhead) and self._begin_ahead(self.work, x0):
+        if hasattr(self.work, "begin_ahead") and self._begin_ahead(self.work, x0):
             return None
         x, residual = self.work.x, self.residual
         guess = None if x0 is None else self._guess(x0)
@@ -441,9 +440,10 @@ class _LoopInBox(_Loop):
         return SolveStatus.INFEASIBLE if lost > self.tolerance else None
 
     def _begin_ahead(self, work: BeginsAhead, x0: Array | None) -> bool:
-        """Let the device begin; return whether it has."""
-        work.allow(self.stopping.max_iterations if self.deadline.ends == math.inf else 0)
-        if x0 is None or self.deadline.ends != math.inf:
+        """Let the device begin; return whether it has. It takes no step ahead of somebody who looks at each, or of a deadline."""
+        watched = self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
+        work.allow(0 if watched else self.stopping.max_iterations)
+        if x0 is None or watched:
             return False
         reference = work.begin_ahead(self.problem.layout.load(x0, wp.float64, "x0"), self.criteria)
         if reference is None:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Protocol
 
 import warp as wp
 
-from warp_lcp.deadline import check_time
+from warp_lcp.deadline import check_time, is_collective
 from warp_lcp.rows.memory import ARRAY_BYTES, Scalar, value_of
 from warp_lcp.rows.team import ALONE, CELLS, Entry, Operation, Patch, Stage, Table, arguments_of, copied, get_threads, ranges, team
 
@@ -43,11 +43,8 @@ def recording(program: Program) -> Iterator[None]:
 
 
 def loops_on_device(device: wp.Device) -> bool:
-    """Return whether loops run on the device, without the host: on CUDA, from driver 12.4.
-
-    Native code could loop on the CPU as well, but would hold up Ctrl-C for all of a loop to save a microsecond an iteration.
-    """
-    return bool(device.is_cuda and wp.is_conditional_graph_supported())
+    """Return whether loops run on the device, without the host: on the CPU by the team, on CUDA from driver 12.4."""
+    return bool(wp.is_conditional_graph_supported()) if device.is_cuda else team() is not None
 
 
 class Launch(Protocol):
@@ -77,7 +74,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Conditional:
-    """A program that is launched if a number on the device is not 0: in a graph without the host."""
+    """A program that is launched if a number on the device is not 0: in a graph, or by the team, without the host."""
 
     condition: wp.array[Any]
     program: Program
@@ -100,11 +97,28 @@ def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
         what()
 
 
+@contextmanager
+def together(device: wp.Device) -> Iterator[Launch]:
+    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches at once."""
+    if device.is_cuda or team() is None:
+        yield wp.launch
+        return
+    program = Program(device)
+    yield program.launch
+    program.run()
+
+
 def run_table(table: Table) -> None:
     """Have the team work through a table."""
     at_work = team()
     assert at_work is not None, "a table is made for a team"
     at_work.run(table)
+
+
+def _run_while(condition: Any, table: Table) -> None:
+    """Have the team repeat a table, unless its condition is 0 before."""
+    if condition[0]:
+        run_table(table)
 
 
 def launch_ranges(
@@ -213,20 +227,31 @@ class Program:
         self.record(Operation(ALONE, [Stage(Entry(made), memory, (made, inputs), patches=patches)]))
 
     def record(self, what: Any) -> None:
-        """Record a recorded launch, an operation of the team or a task of the host."""
-        self._commands.append(Task(what) if callable(what) else what)
+        """Record a recorded launch, an operation of the team, a task of the host or, where loops run on the device, a conditional."""
+        if isinstance(what, Conditional) and not self.device.is_cuda:
+            self._arguments.append(what)
+            self._commands += [operation.only_if(what.condition) for operation in what.program._commands]
+        else:
+            self._commands.append(Task(what) if callable(what) else what)
         self._stretches = None
+        self._loops.clear()
+
+    @property
+    def is_native(self) -> bool:
+        """Whether the team works through all of it, and none of it waits for other ranks."""
+        return all(isinstance(command, Operation) and command.check is None for command in self._commands)
 
     @property
     def has_run(self) -> bool:
-        """Whether it has run, so that all of its kernels are loaded."""
-        return self._runs > 0
+        """Whether all of its kernels are loaded: it has run, or they were loaded as they were recorded, on the CPU."""
+        return self._runs > 0 or not self.device.is_cuda
 
     def extend(self, other: Program) -> None:
         """Append the launches of another program."""
         self._commands += other._commands
         self._arguments += other._arguments
         self._stretches = None
+        self._loops.clear()
 
     def run(self) -> None:
         """Launch everything once, or record that among the launches of another program."""
@@ -245,20 +270,31 @@ class Program:
     def run_while(self, condition: wp.array[Any]) -> None:
         """Launch everything again and again while the condition is not 0; the launches update it.
 
-        Where loops run on the device, all but the first call are one graph, and return before it has ended.
+        Where loops run on the device, they do not come back to the host: on CUDA, all but the first call are one graph, and return
+        before it has ended; on the CPU, the team looks after signals and the deadline.
 
         Args:
             condition: shape (1,), wp.int32.
         """
-        if self._runs == 0 or self._has_tasks or not loops_on_device(self.device):  # the first run loads the kernels
+        if self._loops_here():
+            if condition.ptr not in self._loops:
+                self._loops[condition.ptr] = self._captured_loop(condition)
+            self._loops[condition.ptr]()
+        else:
             wp.capture_while(condition, self._run_in_time)
-            return
-        if condition.ptr not in self._loops:
-            self._loops[condition.ptr] = self._captured_loop(condition)
-        self._loops[condition.ptr]()
+
+    def _loops_here(self) -> bool:
+        """Return whether `run_while` can do without the host now."""
+        if self._has_tasks or not loops_on_device(self.device):
+            return False
+        if self.device.is_cuda or team() is None:
+            return self._runs > 0  # the first run loads the kernels
+        return self.is_native and not is_collective()
 
     def _captured_loop(self, condition: wp.array[Any]) -> Callable[[], object]:
-        """Return what launches a graph that repeats the launches."""
+        """Return what launches a graph, or has the team work through a table, that repeats the launches."""
+        if not self.device.is_cuda and team() is not None:
+            return partial(_run_while, condition.numpy(), Table(self._commands, condition))
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             wp.capture_while(condition, self._launch)
         return partial(wp.capture_launch, capture.graph)

@@ -8,6 +8,7 @@ What is computed depends neither on who does it nor on how it is cut.
 from __future__ import annotations
 
 import atexit
+import copy
 import ctypes
 import functools
 import os
@@ -19,6 +20,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.deadline import check_time, seconds_left
 from warp_lcp.rows.native import shared
 
 VARIABLE = "WARP_LCP_THREADS"
@@ -31,9 +33,10 @@ COPIED = 1 << 18  # bytes that a thread copies at least
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
 ALONE, TASKS, SLABS, COPY = range(4)
-DONE_ALONE, SHARED, RESUMED = range(3)
-TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 56, 64, 24, 12, 8
-COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED = range(16, 21)
+DONE_ALONE, SHARED, RESUMED = 0, 1, 2
+TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 56, 64, 24, 13, 8
+COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED, AGAIN = range(16, 22)
+WITHIN, BETWEEN = 1, 2  # where a table is unfinished: within a run, between two
 MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
 LOCKS = ("pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast")
 SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
@@ -123,6 +126,7 @@ class Operation:
 
     Attributes:
         check: raises what has failed in it, once the table is done; None: nothing can.
+        condition: address of an int32 number; the operation is skipped where it is 0. 0: it is never skipped.
 
     Args:
         kind: ALONE for a launch as it is; TASKS, SLABS for what is cut; COPY for memory.
@@ -134,7 +138,7 @@ class Operation:
         sized: address of the number of tasks, which may differ from run to run; 0: it is `everything`.
     """
 
-    __slots__ = ("_kept", "_stages", "check", "chunks", "sized", "words")
+    __slots__ = ("_kept", "_stages", "check", "chunks", "condition", "sized", "words")
 
     def __init__(
         self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0, sized: int = 0
@@ -142,15 +146,22 @@ class Operation:
         made = [word for stage in stages for word in stage.words]
         self._stages, self._kept, self.chunks = (ctypes.c_uint64 * len(made))(*made), stages, chunks
         self.check: Callable[[], object] | None = None
-        self.words, self.sized = (kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks), sized
+        self.condition, self.sized = 0, sized
+        self.words = kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks
 
     def content(self) -> tuple[Any, ...]:
         """Return what it does, but for what it reads from memory in each run."""
-        return (self.words[0], self.sized, *(stage.content() for stage in self._kept))
+        return (self.words[0], self.sized, self.condition, *(stage.content() for stage in self._kept if isinstance(stage, Stage)))
 
     def name(self) -> str:
         """Return the names of its kernels."""
-        return ", ".join(stage.kept[0].kernel.key if self.words[0] != COPY else "copy" for stage in self._kept)
+        return "copy" if self.words[0] == COPY else ", ".join(s.kept[0].kernel.key for s in self._kept if isinstance(s, Stage))
+
+    def only_if(self, condition: wp.array[Any]) -> Operation:
+        """Return the same operation, skipped where a number, shape (1,), wp.int32, is 0."""
+        made = copy.copy(self)
+        made._kept, made.condition = [*self._kept, condition], condition.ptr
+        return made
 
 
 def ranges(stage: Stage, cells: int, *, ordered: bool = False, sized: int = 0) -> Operation:
@@ -190,9 +201,13 @@ class Table:
 
     Attributes:
         checks: raise what has failed, after all of it.
+
+    Args:
+        operations: in order.
+        again: number on the host, shape (1,), wp.int32, that operations write: the table is run until it is 0. None: once.
     """
 
-    def __init__(self, operations: Iterable[Operation]) -> None:
+    def __init__(self, operations: Iterable[Operation], again: wp.array[Any] | None = None) -> None:
         self._kept = tuple(operations)
         self.checks = {operation.check for operation in self._kept} - {None}
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
@@ -203,10 +218,12 @@ class Table:
         total, made = 0, []
         for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
             total += operation.chunks
-            made += [total, *operation.words, count, self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count), operation.sized]
+            places = self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)
+            made += [total, *operation.words, count, *places, operation.sized, operation.condition]
             at += size
         self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = made
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
+        self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
         self.cut = total > len(self._kept)
 
 
@@ -240,11 +257,15 @@ class Team:
             share = SHARED if table.cut and self.size > 1 and self._inside == 1 else DONE_ALONE
             if share and self._posted is not table.words:
                 self._retire(table.words)
-        asked = Arguments(self.address, table.address, RUN, 0, share, PATIENCE)
+        table.words[SHARED_TIME] = 0
+        asked = Arguments(self.address, table.address, RUN, 0, share, patience(table))
         try:
             self._do(asked)
-            while table.words[UNFINISHED]:  # the interpreter has looked after signals
-                asked.share = RESUMED
+            while unfinished := table.words[UNFINISHED]:  # the interpreter has looked after signals
+                if table.again is not None:
+                    check_time()
+                asked.share = share + (RESUMED if unfinished == WITHIN else 0)
+                asked.limit = patience(table)
                 self._do(asked)
         except BaseException:
             self._do(Arguments(self.address, table.address, CANCEL))
@@ -277,6 +298,11 @@ class Team:
 
     def _do(self, asked: Arguments) -> None:
         self._entry.function(ctypes.c_void_p(self._entry.bounds), ctypes.byref(asked))
+
+
+def patience(table: Table) -> int:
+    """Return after how many nanoseconds the interpreter looks after signals, and after the deadline of a loop."""
+    return PATIENCE if table.again is None else int(min(PATIENCE, 1e9 * seconds_left()))
 
 
 def arguments_of(launch: Any) -> Any:

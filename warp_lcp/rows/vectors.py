@@ -172,10 +172,10 @@ class Sums(Reduction):
         self.launch(declared, slot, **given)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
 
-    def launch(self, declared: RowPass, slot: int = 0, **given: Any) -> None:
-        """Launch a pass, whose sums `reading` will have from a slot on."""
-        declared.bind(self.rows, **given, out=self.partials).launch()
-        self.add_up(slot, columns=len(declared.sums))
+    def launch(self, declared: RowPass, slot: int = 0, *, launch: Launch = wp.launch, **given: Any) -> None:
+        """Launch a pass, whose sums `reading` will have from a slot on, or record it."""
+        declared.bind(self.rows, **given, out=self.partials).launch(launch)
+        self.add_up(slot, columns=len(declared.sums), launch=launch)
         self.reading.changed()
 
 

@@ -14,8 +14,10 @@ from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
-from warp_lcp.rows.program import Conditional, Program, loops_on_device
+from warp_lcp.rows import Rows
+from warp_lcp.rows.program import Conditional, Launch, Program, loops_on_device
 from warp_lcp.rows.readings import Reading
+from warp_lcp.rows.vectors import CONVERT
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 
 if TYPE_CHECKING:
@@ -31,7 +33,8 @@ class RunAhead:
     """What the device does without its host, and what the host has not looked at of it yet.
 
     A step follows a step where residual and energy are the least so far, the tolerance is missed and the free set does not creep: then the
-    host, which judges all of that again when it comes, would have taken the same one. Everything else is left to it.
+    host, which judges all of that again when it comes, would have taken the same one. Everything else is left to it. On the CPU the team
+    works through the beginning of a solve as one table, and through the steps as a table that it repeats.
 
     Args:
         work: whose steps they are; its operator is a grid's, in one process.
@@ -46,10 +49,12 @@ class RunAhead:
         self._found, self._judged = Reading(device, ROWS * int(kernels.ROW)), Reading(device, kernels.JUDGED)
         self._going, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self._loops: dict[int, Program] = {}  # by the step's program
+        self._launches: dict[Any, Any] = {}  # recorded, by their kernel
+        self._beginning: Beginning | None = None
 
     @staticmethod
     def suits(work: MultigridWorkspace) -> bool:
-        """Return whether the device can do without its host: where graphs have loops, on a grid in one process."""
+        """Return whether the device can do without its host: where loops run on it, on a grid in one process."""
         plain = type(work.hierarchy) is Hierarchy and isinstance(work.problem.A, GridPoisson) and work.exact
         return plain and work.problem.layout.across is None and loops_on_device(work.A.device)
 
@@ -60,7 +65,7 @@ class RunAhead:
             return False
         work, r = self._work, self._work.residual
         given = [int(r.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
-        wp.launch(kernels.resume_kernel, 1, [self._judged.array, self._going, self._stale, *given], device=work.A.device)
+        self._launch(kernels.resume_kernel, [self._judged.array, self._going, self._stale], given)
         self._run(loop)
         return True
 
@@ -75,31 +80,18 @@ class RunAhead:
         loop, work, r = self._loop(), self._work, self._work.residual
         if loop is None:
             return None
-        p, device, x = work.problem, work.A.device, work.x
-        p.bounds.encode()
+        p = work.problem
         r.renew()
-        NaturalResidual.start(r, x, keep=False)
-        r.launch_square_of_b()
-        wp.launch(kernels.take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
-        r.classify = False
-        r.assess(x)
-        wp.launch(kernels.keep_row_kernel, 1, [r.scalars, self._found.array, 0], device=device)
-        none_floats = p.A.component_finder.look(work.scratch)  # type: ignore[attr-defined]  # of a GridPoisson
-        faults = p.look_at(guess)
-        p.layout.copy(x, guess)
-        NaturalResidual.start(r, x, keep=True)
-        r.classify = True
-        r.assess(x)
-        if work.scratch is not None:
-            CLEAR.bind(work.flat, x=work.scratch[1]).launch()
+        if self._beginning is None or not self._beginning.fits(guess):
+            self._beginning = Beginning(work, guess, self._found)
+        self._beginning.run()
         counted = criteria.counted if isinstance(criteria, MeanCriteria) else None
         given = [int(r.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, counted, work.descent.noise]
-        memory = [r.scalars, self._found.array, self._judged.array, self._going, self._stale]
-        wp.launch(kernels.begin_kernel, 1, [*memory, *given], device=device)
+        self._launch(kernels.begin_kernel, [r.scalars, self._found.array, self._judged.array, self._going, self._stale], given)
         self._run(loop)
         reference, first = (math.sqrt(row[int(kernels.NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
-        usual = p.bounds.stays and none_floats() and not faults() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
+        usual = p.bounds.stays and self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
         if not (usual and reference > ORDINARY and RATIOS[0] * size < first < RATIOS[1] * size):
             self.rows.clear()
             r.stale = True  # nobody knows what the hierarchy is of
@@ -107,6 +99,17 @@ class RunAhead:
         for _ in range(2):
             r.take(self.rows.popleft(), size)
         return reference
+
+    def _launch(self, kernel: Any, memory: list[Any], given: list[Any]) -> None:
+        """Launch a kernel of one thread whose last arguments differ from launch to launch."""
+        made = self._launches.get(kernel)
+        if made is None:
+            inputs = [*memory, *given]
+            made = self._launches[kernel] = wp.launch(kernel, 1, inputs, device=self._work.A.device, record_cmd=True)
+        else:
+            for place, value in enumerate(given, len(memory)):
+                made.set_param_at_index(place, value)
+        made.launch()
 
     def _run(self, loop: Program) -> None:
         """Launch the loop, and take over the rows that there are then."""
@@ -129,3 +132,67 @@ class RunAhead:
             memory = [work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
             loop.launch(kernels.judge_kernel, 1, memory, device=work.A.device)
         return self._loops[id(step)]
+
+
+class Beginning:
+    """The launches that begin a solve from a guess: residuals at clip(0, l, u) and at the guess, and what is unusual about the data.
+
+    Args:
+        work: of the solve.
+        guess: stored field, read each time.
+        found: receives the first evaluation, see `projected_multigrid_kernels.keep_row`.
+    """
+
+    def __init__(self, work: MultigridWorkspace, guess: wp.array[Any], found: Reading) -> None:
+        self._work, self._guess, self._found, device = work, guess, found, work.A.device
+        self._key, self._finder = work.program_key(), work.problem.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
+        self._program = None if device.is_cuda else Program(device)
+        if self._program is not None:
+            self._searches, search = wp.zeros(1, dtype=wp.int32, device=device), Program(device)
+            self._finder.record(work.scratch, search.launch)
+            self._record(self._program.launch, Conditional(self._searches, search))
+
+    def fits(self, guess: wp.array[Any]) -> bool:
+        """Return whether the launches are of this guess, and of the bounds as they are."""
+        return self._guess.ptr == guess.ptr and self._key == self._work.program_key()
+
+    def run(self) -> None:
+        """Launch everything."""
+        wanted = self._finder.wanted()
+        if self._program is None:
+            self._record(wp.launch, None)
+        else:
+            self._searches.numpy()[0] = wanted
+            self._program.run()
+        self._work.residual.classify = True
+
+    def is_plain(self) -> bool:
+        """Return whether no component floats and the guess is finite; waits for the device."""
+        return self._finder.none() and not self._faults()
+
+    def _record(self, launch: Launch, search: Conditional | None) -> None:
+        """Record the launches, or launch them; the search for floating components where it is None and due."""
+        work, r, x = self._work, self._work.residual, self._work.x
+        p, device = work.problem, work.A.device
+        p.bounds.encode(launch)
+        NaturalResidual.start(r, x, keep=False, launch=launch)
+        r.launch_square_of_b(launch)
+        launch(kernels.take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
+        r.classify = False
+        r.assess(x, launch=launch)
+        launch(kernels.keep_row_kernel, 1, [r.scalars, self._found.array, 0], device=device)
+        if search is None:
+            self._finder.look(work.scratch)
+        else:
+            assert self._program is not None
+            self._program.record(search)
+        self._faults = p.look_at(self._guess, launch)
+        if search is None:
+            p.layout.copy(x, self._guess)
+        else:
+            CONVERT.bind(Rows.of_fields(p.layout), a=self._guess, b=x).launch(launch)
+        NaturalResidual.start(r, x, keep=True, launch=launch)
+        r.classify = True
+        r.assess(x, launch=launch)
+        if work.scratch is not None:
+            CLEAR.bind(work.flat, x=work.scratch[1]).launch(launch)

@@ -144,8 +144,9 @@ class CoupledWorkspace(MultigridWorkspace):
         self.correction.begin()
         super()._cycle()
 
-    def _program_key(self) -> tuple[Any, ...]:
-        return (*super()._program_key(), *self.correction.key)
+    def program_key(self) -> tuple[Any, ...]:
+        """Return by what a step's program differs from others, the bodies' term included."""
+        return (*super().program_key(), *self.correction.key)
 
     def _correct(self, program: Program) -> None:
         """Record a cycle, its correction, the measuring and the plan of the step."""

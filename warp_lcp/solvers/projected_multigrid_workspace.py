@@ -376,7 +376,7 @@ class MultigridWorkspace(IterateMemory):
 
     def step_program(self) -> Program:
         """Return the launches of a truncated cycle; bounds in place may be coded now and not in the next solve."""
-        key = self._program_key()
+        key = self.program_key()
         program = self._programs.get(key)
         if program is None:
             program, before = Program(self.A.device), self.residual.classify
@@ -386,7 +386,7 @@ class MultigridWorkspace(IterateMemory):
             self.residual.classify = before
         return program
 
-    def _program_key(self) -> tuple[Any, ...]:
+    def program_key(self) -> tuple[Any, ...]:
         """Return what the launches of a truncated cycle depend on."""
         lower, least, upper, most, code = self.problem.bounds.operands
         return lower.ptr, float(least), upper.ptr, float(most), code.ptr

@@ -25,7 +25,8 @@ static void next(void*, void* given) {  // planes that read what the stage befor
         const int below = t > 0 ? a->cells[t - 1] : 0, above = t + 1 < CELLS_ ? a->cells[t + 1] : 0;
         a->cells[CELLS_ + t] = a->cells[t] + below + above; }
 }
-static void all(void*, void* given) { Arguments* a = (Arguments*)given; for (int t = 0; t < CELLS_; ++t) a->cells[t] -= a->value; }
+static int left, odd;  // conditions: of the loop, and of an operation
+static void all(void*, void* given) { Arguments* a = (Arguments*)given; for (int t = 0; t < CELLS_; ++t) a->cells[t] -= a->value; --left; odd = left % 2; }
 
 int main() {
     enum { SIZE = 4, ROUNDS = 3000 };
@@ -47,35 +48,43 @@ int main() {
     const U patches[] = {1, offsetof(Arguments, value), (U)&three, sizeof(int)};
     first[9] = (U)patches;
     wave.insert(wave.end(), after.begin(), after.end());
-    enum { SLABS_ = 8, PIECES_ = 16, LANES_ = 3, WORDS_ = 12, LANE_ = 8 };
+    enum { SLABS_ = 8, PIECES_ = 16, LANES_ = 3, WORDS_ = 13, LANE_ = 8 };
     const U each = CELLS_/SLABS_;
-    std::vector<U> table(24 + 3*WORDS_ + 3*LANE_*LANES_ + SLABS_);
-    U *words = &table[24], *taken = words + 3*WORDS_, *cuts = taken + 3*LANE_*LANES_;
-    const U made[3][WORDS_] = {{PIECES_, 1, (U)first.data(), 1, 1, 0, 0, PIECES_, LANES_, (U)taken, 0, (U)&tasks},
-        {PIECES_ + SLABS_, 2, (U)wave.data(), 2, each, CELLS_, 1, SLABS_, LANES_, (U)(taken + LANE_*LANES_), (U)cuts, 0},
-        {PIECES_ + SLABS_ + 1, 0, (U)last.data(), 1, 0, 0, 0, 1, 1, (U)(taken + 2*LANE_*LANES_), 0, 0}};
+    std::vector<U> table(24 + 4*WORDS_ + 4*LANE_*LANES_ + SLABS_);
+    U *words = &table[24], *taken = words + 4*WORDS_, *cuts = taken + 4*LANE_*LANES_;
+    const U made[4][WORDS_] = {{PIECES_, 1, (U)first.data(), 1, 1, 0, 0, PIECES_, LANES_, (U)taken, 0, (U)&tasks, 0},
+        {PIECES_ + SLABS_, 2, (U)wave.data(), 2, each, CELLS_, 1, SLABS_, LANES_, (U)(taken + LANE_*LANES_), (U)cuts, 0, 0},
+        {PIECES_ + SLABS_ + 1, 0, (U)last.data(), 1, 0, 0, 0, 1, 1, (U)(taken + 2*LANE_*LANES_), 0, 0, 0},
+        {2*PIECES_ + SLABS_ + 1, 1, (U)first.data(), 1, 1, 0, 0, PIECES_, LANES_, (U)(taken + 3*LANE_*LANES_), 0, (U)&tasks, (U)&odd}};
     memcpy(words, made, sizeof(made));
-    table[16] = 3; table[17] = made[2][0]; table[18] = (U)words;
-    int wrong = 0, resumed = 0;
+    table[16] = 4; table[17] = made[3][0]; table[21] = (U)&left; table[18] = (U)words;
+    int wrong = 0, resumed = 0, between = 0;
     for (int round = 0; round < ROUNDS; ++round) {
         const int share = round % 5 ? 1 : 0; const long long limit = round % 7 ? 1LL << 40 : 0;
+        const int runs = 1 + round % 3;  // one after another, natively
+        left = runs;
         work_through((U)team.data(), (U)table.data(), 0, 0, share, limit);
-        while (table[20]) { ++resumed; work_through((U)team.data(), (U)table.data(), 0, 0, 2, 2000); }
-        for (int t = 0; t < CELLS_; ++t) expected[t] += 5;
-        for (int t = 0; t < CELLS_; ++t) {
-            expected[CELLS_ + t] = expected[t] + (t > 0 ? expected[t - 1] : 0) + (t + 1 < CELLS_ ? expected[t + 1] : 0); }
-        for (int t = 0; t < CELLS_; ++t) expected[t] -= 1;
+        while (const U unfinished = table[20]) {
+            ++resumed; between += unfinished == 2;
+            work_through((U)team.data(), (U)table.data(), 0, 0, unfinished == 1 ? 2 + share : share, 2000); }
+        for (int run = 1; run <= runs; ++run) {
+            for (int t = 0; t < CELLS_; ++t) expected[t] += 5;
+            for (int t = 0; t < CELLS_; ++t) {
+                expected[CELLS_ + t] = expected[t] + (t > 0 ? expected[t - 1] : 0) + (t + 1 < CELLS_ ? expected[t + 1] : 0); }
+            for (int t = 0; t < CELLS_; ++t) expected[t] += (runs - run) % 2 ? 2 : -1; }
         wrong += memcmp(cells.data(), expected.data(), sizeof(int)*2*CELLS_) != 0;
         if (round % 100 == 50) {  // a run that is broken off; then all is as it was set
+            left = 2;
             work_through((U)team.data(), (U)table.data(), 0, 0, 1, 0);
             work_through((U)team.data(), (U)table.data(), 2, 0, 0, 0);
             std::copy(expected.begin(), expected.end(), cells.begin());
+            left = 0;
             work_through((U)team.data(), (U)table.data(), 0, 0, 2, 2000);  // who comes late finds nothing
             wrong += memcmp(cells.data(), expected.data(), sizeof(int)*2*CELLS_) != 0; }
         if (round % 500 == 7) { timespec t{0, 20000000}; nanosleep(&t, nullptr); }  // the others fall asleep
     }
     work_through((U)team.data(), 0, 3, 0, 0, 0);
     for (auto& other : others) other.join();
-    printf("%d rounds, %d wrong, %d resumed\n", (int)ROUNDS, wrong, resumed > 0);
-    return wrong != 0;
+    printf("%d rounds, %d wrong, %d resumed, %d of them between runs\n", (int)ROUNDS, wrong, resumed, between);
+    return wrong != 0 || !between;
 }

@@ -10,8 +10,8 @@ enum { RUN, SERVE, CANCEL, QUIT };                                              
 enum { ALONE, TASKS, SLABS, COPY };                                                                   // operations
 enum { POSTED = 0, TABLE = 1, QUITS = 8, SLEEPERS = 16, MUTEX = 24, CONDITION = 40, CALLS = 56, THREADS = 64 };  // words of a team
 enum { YIELD, CLOCK, NAP, LOCK, UNLOCK, WAIT, WAKE, CLOCK_NUMBER };                                   // functions of the system, from CALLS on
-enum { RUNS = 0, DONE = 8, COUNT = 16, TOTAL = 17, OPERATIONS = 18, SHARED = 19, UNFINISHED = 20 };     // words of a table
-enum { END, KIND, STAGES, STAGE_COUNT, EACH, ALL, MARGIN, CHUNKS, LANES, TAKEN, CUTS, SIZED, WORDS };  // of an operation
+enum { RUNS = 0, DONE = 8, COUNT = 16, TOTAL = 17, OPERATIONS = 18, SHARED = 19, UNFINISHED = 20, AGAIN = 21 };  // words of a table
+enum { END, KIND, STAGES, STAGE_COUNT, EACH, ALL, MARGIN, CHUNKS, LANES, TAKEN, CUTS, SIZED, WHEN, WORDS };  // of an operation
 enum { FUNCTION, BOUNDS, ARGUMENTS, BYTES, PLANE_TASKS, PLANES, LAG, FINER, FINER_PLANES, PATCHES, STAGE_WORDS };  // of a stage
 enum { LANE_WORDS = 8, MOST = 4, ROOM = 4096, SPINS = 2000, YIELDS = 1000, IDLE_YIELDS = 4000 };
 Word* T = (Word*)team_; Word* H = (Word*)table_;
@@ -94,6 +94,7 @@ const auto stream = [=](const Word* op, Word runs, Long c, const Word** stages, 
     return (Word)(c + 1 - from); };
 
 const auto work = [=](const Word* op, Word runs, Long c) -> Word {  // on a chunk and those that follow; how many
+    if (op[WHEN] && !*(const volatile int*)op[WHEN]) return 1;  // the condition changes between operations only
     char room[MOST][ROOM] __attribute__((aligned(16)));
     const Word* stages[MOST];
     for (int s = 0; s < (int)op[STAGE_COUNT]; ++s) {
@@ -139,12 +140,18 @@ else if (mode == CANCEL) {  // nobody takes any more, who comes later neither; w
         left += all - (w >> 32 == runs ? (w & 0xffff) + (w >> 16 & 0xffff) : 0); }
     while (get(H + DONE) + left < H[TOTAL]) relax(++spins, YIELDS);
     set(H + RUNS, after);
-} else if (mode == RUN) {  // share: 0: alone, 1: with the team, 2: go on
-    if (share < 2) { H[SHARED] = 0; set(H + DONE, 0); set(H + RUNS, (get(H + RUNS) + 1) & 0xffffffff); }
-    if (share == 1) {
-        set(T + TABLE, table_); set(T + POSTED, T[POSTED] + 1);
-        if (get(T + SLEEPERS)) wake(); }
-    H[UNFINISHED] = help(H, get(H + RUNS), limit_);
+} else if (mode == RUN) {  // share & 1: with the team; share & 2: go on with what is unfinished
+    const volatile int* again = (const volatile int*)H[AGAIN];  // 0: once; else until the number there is 0
+    const Long until = now() + limit_;
+    for (bool resumes = share & 2;; resumes = false) {
+        if (!resumes) {
+            set(H + DONE, 0); set(H + RUNS, (get(H + RUNS) + 1) & 0xffffffff);
+            if (share & 1) {
+                set(T + TABLE, table_); set(T + POSTED, T[POSTED] + 1);
+                if (get(T + SLEEPERS)) wake(); } }
+        H[UNFINISHED] = help(H, get(H + RUNS), until - now());
+        if (H[UNFINISHED] || !again || !*again) break;
+        if (now() > until) { H[UNFINISHED] = 2; break; } }  // between two runs
 } else {
     Word* ours = T + THREADS + 8*me; Word seen = 0;
     for (int spins = 0;;) {
