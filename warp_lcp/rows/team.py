@@ -25,8 +25,8 @@ VARIABLE = "WARP_LCP_THREADS"
 RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")  # where launchers of ranks tell how many are on this machine
 MOST_THREADS = 1024
 PATIENCE = 50_000_000  # nanoseconds in native code after which the interpreter is asked whether there is a signal
-CELLS = 16384  # of a usual pass that a piece has at least: some microseconds, many times what it costs to take one
-PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
+CELLS = 4096  # of a usual pass that a piece has at least: a microsecond or more; to take a piece costs 0.1
+PIECES = 12  # that a thread's share of a pass is cut into, so that none waits long for another
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
 ALONE, TASKS, SLABS = range(3)
@@ -129,9 +129,11 @@ def ranges(stage: Stage, cells: int, *, ordered: bool = False) -> Operation:
         cells: what a task costs, in cells of a usual pass.
         ordered: whether tasks write what others read or write: then it is not cut.
     """
-    each = max(-(-stage.tasks // (PIECES * get_threads())), -(-CELLS // cells))
-    if ordered or get_threads() == 1:
-        each = stage.tasks
+    each, threads = stage.tasks, get_threads()
+    if threads > 1 and not ordered:
+        count = max(min(PIECES * threads, stage.tasks * cells // CELLS), 1)
+        count -= count % threads if count > threads else 0  # as many for each thread: 5 equal pieces take two threads as long as 6
+        each = -(-stage.tasks // count)
     return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
 
 
