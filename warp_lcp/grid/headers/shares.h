@@ -1,6 +1,7 @@
-// Particles add to fields around them. On CUDA a task has its own particles, on the CPU the planes of the fields (rows in 2-D) from P.first
-// on: all particles that touch those are added there in their order, so that each sum is the one that a single thread makes. Where the
-// order is not that in which they lie, `runs` has the begin and the end of what lies in order, one run after another.
+// Particles add to fields around them. On CUDA a task has its own particles, on the CPU planes of the fields (rows in 2-D): all particles
+// that touch those are added there in their order, so that each sum is the one that a single thread makes. Where the order is not that in
+// which they lie, `runs` has the begin and the end of what lies in order, one run after another. Planes are cut where particles are: share s
+// begins in the middle of chunk s/shares of all, so that sorted particles are as many in each share.
 // visit(begin, end, ours): `ours` tells of a plane whether it is the task's. Its arithmetic is EXACT_MATH with `fused`: else the compiler might
 // round in one form of it otherwise than in the other.
 const auto each_share = [&](auto visit) {
@@ -8,7 +9,11 @@ const auto each_share = [&](auto visit) {
 #ifdef __CUDA_ARCH__
     visit((long long)P.first, (long long)P.first + n, all);
 #else
-    const int from = P.first, to = P.first + n;
+    const auto cut = [&](int share) {
+        const long long all = (count + chunk - 1)/chunk; int at = 0;
+        for (int s = 1; touched && s <= share; ++s) { const int* c = touched + 2*(s*all/shares); at = at < (c[0] + c[1])/2 ? (c[0] + c[1])/2 : at; }
+        return at; };
+    const int from = cut(P.first), to = P.first + n < shares ? cut(P.first + n) : 1 << 30;
     const auto ours = [=](int plane) { return plane >= from && plane < to; };
     const int whole[2] = {0, (int)count}, *run = runs ? runs : whole, *end = run + (runs ? given.runs.shape[0] : 2);
     if (!touched) { for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], all); return; }
