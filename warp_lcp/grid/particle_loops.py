@@ -72,8 +72,8 @@ def scatter_pass(name: str, whole: Mapping[str, Any], *, real: Any = wp.float32,
     """
     return RowPass(
         name, HEADERS / f"{name.rpartition('.')[2]}.h", real, whole={**whole, "touched": wp.int32, "runs": wp.int32},
-        numbers={**_grid_numbers(real), **numbers, "count": int, "chunk": int, "shares": int}, optional=("touched", "runs", *more.pop("optional", ())),
-        **more,
+        numbers={**_grid_numbers(real), **numbers, "count": int, "chunk": int, "shares": int},
+        optional=("touched", "runs", *more.pop("optional", ())), **more,
     )  # fmt: skip
 
 

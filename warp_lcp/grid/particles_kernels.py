@@ -4,13 +4,24 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import list_kernel
-from warp_lcp.grid.particle_loops import particle_pass
+from warp_lcp.grid.particle_loops import HEADERS, cell_pass, particle_pass
 
 _PARTICLES, _COUNTS = "warp_lcp.grid.particles", {"nx": int, "ny": int, "nz": int}
 NUMBER = particle_pass(f"{_PARTICLES}.number", {"position": wp.vec3}, whole={"key": wp.int32}, numbers=_COUNTS)
 TOTAL = particle_pass(
     f"{_PARTICLES}.total", {"position": wp.vec3, "velocity": wp.vec3}, sums=("energy", "x", "y", "z", "u", "v", "w", "lost", "wild"),
     largest=("top", "high_x", "high_y", "high_z", "low_x", "low_y", "low_z"),
+)  # fmt: skip
+
+APART = 16  # numbers between the counts of two pieces, so that they do not share a set of the cache
+_INTS, _SORT = wp.int32, {"headers": HEADERS, "constants": {"APART": APART}}
+SORT_COUNT = cell_pass(
+    f"{_PARTICLES}.sort_count", "", {"key": _INTS}, whole={"counts": _INTS}, numbers={"shift": int, "digits": int}, **_SORT
+)
+SORT_BEGIN = cell_pass(f"{_PARTICLES}.sort_begin", "", {"counts": _INTS}, numbers={"pieces": int, "digits": int}, **_SORT)
+SORT_PLACE = cell_pass(
+    f"{_PARTICLES}.sort_place", "", {"key": _INTS}, whole=dict.fromkeys(("counts", "order", "sorted", "moved"), _INTS), optional=("order",),
+    numbers={"shift": int, "digits": int}, **_SORT,
 )  # fmt: skip
 
 
