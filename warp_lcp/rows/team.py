@@ -27,11 +27,12 @@ MOST_THREADS = 1024
 PATIENCE = 50_000_000  # nanoseconds in native code after which the interpreter is asked whether there is a signal
 CELLS = 4096  # of a usual pass that a piece has at least: a microsecond or more; to take a piece costs 0.1
 PIECES = 12  # that a thread's share of a pass is cut into, so that none waits long for another
+SPINS = 10000, 2000  # of an idle thread before it lets others have its core, 25 ns each: with a core of its own, without
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
 ALONE, TASKS, SLABS = range(3)
 DONE_ALONE, SHARED, RESUMED = range(3)
-TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 56, 64, 24, 11, 8
+TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 2, 56, 64, 24, 11, 8
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED = range(16, 21)
 MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
 LOCKS = ("pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast")
@@ -178,6 +179,7 @@ class Team:
             self.words[CALLS + i] = function
         for name, word in MADE.items() if _system() else ():
             getattr(ctypes.CDLL(None), name)(ctypes.c_void_p(self.address + 8 * word), None)
+        self.words[IDLE_SPINS] = SPINS[size > available_threads()]
         self._lock, self._inside = threading.Lock(), 0
         self._posted, self._retired = None, []
         self.shared_time = 0.0  # seconds that callers have spent in what the team shared
