@@ -1,7 +1,7 @@
 // Particles add to fields around them. On CUDA a task has its own particles, on the CPU planes of the fields (rows in 2-D): all particles
 // that touch those are added there in their order, so that each sum is the one that a single thread makes. Where the order is not that in
-// which they lie, `runs` has the begin and the end of what lies in order, one run after another. Planes are cut where particles are: share s
-// begins in the middle of chunk s/shares of all, so that sorted particles are as many in each share.
+// which they lie, `runs` has the begin and the end of what lies in order, one run after another. Planes are cut where particles are: share
+// s begins in the middle of chunk s/shares of all, so that sorted particles are as many in each share.
 // visit(begin, end, ours): `ours` tells of a plane whether it is the task's. Its arithmetic is EXACT_MATH with `fused`: else the compiler might
 // round in one form of it otherwise than in the other.
 const auto each_share = [&](auto visit) {
@@ -11,7 +11,9 @@ const auto each_share = [&](auto visit) {
 #else
     const auto cut = [&](int share) {
         const long long all = (count + chunk - 1)/chunk; int at = 0;
-        for (int s = 1; touched && s <= share; ++s) { const int* c = touched + 2*(s*all/shares); at = at < (c[0] + c[1])/2 ? (c[0] + c[1])/2 : at; }
+        for (int s = 1; touched && s <= share; ++s) {
+            const long long c = s*all/shares; const int middle = (touched[2*c] + touched[2*c + 1])/2;
+            at = at < middle ? middle : at; }
         return at; };
     const int from = cut(P.first), to = P.first + n < shares ? cut(P.first + n) : 1 << 30;
     const auto ours = [=](int plane) { return plane >= from && plane < to; };
