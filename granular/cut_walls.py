@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 SAMPLES = {2: 8, 3: 4}  # of a half cell along each axis, for its volume
 LEAST_WALL = 1e-4  # of a cell's face, below which there is no wall
+WALL_FACE = 16  # cells of a usual pass that a wall face costs
 
 
 class CutWalls:
@@ -106,7 +107,7 @@ class CutWalls:
             grain: cells a thread takes.
             launch: launches or records.
         """
-        rows = Rows.entries(self.count, self.grid.device, grain)
+        rows = Rows.entries(self.count, self.grid.device, grain, weight=WALL_FACE)
         behind = given["partials"].shape[0] // COLUMNS - rows.places
         walls = {"cells": self.cells, "numbers_of": self._numbers, "walls": self._entries, "friction": self._friction}
         fields = {"flags": packing.flags, "fraction": packing.fraction, "openings": self.openings, "share_x": packing.share[0]}

@@ -11,6 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
+from warp_lcp.granular.cut_walls import WALL_FACE
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, momentum_kernel, stress_passes
@@ -286,7 +287,7 @@ class Stress(wl.VariationalInequality):
             given["partials"] = self._wall_sums.partials
             if walls.count:
                 fields = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p)
-                rows = Rows.entries(walls.count, p.grid.device, self._grain)
+                rows = Rows.entries(walls.count, p.grid.device, self._grain, weight=WALL_FACE)
                 passes.wall.bind(rows, active=walls.active, behind=0, **fields, **given).launch(launch)
             if p.cut is not None:
                 p.cut.project(p, velocity, given, self._grain, launch)

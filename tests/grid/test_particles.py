@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warp_lcp.grid.particles import MARGIN, SORT_EVERY, Particles, lattice, seed
+import warp_lcp as wl
+from warp_lcp.grid.particles import MARGIN, SORT_EVERY, Particles, lattice, seed, sort_keys
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((7, 5, 1), 0.2, 2)
@@ -34,6 +36,26 @@ def test_sort_orders_by_cell_and_keeps_particles_whole(grid: StaggeredGrid, n: i
     assert set(before) == {"position", "velocity"} | {f"affine_{c}" for c in range(grid.dimension)}
     for name, array in particles.arrays().items():
         assert (array.numpy() == before[name][order]).all()
+
+
+@pytest.mark.parametrize(("count", "bits"), [(1, 4), (50, 1), (999, 9), (3000, 18), (1000, 22), (1000, 23), (500, 31)])
+def test_keys_are_sorted_as_numpy_sorts_them(count: int, bits: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In pieces of 100 keys, on any number of threads; what lies behind the keys is scratch memory."""
+    monkeypatch.setattr("warp_lcp.grid.particles.CPU_GRAIN", 100)
+    monkeypatch.setattr("warp_lcp.rows.team.CELLS", 1)
+    rng, before = np.random.default_rng([count, bits]), wl.get_threads()
+    keys = np.where(rng.random(count) < 0.1, 2**bits - 1, rng.integers(0, 2**bits, count))
+    expected = np.argsort(keys, kind="stable")
+    try:
+        for threads in (1, 2, 3, 7):
+            wl.set_threads(threads)
+            key = wp.array(np.append(keys, rng.integers(0, 9, count)), dtype=wp.int32, device="cpu")
+            order = wp.full(2 * count, -7, dtype=wp.int32, device="cpu")
+            sort_keys(key, order, count, bits)
+            np.testing.assert_array_equal(order.numpy()[:count], expected)
+            np.testing.assert_array_equal(key.numpy()[:count], keys[expected])
+    finally:
+        wl.set_threads(before)
 
 
 def test_sorting_twice_changes_nothing() -> None:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+import warp_lcp as wl
+from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
@@ -269,3 +271,50 @@ def test_a_gpu_gathers_the_same_bits_every_time() -> None:
     once = transfer(p, p.offsets)
     for _ in range(5):
         assert all((a == b).all() for a, b in zip(transfer(p, p.offsets), once, strict=True))
+
+
+PLACES = {
+    "sorted": lambda rng, n: np.sort(rng.random(n)),
+    "shuffled": lambda rng, n: rng.random(n),
+    "in one plane": lambda rng, n: np.full(n, 0.4),
+    "at both ends": lambda rng, n: np.where(rng.random(n) < 0.5, 0.002, 0.998),
+    "downward, then some more": lambda rng, n: np.append(np.sort(rng.random(n - n // 4))[::-1], rng.random(n // 4) ** 4),
+}
+
+
+@pytest.mark.cpu_form("CUDA has no shares of planes")
+@pytest.mark.parametrize("places", PLACES)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_threads_add_up_in_the_order_of_one(dimension: int, places: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However particles lie, and however many share them: the bits of one thread, and the weights of a plain loop."""
+    monkeypatch.setattr("warp_lcp.grid.particle_loops.CPU_GRAIN", 64)
+    n, rng, before = 1500, np.random.default_rng([dimension, len(places)]), wl.get_threads()
+    grid = StaggeredGrid((6, 60, 1) if dimension == 2 else (6, 5, 60), 0.5, dimension, "cpu")
+    points = rng.random((n, 3))
+    points[:, dimension - 1] = PLACES[places](rng, n)
+    points = (points * (grid.extent - 2e-3) + 1e-3).astype(np.float32)
+    points[:, dimension:] = 0.0
+    particles = Particles(grid, points, rng.normal(size=(n, 3)), affine=True, indexed=False)
+
+    def added(threads: int) -> list[np.ndarray]:
+        wl.set_threads(threads)
+        fields, weights, density = grid.faces(), grid.faces(), grid.field()
+        particles_to_faces(grid, particles.position, particles.velocity, particles.affine, fields, weights)
+        particle_density(grid, particles, grid.everywhere, 4, density)
+        return [a.numpy() for a in (*fields, *weights, density)]
+
+    try:
+        one, *others = (added(threads) for threads in (1, 2, 3, 7))
+    finally:
+        wl.set_threads(before)
+    for other in others:
+        for a, b in zip(one, other, strict=True):
+            assert a.tobytes() == b.tobytes()
+    expected = np.zeros(grid.shape)
+    corner = grid.to_grid(points) - [0.0, 0.5, 0.5]  # of the u faces
+    cell, share = np.floor(corner).astype(int), corner - np.floor(corner)
+    for offset in np.ndindex(2, 2, dimension - 1):
+        weight = np.prod([np.where(o, f, 1.0 - f) for o, f in list(zip(offset, share.T, strict=True))[:dimension]], axis=0)
+        at = cell + offset
+        np.add.at(expected, (at[:, 2] if dimension == 3 else np.ones(n, dtype=int), at[:, 1], at[:, 0]), weight)
+    np.testing.assert_allclose(one[dimension], expected, atol=3e-5 * expected.max())

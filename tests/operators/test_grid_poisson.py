@@ -6,6 +6,7 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble
+from warp_lcp.rows.fields import CPU_CHUNK
 
 SHAPES = [(5, 4, 6), (6, 7), (1, 3, 4), (3, 1), (2, 2, 2), (1, 1, 1)]
 PERIODIC = [(False, False, False), (True, False, False), (True, True, True)]
@@ -85,6 +86,33 @@ def test_update_equals_a_new_operator(device):
         A.update(wp.array(np.pad(second, 1, constant_values=wl.SOLID), device=device))
         x = wp.array(rng.standard_normal(first.shape), dtype=wp.float64, device=device)
         np.testing.assert_array_equal(A.apply(x).numpy(), B.apply(x).numpy())
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 16, 31, 70])
+def test_rows_span_their_fluid_cells(n, device, monkeypatch):
+    """Spans of rows, of whole vectors of 16 cells, and the chunks of flat fields that have been in use, as a plain loop finds them."""
+    monkeypatch.setattr("warp_lcp.operators.grid_operator.LARGE", 0)
+    rng = np.random.default_rng(n)
+    shape = (9, 40, n)
+    A = wl.GridPoisson(np.zeros(shape, dtype=np.int8), device=device)
+    ever = np.zeros(shape[:2], dtype=bool)
+    for share in (0.0, 2.0 / n, 0.02, 1.0):
+        cells = np.where(rng.random(shape) < share, wl.FLUID, rng.choice([wl.AIR, wl.SOLID], shape)).astype(np.int8)
+        cells[rng.random(shape[:2]) < 0.5] = wl.AIR
+        A.update(wp.array(np.pad(cells, 1, constant_values=wl.SOLID), device=device))
+        spans, row = np.zeros((*shape[:2], 2), dtype=int), n + 2
+        for k, j in np.ndindex(shape[:2]):
+            found = np.flatnonzero(cells[k, j] == wl.FLUID)
+            if found.size:
+                spans[k, j] = found[0] // 16 * 16, min(n, -(-(found[-1] + 1) // 16) * 16)
+        np.testing.assert_array_equal(A.stencil.spans.numpy(), spans)
+        ever |= spans[:, :, 1] > 0
+        if A.layout.chunks is not None:
+            used = np.zeros(A.layout.size, dtype=bool)
+            for k, j in np.argwhere(ever):
+                used[((k + 1) * (shape[1] + 2) + j + 1) * row :][:row] = True
+            parts = [used[at : at + CPU_CHUNK] for at in range(0, used.size, CPU_CHUNK)]
+            np.testing.assert_array_equal(A.layout.chunks.numpy()[:, 0], [(0, part.size * part.any()) for part in parts])
 
 
 @pytest.mark.parametrize(

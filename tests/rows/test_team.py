@@ -110,6 +110,22 @@ def test_slabs_fill_their_threads(planes, threads):
     assert share <= 1.3 * max(planes / threads, 14) or planes < 128
 
 
+@pytest.mark.parametrize("threads", [1, 2, 3, 8])
+@pytest.mark.parametrize(("tasks", "cells"), [(1, 1), (9, 30000), (68, 65536), (500, 98), (1850, 98), (10**6, 1), (10**6, 20)])
+def test_pieces_of_a_pass_are_as_many_for_each_thread(tasks, cells, threads):
+    """Pieces cover all tasks, none is small, and the thread with the most has hardly more than its share."""
+    wl.set_threads(threads)
+    stage = team.Stage.__new__(team.Stage)
+    stage.tasks, stage.words = tasks, (0,) * 10
+    count, each = (cut := team.ranges(stage, cells)).chunks, cut.words[3]
+    assert (count - 1) * each < tasks <= count * each
+    assert count == 1 or each * cells >= team.CELLS
+    assert -(-count // threads) * each < tasks / threads + each + threads
+    if tasks * cells >= threads * team.CELLS and tasks > 100 * threads:
+        assert count % threads == 0
+    assert team.ranges(stage, cells, ordered=True).chunks == 1
+
+
 def test_two_python_threads_solve_at_once():
     wl.set_threads(2)
     expected = {n: solved(n, "everywhere") for n in (20, 28)}

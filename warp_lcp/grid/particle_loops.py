@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
 SHARES = 2  # that a thread's planes are cut into where particles add to them: chunks that touch two shares are read twice
+LEAST_PLANES = 4  # of a share
 PARTICLE = 16  # cells of a usual pass that a particle of one costs
 MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
@@ -94,7 +95,7 @@ def scatter(
         runs: of `Particles`.
         given: what else the pass takes.
     """
-    count, planes = len(position), grid.shape[3 - grid.dimension]
+    count, shares = len(position), 1
     listed = getattr(position, "listed", None) if is_recording() else None
     if not count and listed is None:
         return
@@ -102,9 +103,10 @@ def scatter(
     if grid.device.is_cuda:
         rows = Rows.listed(count, grid.device)
     else:
-        each = planes if touched is None else max(4, -(-planes // (SHARES * get_threads())))
-        rows = Rows.listed(planes, grid.device, each, weight=1 << 20)  # a share is a piece
-    passed.bind(rows, **on_grid(grid), position=position, touched=touched, runs=runs, count=number, chunk=CPU_GRAIN, **given).launch()
+        shares = 1 if touched is None else max(1, min(SHARES * get_threads(), grid.shape[3 - grid.dimension] // LEAST_PLANES))
+        rows = Rows.listed(shares, grid.device, 1, weight=1 << 20)  # a share is a piece
+    given |= {"touched": touched, "runs": runs, "count": number, "chunk": CPU_GRAIN, "shares": shares}
+    passed.bind(rows, **on_grid(grid), position=position, **given).launch()
 
 
 def on_grid(grid: "StaggeredGrid") -> dict[str, Any]:

@@ -13,6 +13,11 @@ NUMBER = KERNELS["warp_lcp.grid.particles.number"]
 TOTAL = KERNELS["warp_lcp.grid.particles.total"]
 ADD_IN_ORDER = KERNELS["warp_lcp.grid.particles.add_in_order"]
 
+APART = 16  # numbers between the counts of two pieces, so that they do not share a set of the cache
+SORT_COUNT, SORT_BEGIN, SORT_PLACE = (
+    KERNELS.kernel(f"warp_lcp.grid.particles.sort_{which}", constants={"APART": APART}) for which in ("count", "begin", "place")
+)
+
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
 def count_up_kernel(order: wp.array(dtype=wp.int32)):

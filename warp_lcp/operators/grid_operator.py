@@ -12,17 +12,18 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.operators.cell_lists import cells_of
-from warp_lcp.operators.padded_stencil import Ghosts, PaddedStencil, find_spans_kernel
+from warp_lcp.operators.padded_stencil import SPAN_CELLS, Ghosts, PaddedStencil
 from warp_lcp.problem.pickling import Pickled
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
-from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.rows import Bound, KernelFile, Rows
 from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, checked_device, real_array, relative_rounding
-from warp_lcp.rows.program import LaunchGraph, launch
+from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.rows.program import copy as copy_array
 from warp_lcp.rows.vectors import Across
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
 COPY_CELLS = KERNELS["grid_poisson.copy_cells"]
+FIND_SPANS = KERNELS.kernel("grid_operator.find_spans", constants={"CHUNK": CPU_CHUNK, "SPAN_CELLS": int(SPAN_CELLS)})
 
 
 class GridOperator(Pickled):
@@ -277,8 +278,14 @@ class GridOperator(Pickled):
 
     def _find_rows(self) -> None:
         """Find what of each row is in use."""
-        counts = self.layout.padding.counts
-        launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans, self._reach, self._chunks], device=self.device)
+        self._search.launch()
+
+    @cached_property
+    def _search(self) -> Bound:
+        """Find the spans of `cells`; the arrays are always these."""
+        rows = Rows.of(self.layout.padding, self.device, whole=True)
+        found = {"spans": self._spans.flatten(), "reach": self._reach.flatten(), "chunks": self._chunks.flatten()}
+        return FIND_SPANS.bind(rows, cells=self.cells.flatten(), **found, chunk_count=len(self._chunks), size=self.layout.size)
 
     def _wrap_cells(self) -> None:
         """Fill ghost cells of periodic axes in `cells_around`."""

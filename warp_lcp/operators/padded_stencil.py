@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows import Bound, KernelFile, Rows
-from warp_lcp.rows.fields import CPU_CHUNK, Padding
+from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.layout import Pattern, check_memory, put, stencil_struct
 from warp_lcp.rows.program import Launch, Task
 
@@ -25,7 +25,6 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 PRODUCT = KERNELS["stencil.product"]
 RELAX = KERNELS["stencil.relax"]
 WRAP = KERNELS["stencil.wrap"]
-CHUNK = wp.constant(CPU_CHUNK)
 SPAN_CELLS = wp.constant(16)  # spans begin at multiples of this, so that rows stay whole vectors and aggregates whole
 
 
@@ -39,32 +38,6 @@ def whole_span(first: int, last: int, n: int):
         begin = 0
         end = 0
     return wp.vec2i(begin, wp.min(n, (end + SPAN_CELLS - 1) // SPAN_CELLS * SPAN_CELLS))
-
-
-@no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.stencil")
-def find_spans_kernel(
-    cells: wp.array3d(dtype=wp.int8), n: int, spans: wp.array2d(dtype=wp.vec2i), reach: wp.array2d(dtype=wp.vec2i),
-    chunks: wp.array2d(dtype=wp.vec2i),
-):  # fmt: skip
-    """The span of a row is what lies between its first and its last FLUID cell, both included, grown to whole vectors.
-
-    Rows that have one are marked in `reach`, the chunks of flat fields that they lie in in `chunks`; what is marked stays so.
-    """
-    k, j = wp.tid()
-    first = int(0)
-    while first < n and cells[k + 1, j + 1, first + 1] != wp.int8(1):
-        first += 1
-    last = int(n)
-    while last > first and cells[k + 1, j + 1, last] != wp.int8(1):
-        last -= 1
-    spans[k, j] = whole_span(first, last, n)
-    if last > first:
-        reach[k, j] = wp.vec2i(0, n)
-        row = cells.shape[2]
-        begin = ((k + 1) * cells.shape[1] + j + 1) * row
-        for c in range(begin // CHUNK, wp.min((begin + row - 1) // CHUNK + 1, chunks.shape[0])):
-            chunks[c, 0] = wp.vec2i(0, wp.min(CHUNK, cells.shape[0] * cells.shape[1] * row - c * CHUNK))
 
 
 @no_type_check

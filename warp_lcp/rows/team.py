@@ -27,14 +27,15 @@ VARIABLE = "WARP_LCP_THREADS"
 RANKS = ("OMPI_COMM_WORLD_LOCAL_SIZE", "MPI_LOCALNRANKS")  # where launchers of ranks tell how many are on this machine
 MOST_THREADS = 1024
 PATIENCE = 50_000_000  # nanoseconds in native code after which the interpreter is asked whether there is a signal
-CELLS = 16384  # of a usual pass that a piece has at least: some microseconds, many times what it costs to take one
-PIECES = 8  # that a thread's share of a pass is cut into, so that none waits long for another
+CELLS = 4096  # of a usual pass that a piece has at least: a microsecond or more; to take a piece costs 0.1
+PIECES = 12  # that a thread's share of a pass is cut into, so that none waits long for another
+SPINS = 10000, 2000  # of an idle thread before it lets others have its core, 25 ns each: with a core of its own, without
 COPIED = 1 << 18  # bytes that a thread copies at least
 ROOM = 4096  # bytes of the arguments of what can be cut
 RUN, SERVE, CANCEL, QUIT = range(4)  # as in team.h, like all that follows
 ALONE, TASKS, SLABS, COPY = range(4)
 DONE_ALONE, SHARED, RESUMED = 0, 1, 2
-TABLE, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 56, 64, 24, 13, 8
+TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 2, 56, 64, 24, 13, 8
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED, AGAIN = range(16, 22)
 WITHIN, BETWEEN = 1, 2  # where a table is unfinished: within a run, between two
 MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
@@ -173,10 +174,13 @@ def ranges(stage: Stage, cells: int, *, ordered: bool = False, sized: int = 0) -
         ordered: whether tasks write what others read or write: then it is not cut.
         sized: address of the number of tasks in each run; 0: it is the stage's.
     """
-    threads = 1 if ordered else get_threads()
+    each, threads = stage.tasks, 1 if ordered else get_threads()
     if sized:
         return Operation(TASKS, [stage], PIECES * threads if threads > 1 else 1, -(-CELLS // max(cells, 1)), stage.tasks, sized=sized)
-    each = stage.tasks if threads == 1 else max(-(-stage.tasks // (PIECES * threads)), -(-CELLS // cells))
+    if threads > 1:
+        count = max(min(PIECES * threads, stage.tasks * cells // CELLS), 1)
+        count -= count % threads if count > threads else 0  # as many for each thread: 5 equal pieces take two threads as long as 6
+        each = -(-stage.tasks // count)
     return Operation(TASKS, [stage], -(-stage.tasks // each), each, stage.tasks)
 
 
@@ -243,6 +247,7 @@ class Team:
             self.words[CALLS + i] = function
         for name, word in MADE.items() if _system() else ():
             getattr(ctypes.CDLL(None), name)(ctypes.c_void_p(self.address + 8 * word), None)
+        self.words[IDLE_SPINS] = SPINS[size > available_threads()]
         self._lock, self._inside = threading.Lock(), 0
         self._posted, self._retired = None, []
         self.shared_time = 0.0  # seconds that callers have spent in what the team shared

@@ -5,7 +5,7 @@
 //   compute    float32
 //   whole      vec3 position; float32 density; int32 touched?, runs?
 //   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z; float32 each;
-//              int count, chunk
+//              int count, chunk, shares
 #include "particles.h:weigh"
 #include "particles.h:add"
 #include "particles.h:shares"

@@ -51,18 +51,25 @@ auto add_product = [&](auto& element, auto a, auto b) {
 };
 
 // snippet shares: Particles add to fields around them. On CUDA a task has its own particles, on
-// the CPU the planes of the fields (rows in 2-D) from P.first on: all particles that touch those
-// are added there in their order, so that each sum is the one that a single thread makes. Where
-// the order is not that in which they lie, `runs` has the begin and the end of what lies in order,
-// one run after another. visit(begin, end, ours): `ours` tells of a plane whether it is the
-// task's. Its arithmetic is EXACT_MATH with `fused`: else the compiler might round in one form of
-// it otherwise than in the other.
+// the CPU planes of the fields (rows in 2-D): all particles that touch those are added there in
+// their order, so that each sum is the one that a single thread makes. Where the order is not that
+// in which they lie, `runs` has the begin and the end of what lies in order, one run after another.
+// Planes are cut where particles are: share s begins in the middle of chunk s/shares of all, so
+// that sorted particles are as many in each share. visit(begin, end, ours): `ours` tells of a plane
+// whether it is the task's. Its arithmetic is EXACT_MATH with `fused`: else the compiler might
+// round in one form of it otherwise than in the other.
 const auto each_share = [&](auto visit) {
     const auto all = [](int) { return true; };
 #ifdef __CUDA_ARCH__
     visit((long long)P.first, (long long)P.first + n, all);
 #else
-    const int from = P.first, to = P.first + n;
+    const auto cut = [&](int share) {
+        const long long all = (count + chunk - 1)/chunk; int at = 0;
+        for (int s = 1; touched && s <= share; ++s) {
+            const long long c = s*all/shares; const int middle = (touched[2*c] + touched[2*c + 1])/2;
+            at = at < middle ? middle : at; }
+        return at; };
+    const int from = cut(P.first), to = P.first + n < shares ? cut(P.first + n) : 1 << 30;
     const auto ours = [=](int plane) { return plane >= from && plane < to; };
     const int whole[2] = {0, (int)count}, *run = runs ? runs : whole, *end = run + (runs ? given.runs.shape[0] : 2);
     if (!touched) { for (; run < end; run += 2) visit((long long)run[0], (long long)run[1], all); return; }
@@ -217,3 +224,37 @@ for (int column = P.first; column < P.first + n; ++column) {
         if (column < sums_) s += found[t];
         else s = found[t] > s || found[t] != found[t] ? found[t] : s; }
     results[column] = s; }
+
+// kernel warp_lcp.grid.particles.sort_count: Count how many keys of a piece have each digit
+//   compute    float32
+//   whole      int32 counts
+//   box        int32 key
+//   numbers    int shift, digits
+//   constants  APART
+int* mine = counts + (long long)c_*(digits + APART);
+for (int d = 0; d < digits; ++d) mine[d] = 0;
+for (int p = first; p < last; ++p) ++mine[key[p] >> shift & (digits - 1)];
+
+// kernel warp_lcp.grid.particles.sort_begin: Find where the keys of each digit and piece begin:
+// those of smaller digits are before them, and those of the pieces before
+//   compute    float32
+//   box        int32 counts
+//   numbers    int pieces, digits
+//   constants  APART
+int at = 0;
+for (int d = 0; d < digits; ++d)
+    for (int c = 0; c < pieces; ++c) {
+        int* here = counts + (long long)c*(digits + APART) + d; const int many = *here;
+        *here = at; at += many; }
+
+// kernel warp_lcp.grid.particles.sort_place: Put the keys of a piece, and where they were at first,
+// to the place of their digit; those of one digit keep their order
+//   compute    float32
+//   whole      int32 counts, order?, sorted, moved
+//   box        int32 key
+//   numbers    int shift, digits
+//   constants  APART
+int* next = counts + (long long)c_*(digits + APART);
+for (int p = first; p < last; ++p) {
+    const int to = next[key[p] >> shift & (digits - 1)]++;
+    sorted[to] = key[p]; moved[to] = order ? order[p] : p; }

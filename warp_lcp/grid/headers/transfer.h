@@ -3,7 +3,7 @@
 // kernel grid.transfer.scatter: Add the momentum and weight of particles to the nodes around them
 //   compute    float32 | float64
 //   whole      vec3<T> position, velocity, gradient?; T momentum, weight; int32 touched?, runs?
-//   numbers    int planes; T dx, inverse_dx; int before_x, before_y, before_z, axis, count, chunk
+//   numbers    int planes; T dx, inverse_dx; int before_x, before_y, before_z, axis, count, chunk, shares
 //   constants  EDGE
 #include "particles.h:add"
 #include "particles.h:shares"

@@ -8,7 +8,7 @@
 typedef unsigned long long Word; typedef long long Long; typedef void (*Call)(void*, void*);
 enum { RUN, SERVE, CANCEL, QUIT };                                                                    // what is asked for
 enum { ALONE, TASKS, SLABS, COPY };                                                                   // operations
-enum { POSTED = 0, TABLE = 1, QUITS = 8, SLEEPERS = 16, MUTEX = 24, CONDITION = 40, CALLS = 56, THREADS = 64 };  // words of a team
+enum { POSTED = 0, TABLE = 1, IDLE_SPINS = 2, QUITS = 8, SLEEPERS = 16, MUTEX = 24, CONDITION = 40, CALLS = 56, THREADS = 64 };  // words of a team
 enum { YIELD, CLOCK, NAP, LOCK, UNLOCK, WAIT, WAKE, CLOCK_NUMBER };                                   // functions of the system, from CALLS on
 enum { RUNS = 0, DONE = 8, COUNT = 16, TOTAL = 17, OPERATIONS = 18, SHARED = 19, UNFINISHED = 20, AGAIN = 21 };  // words of a table
 enum { END, KIND, STAGES, STAGE_COUNT, EACH, ALL, MARGIN, CHUNKS, LANES, TAKEN, CUTS, SIZED, WHEN, WORDS };  // of an operation
@@ -19,14 +19,14 @@ const auto get = [](const Word* w) { return __atomic_load_n(w, __ATOMIC_SEQ_CST)
 const auto set = [](Word* w, Word v) { __atomic_store_n(w, v, __ATOMIC_SEQ_CST); };
 const auto call = [=](int number, auto... arguments) { return ((long (*)(decltype(arguments)...))T[CALLS + number])(arguments...); };
 const auto now = [=] { long t[2] = {0, 0}; call(CLOCK, (int)T[CALLS + CLOCK_NUMBER], (void*)t); return (Long)t[0]*1000000000 + t[1]; };
-const auto relax = [=](int spins, int yields) {  // a little at first, then let others have the core, then sleep
-    if (spins < SPINS) {
+const auto relax = [=](int spins, int most, int yields) {  // a little at first, then let others have the core, then sleep
+    if (spins < most) {
 #if defined(__x86_64__)
         __builtin_ia32_pause();
 #elif defined(__aarch64__)
         __asm__ volatile("yield");
 #endif
-    } else if (spins < SPINS + yields) call(YIELD);
+    } else if (spins < most + yields) call(YIELD);
     else { long t[2] = {0, 50000}; call(NAP, (const void*)t, (void*)nullptr); } };
 const auto wake = [=] { call(LOCK, (void*)(T + MUTEX)); call(WAKE, (void*)(T + CONDITION)); call(UNLOCK, (void*)(T + MUTEX)); };
 
@@ -129,7 +129,7 @@ const auto help = [=](Word* H, Word runs, Long limit) -> int {  // work through 
         const Long chunk = theirs ? -1 : take_any(op, runs);
         if (chunk >= 0) { __atomic_fetch_add(H + DONE, work(op, runs, chunk), __ATOMIC_SEQ_CST); spins = 0; }
         else if (me && !theirs && op + WORDS == last) return 0;
-        else relax(++spins, YIELDS); } };
+        else relax(++spins, SPINS, YIELDS); } };
 
 if (mode == QUIT) { set(T + QUITS, 1); wake(); }
 else if (mode == CANCEL) {  // nobody takes any more, who comes later neither; wait for those who have
@@ -138,7 +138,7 @@ else if (mode == CANCEL) {  // nobody takes any more, who comes later neither; w
         const Word* op = (const Word*)H[OPERATIONS] + o*WORDS; const Word all = start_of(op, l + 1) - start_of(op, l);
         const Word w = __atomic_exchange_n((Word*)op[TAKEN] + l*LANE_WORDS, after << 32 | all, __ATOMIC_SEQ_CST);
         left += all - (w >> 32 == runs ? (w & 0xffff) + (w >> 16 & 0xffff) : 0); }
-    while (get(H + DONE) + left < H[TOTAL]) relax(++spins, YIELDS);
+    while (get(H + DONE) + left < H[TOTAL]) relax(++spins, SPINS, YIELDS);
     set(H + RUNS, after);
 } else if (mode == RUN) {  // share & 1: with the team; share & 2: go on with what is unfinished
     const volatile int* again = (const volatile int*)H[AGAIN];  // 0: once; else until the number there is 0
@@ -154,6 +154,8 @@ else if (mode == CANCEL) {  // nobody takes any more, who comes later neither; w
         if (now() > until) { H[UNFINISHED] = 2; break; } }  // between two runs
 } else {
     Word* ours = T + THREADS + 8*me; Word seen = 0;
+    // between tables the interpreter takes a tenth of a millisecond: on a busy machine a thread that yields then loses its core for several
+    const int most = (int)T[IDLE_SPINS];
     for (int spins = 0;;) {
         if (get(T + QUITS)) break;
         const Word posted = get(T + POSTED);
@@ -165,7 +167,7 @@ else if (mode == CANCEL) {  // nobody takes any more, who comes later neither; w
                 seen = posted; spins = 0; }
             else if (!table && get(T + POSTED) == posted) seen = posted;
             set(ours, 0);
-        } else if (spins < SPINS + IDLE_YIELDS) relax(++spins, IDLE_YIELDS);
+        } else if (spins < most + IDLE_YIELDS) relax(++spins, most, IDLE_YIELDS);
         else {
             call(LOCK, (void*)(T + MUTEX));
             __atomic_fetch_add(T + SLEEPERS, 1, __ATOMIC_SEQ_CST);
