@@ -93,7 +93,10 @@ class CutCells:
         self._moved_from: NodeBox | None = None  # nodes near the solids that move, where the velocity was filled last
         self._moved_to: NodeBox | None = None  # and where they are
         moving = [(number, solid) for number, solid in enumerate(solids, start=1) if solid.motion is not None]
-        self.motions, self._moving = Motions([solid.motion for _, solid in moving]), [number for number, _ in moving]
+        self.motions, self._moving = (
+            Motions([solid.motion for _, solid in moving if solid.motion is not None]),
+            [number for number, _ in moving],
+        )
         if self.moves:
             self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving]))
             self._standing = NodeDistances(grid, second=len(solids) > 1)

@@ -476,7 +476,7 @@ class _Turns:
 
 def _corners(bounds: np.ndarray) -> np.ndarray:
     """Return the corners of boxes, shape (..., 8, 3), from their low and high one, shape (..., 2, 3)."""
-    return cast(np.ndarray, bounds[..., ENDS, np.arange(3)])
+    return bounds[..., ENDS, np.arange(3)]
 
 
 def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:

@@ -20,7 +20,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
-KINDS = {Box: kernels.BOX, Sphere: kernels.SPHERE, Capsule: kernels.CAPSULE, Plane: kernels.PLANE}
+KINDS: dict[Any, int] = {Box: kernels.BOX, Sphere: kernels.SPHERE, Capsule: kernels.CAPSULE, Plane: kernels.PLANE}
 UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of a solid without an end
 SNAP = 1e-6  # of the domain's longest side: distances below it are rounding errors of float32 positions, and count as 0
 
@@ -112,18 +112,20 @@ class ShapeTable:
         self._margin = np.array([margin for _, margin in hulls])
         limits = [UNLIMITED if (box := shape.bounds()) is None else np.where(np.isfinite(box), 0.0, box) for shape in shapes]
         self._limits = np.array(limits)  # infinite where a shape has no end
-        self._shapes = np.zeros(len(shapes), dtype=kernels.PlacedShape.numpy_dtype())
+        structs: list[Any] = [kernels.ShapeGroup, kernels.PlacedShape]
+        groups, rows = (np.zeros(len(of), dtype=struct.numpy_dtype()) for of, struct in zip((solids, shapes), structs, strict=True))
+        self._solids: Any = groups
+        self._shapes: Any = rows
         for row, shape in zip(self._shapes, shapes, strict=True):
             row["kind"], numbers = KINDS[type(shape)], shape.parameters(grid.device)
             row["frame"]["scale"], row["frame"]["sign"] = shape.placement.scale * shape.unit_length(), -1.0 if shape.invert else 1.0
             for number in numbers:
                 row["radius" if isinstance(number, float) else "way"] = number
-        self._solids = np.zeros(len(solids), dtype=kernels.ShapeGroup.numpy_dtype())
         self._solids["number"], self._solids["first"] = [number for number, _ in solids], self._starts
         self._solids["end"] = self._starts + counts
         self._on_device = (
-            wp.zeros(len(solids), dtype=kernels.ShapeGroup, device=grid.device),
-            wp.zeros(len(shapes), dtype=kernels.PlacedShape, device=grid.device),
+            wp.zeros(len(solids), dtype=structs[0], device=grid.device),
+            wp.zeros(len(shapes), dtype=structs[1], device=grid.device),
         )
         self._block = block_of(np.zeros(3), np.ones(3), grid.spacing, grid.dimension, grid.origin)
         self.low = self.high = np.zeros((len(solids), 3), dtype=np.int64)

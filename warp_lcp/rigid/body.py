@@ -433,5 +433,13 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
     return (vector @ CROSS).reshape(*vector.shape, 3)
 
 
+def cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the cross products of vectors, shapes (..., 3); as `np.cross`, whose checks take ten times as long."""
+    result = np.empty(np.broadcast_shapes(one.shape, other.shape))
+    for axis, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        result[..., axis] = one[..., j] * other[..., k] - one[..., k] * other[..., j]
+    return result
+
+
 def _three(vector: np.ndarray | None) -> np.ndarray:
     return np.zeros(3) if vector is None else np.array(vector, dtype=np.float64)
