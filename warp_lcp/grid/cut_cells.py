@@ -21,6 +21,7 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows.host_array import HostArray
 
 DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
 
@@ -76,8 +77,8 @@ class CutCells:
         self.capacity = grid.field() if capacity else None
         self.velocity = grid.faces() if self.moves else None
         self._counts = wp.zeros(2, dtype=wp.int32, device=grid.device)
-        self.turn = wp.zeros(1 + len(solids), dtype=wp.mat33, device=grid.device)
-        self.shift = wp.zeros(1 + len(solids), dtype=wp.vec3, device=grid.device)
+        self._turn, self._shift = (HostArray(1 + len(solids), of, grid.device) for of in (wp.mat33, wp.vec3))
+        self.turn, self.shift = self._turn.array, self._shift.array
         notes = start_notes(self.solids, grid)
         self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
         self.distance = self._nodes.near
@@ -158,23 +159,20 @@ class CutCells:
             return
         if dt == 0.0:
             raise ValueError("dt = 0: a velocity needs two different times")
-        turn, shift = np.zeros((len(self.names), 3, 3)), np.zeros((len(self.names), 3))
-        turn[self._moving], shift[self._moving] = self.motions.velocity_fields(time, dt)
-        self.turn.assign(turn.astype(np.float32))
-        self.shift.assign(shift.astype(np.float32))
-        grid = self.grid
+        self._turn.host[self._moving], self._shift.host[self._moving] = self.motions.velocity_fields(time, dt)
+        self._turn.send()
+        self._shift.send()
         near = _around([box for box in (self._moved_from, self._moved_to) if box is not None])
         if near is None:
             return
-        low, high = near
-        for axis, (field, open_, wall) in enumerate(zip(self.velocity, self.open, self.wall, strict=True)):
-            first = [max(int(node), 1) for node in low]
-            last = [min(int(high[a]) - 1, count + (a == axis)) for a, count in enumerate(grid.counts)]
-            if any(a > b for a, b in zip(first, last, strict=True)):
-                continue  # only the ring is near
-            window = grid.window(first, last)
-            inputs = [self.moving, grid.planes, axis, grid.spacing, wp.vec3i(*grid.origin), open_, wall, self.turn, self.shift, field]
-            window.launch(kernels.velocity_kernel, inputs)
+        grid = self.grid
+        first = np.maximum(near[0], 1)
+        last = np.minimum(near[1] - 1, np.array(grid.counts) + 1)
+        if (first <= last).all():
+            fields = [field for each in (self.open, self.wall, self.velocity) for field in (*each, *each[1:2])[:3]]  # in 2-D no third one
+            inputs = [self.moving, grid.planes, grid.spacing, wp.vec3i(*grid.origin), wp.vec3i(*grid.counts)]
+            window = grid.window(first.tolist(), last.tolist())
+            window.launch(kernels.velocity_kernel, [*inputs, *fields[:6], self.turn, self.shift, *fields[6:]])
         self._moved_from = self._moved_to
 
     def moving_block(self) -> tuple[list[int], list[int]] | None:

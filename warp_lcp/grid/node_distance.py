@@ -17,6 +17,7 @@ from warp_lcp.grid.node_distance_kernels import COARSE, FAR, Nearest
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
 from warp_lcp.grid.solids_kernels import block_of, item_points
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.rows.host_array import HostArray
 
 NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
@@ -112,21 +113,15 @@ class ShapeTable:
         self._margin = np.array([margin for _, margin in hulls])
         limits = [UNLIMITED if (box := shape.bounds()) is None else np.where(np.isfinite(box), 0.0, box) for shape in shapes]
         self._limits = np.array(limits)  # infinite where a shape has no end
-        structs: list[Any] = [kernels.ShapeGroup, kernels.PlacedShape]
-        groups, rows = (np.zeros(len(of), dtype=struct.numpy_dtype()) for of, struct in zip((solids, shapes), structs, strict=True))
-        self._solids: Any = groups
-        self._shapes: Any = rows
-        for row, shape in zip(self._shapes, shapes, strict=True):
+        self._solids = HostArray(len(solids), kernels.ShapeGroup, grid.device)
+        self._shapes = HostArray(len(shapes), kernels.PlacedShape, grid.device)
+        for row, shape in zip(self._shapes.host, shapes, strict=True):
             row["kind"], numbers = KINDS[type(shape)], shape.parameters(grid.device)
             row["frame"]["scale"], row["frame"]["sign"] = shape.placement.scale * shape.unit_length(), -1.0 if shape.invert else 1.0
             for number in numbers:
                 row["radius" if isinstance(number, float) else "way"] = number
-        self._solids["number"], self._solids["first"] = [number for number, _ in solids], self._starts
-        self._solids["end"] = self._starts + counts
-        self._on_device = (
-            wp.zeros(len(solids), dtype=structs[0], device=grid.device),
-            wp.zeros(len(shapes), dtype=structs[1], device=grid.device),
-        )
+        groups = self._solids.host
+        groups["number"], groups["first"], groups["end"] = [number for number, _ in solids], self._starts, self._starts + counts
         self._block = block_of(np.zeros(3), np.ones(3), grid.spacing, grid.dimension, grid.origin)
         self.low = self.high = np.zeros((len(solids), 3), dtype=np.int64)
 
@@ -140,7 +135,7 @@ class ShapeTable:
         turn = rotation[self._owner]
         R = turn @ self._rotation
         t = (self._translation[:, None] @ turn.swapaxes(-1, -2))[:, 0] + translation[self._owner]
-        scaled, frame = self._scale[:, None, None], self._shapes["frame"]
+        scaled, frame = self._scale[:, None, None], self._shapes.host["frame"]
         frame["inverse_rotation"] = R.swapaxes(-1, -2)
         frame["translation"] = t + ((scaled * R) @ self._origin[..., None])[..., 0]
         corners = scaled * self._corners @ R.swapaxes(-1, -2) + t[:, None]
@@ -148,16 +143,16 @@ class ShapeTable:
         boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin], axis=1) + self._limits
         bounds = np.stack([np.minimum.reduceat(boxes[:, 0], self._starts), np.maximum.reduceat(boxes[:, 1], self._starts)], axis=1)
         self.low, self.high = nodes_within(self.grid, bounds)
-        self._solids["low"], self._solids["high"] = self.low, self.high
-        for device, host in zip(self._on_device, (self._solids, self._shapes), strict=True):
-            device.assign(host)
+        self._solids.host["low"], self._solids.host["high"] = self.low, self.high
+        self._solids.send()
+        self._shapes.send()
 
     def enter(self, nodes: NodeDistances, snap: float) -> None:
         """Enter the solids' distances; those within `snap` [cells] of a surface are 0."""
         near = (self.low < self.high).all(axis=1)
         if near.any():
             window = Window(_kji(self.low[near].min(axis=0)), _kji(self.high[near].max(axis=0)), self.grid.device)
-            window.launch(kernels.enter_solids, [self._block, *self._on_device, snap, nodes.struct])
+            window.launch(kernels.enter_solids, [self._block, self._solids.array, self._shapes.array, snap, nodes.struct])
 
 
 class NodeSampler:

@@ -336,6 +336,5 @@ class CutBoundary:
         return float(np.abs(lines[1] - lines[-1]).max())
 
     def _find_walls(self) -> None:
-        self.touch.zero_()
-        for axis, wall in enumerate(self.cut.wall):
-            self.grid.domain.launch(kernels.touch_cut_kernel, [axis, wall, self.cut.separating, self.touch])
+        walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third
+        self.grid.domain.launch(kernels.touch_cut_kernel, [self.grid.planes, *walls, self.cut.separating, self.touch])
