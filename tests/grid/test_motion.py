@@ -9,7 +9,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warp_lcp.grid.motion import Keyframes, Motion, Pose, Rotation, Sinusoid, Translation, kinks, top_speed
+from warp_lcp.grid.motion import Keyframes, Motion, Motions, Pose, Rotation, Sinusoid, Translation, kinks
 from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 
@@ -200,6 +200,10 @@ def test_kinks_are_where_the_velocity_jumps(motion):
     assert [time for time in np.arange(0.0, 3.0, 0.125) if jumps(time)] == [time for time in kinks(motion) if time < 3.0]
 
 
+def top_speed(motion, bounds, size, time, span):
+    return Motions([motion]).top_speed([bounds], size, time, span)
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_top_speeds(dimension):
     size = np.array([2.0, 1.0, 1.0 if dimension == 3 else 0.0])
@@ -215,6 +219,29 @@ def test_top_speeds(dimension):
     leaving = Translation(velocity=[10.0, 0.0])
     assert top_speed(leaving, rod, size, 0.0, 0.01) == pytest.approx(10.0)
     assert top_speed(leaving, rod, size, 0.2, 0.01) == 0.0  # it is out of the domain
+
+
+def test_top_speed_is_the_mean_one_of_the_fastest_sampled_point():
+    rng = np.random.default_rng(71)
+    size = np.array([1.0, 1.2, 0.8])
+    for _ in range(5):
+        motions = [
+            Rotation(rate=rng.uniform(-90, 90), center=rng.uniform(0, 1, 3), axis=rng.normal(size=3)),
+            Translation(velocity=rng.normal(size=3)),
+            Sinusoid(period=3.0, amplitude=rng.normal(size=3) * 0.1, angle=rng.uniform(0, 30), center=rng.uniform(0, 1, 3)),
+        ]
+        corners = [np.sort(rng.uniform(0.1, 0.7, (2, 3)), axis=0) for _ in motions]
+        span, fastest = 0.02, 0.0
+        for motion, (low, high) in zip(motions, corners, strict=True):
+            points = low + (high - low) * np.stack(np.meshgrid(*[np.linspace(0, 1, 5)] * 3), axis=-1).reshape(-1, 3)
+            for start in np.linspace(0.0, span, 5)[:-1]:
+                ends = motion.pose(start).apply(points), motion.pose(start + span / 4).apply(points)
+                inside = np.any([((end >= 0) & (end <= size)).all(axis=1) for end in ends], axis=0)
+                way = np.linalg.norm(ends[1] - ends[0], axis=1)
+                fastest = max(fastest, float(way[inside].max(initial=0.0)) * 4 / span)
+        found = Motions(motions).top_speed(corners, size, 0.0, span)
+        assert fastest * (1 - 1e-12) <= found <= 1.3 * fastest  # boxes around turned solids are larger
+    assert Motions([]).top_speed([], size, 0.0, 0.1) == 0.0
 
 
 SHAPES = {

@@ -7,7 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from warp_lcp.grid.motion import Motion
+from warp_lcp.grid import motion as prescribed
+from warp_lcp.grid.motion import Motion, Motions
 from warp_lcp.rigid.body import BodyMotion, BodyStates, RigidBody, orthonormal
 from warp_lcp.rigid.mass_properties import MassProperties
 
@@ -81,6 +82,30 @@ def test_poses_are_those_of_advance():
         np.testing.assert_allclose(predicted.rotation, now.rotation, atol=1e-13)
         np.testing.assert_allclose(predicted.translation, now.translation, atol=1e-13)
         np.testing.assert_allclose(now.apply(before.inverse().apply(points)) - points, dt * field, atol=1e-13)
+
+
+def test_motions_of_several_bodies_are_those_of_each():
+    rng = np.random.default_rng(17)
+    bodies = []
+    for _ in range(4):
+        root = rng.normal(size=(3, 3))
+        properties = MassProperties(mass=rng.uniform(0.1, 3), center=rng.uniform(0, 1, 3), inertia=root @ root.T + np.eye(3))
+        spin = rng.normal(size=3) * rng.choice([0.0, 10.0])
+        bodies.append(RigidBody(properties, name="top", velocity=rng.normal(size=3), angular_velocity=spin))
+    BodyStates(bodies).advance(0.03)
+    turning = prescribed.Rotation(rate=40.0, center=[0.2, 0.1])
+    each = [BodyMotion(bodies[0]), turning, *(BodyMotion(body) for body in bodies[1:])]
+    motions, times = Motions(each), bodies[0].time + np.array([0.0, 0.004, 0.02])
+    rotations, translations = motions.poses(times)
+    for m, time in enumerate(times):
+        for n, motion in enumerate(each):
+            np.testing.assert_allclose(rotations[m, n], motion.pose(time).rotation, rtol=0, atol=1e-15)
+            np.testing.assert_allclose(translations[m, n], motion.pose(time).translation, rtol=0, atol=1e-15)
+    points, h = rng.normal(size=(5, 3)), 1e-6
+    for n, (turn, shift) in enumerate(zip(*motions.velocity_fields(times[0], h), strict=True)):
+        here = each[n].pose(times[0]).apply(points)
+        moved = (each[n].pose(times[0] + h).apply(points) - here) / h
+        np.testing.assert_allclose(here @ turn.T + shift, moved, atol=1e-3)
 
 
 def test_the_center_of_mass_goes_where_its_pose_does():

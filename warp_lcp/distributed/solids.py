@@ -12,7 +12,8 @@ import warp_lcp as wl
 from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.node_distance import NodeDistances, nodes_near
+from warp_lcp.grid.motion import Motions
+from warp_lcp.grid.node_distance import NodeBox, NodeDistances, ShapeTable, nodes_near
 from warp_lcp.grid.node_distance_kernels import claim_nodes
 from warp_lcp.grid.sides import PeriodicSides, side_bits, with_periodic
 from warp_lcp.grid.solids import Geometry, TriangleMesh
@@ -21,8 +22,6 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
 from warp_lcp.material.boundary import CLOSE, Boundary, CutBoundary, WholeCells
 from warp_lcp.material.particle_scene import ParticleScene
-
-NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) of the whole grid and one past the last
 
 
 class CutCellsOfPart(CutCells):
@@ -45,21 +44,24 @@ class CutCellsOfPart(CutCells):
         self.unlikeness: dict[int, float] = {}
         super().__init__(part.grid, solids, **settings)
 
-    def _enter(self, placed: Sequence[tuple[int, Geometry]]) -> None:
+    def _enter(self) -> None:
         ranks, grid = self._part.ranks, self.grid
         whole = StaggeredGrid(grid.domain_counts, grid.spacing, grid.dimension, grid.device)
-        meshes = [(number, geometry) for number, geometry in placed if isinstance(geometry, TriangleMesh) and ranks.size > 1]
-        boxes = {number: box for number, geometry in meshes if (box := nodes_near(whole, geometry)) is not None}
-        mine = [self._layer(geometry, boxes[number]) for number, geometry in meshes if number in boxes]
+        placed = {place: self._placed(place) for place in self._runs if not isinstance(place, ShapeTable)}
+        meshes = {place: geometry for place, geometry in placed.items() if isinstance(geometry, TriangleMesh) and ranks.size > 1}
+        boxes = {place: box for place, geometry in meshes.items() if (box := nodes_near(whole, geometry)) is not None}
+        mine = [self._layer(geometry, boxes[place]) for place, geometry in meshes.items() if place in boxes]
         everyone, first = ranks.gather(np.concatenate(mine)) if mine else np.empty((0, 0)), 0
-        for number, geometry in placed:
-            if number not in dict(meshes):
-                self._sampler.enter(self._nodes, number, geometry)
-            elif number in boxes:
-                layers = [_layer(boxes[number], rank, ranks.size) for rank in range(ranks.size)]
+        for run in self._runs:
+            if isinstance(run, ShapeTable):
+                run.enter(self._nodes, self._sampler.snap)
+            elif run not in meshes:
+                self._sampler.enter(self._nodes, self._moving[run], placed[run])
+            elif run in boxes:
+                layers = [_layer(boxes[run], rank, ranks.size) for rank in range(ranks.size)]
                 size = layers[0].cells
                 for layer, distances in zip(layers, everyone[:, first : first + size], strict=True):
-                    self._claim(number, layer, distances[: layer.cells].reshape(layer.counts[::-1]))
+                    self._claim(self._moving[run], layer, distances[: layer.cells].reshape(layer.counts[::-1]))
                 first += size
 
     def _join(self) -> None:
@@ -119,7 +121,8 @@ class CutBoundaryOfPart(CutBoundary):
     def __init__(self, part: Subdomain, cut: CutCellsOfPart, sides: PeriodicSides | None) -> None:
         self._part, self._unlike = part, cut.unlikeness
         super().__init__(part.grid, cut, sides=sides)
-        self._moving = self._moving[part.ranks.rank :: part.ranks.size]
+        mine = slice(part.ranks.rank, None, part.ranks.size)
+        self._motions, self._bounds = Motions(self._motions.motions[mine]), self._bounds[mine]
         part.fill(*self.placed())
 
     def top_speed(self, time: float, span: float) -> float:

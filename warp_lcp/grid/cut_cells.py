@@ -6,20 +6,22 @@ second order for smooth walls; at a solid's edges, and where it or a gap is thin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import groupby
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid import cut_cells_kernels as kernels
 from warp_lcp.grid.cut_cells_kernels import integrate_kernel
-from warp_lcp.grid.motion import Motion, RigidMotion
-from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
+from warp_lcp.grid.motion import Motions, Pose
+from warp_lcp.grid.node_distance import NodeBox, NodeDistances, NodeSampler, ShapeTable, nodes_near
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows.host_array import HostArray
 
 DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
 
@@ -75,8 +77,8 @@ class CutCells:
         self.capacity = grid.field() if capacity else None
         self.velocity = grid.faces() if self.moves else None
         self._counts = wp.zeros(2, dtype=wp.int32, device=grid.device)
-        self.turn = wp.zeros(1 + len(solids), dtype=wp.mat33, device=grid.device)
-        self.shift = wp.zeros(1 + len(solids), dtype=wp.vec3, device=grid.device)
+        self._turn, self._shift = (HostArray(1 + len(solids), of, grid.device) for of in (wp.mat33, wp.vec3))
+        self.turn, self.shift = self._turn.array, self._shift.array
         notes = start_notes(self.solids, grid)
         self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
         self.distance = self._nodes.near
@@ -86,12 +88,18 @@ class CutCells:
             self._sampler.enter(self._nodes, number, geometry)
         self._marks = wp.array(_ring(grid, open_sides), dtype=wp.int8, device=grid.device)
         self._sampler.look_at_centers(
-            self._nodes, [geometry for _, geometry in standing], np.zeros(3, dtype=int), np.array(grid.shape[::-1]), self._marks
+            self._nodes, lambda: [geometry for _, geometry in standing], np.zeros(3, dtype=int), np.array(grid.shape[::-1]), self._marks
         )
         wp.copy(self.base, self._marks)
-        self._moved_from: list[tuple[np.ndarray, np.ndarray]] = []  # nodes near the solids that move, where the velocity was filled last
-        self._moved_to: list[tuple[np.ndarray, np.ndarray]] = []  # and where they are
+        self._moved_from: NodeBox | None = None  # nodes near the solids that move, where the velocity was filled last
+        self._moved_to: NodeBox | None = None  # and where they are
+        moving = [(number, solid) for number, solid in enumerate(solids, start=1) if solid.motion is not None]
+        self.motions, self._moving = (
+            Motions([solid.motion for _, solid in moving if solid.motion is not None]),
+            [number for number, _ in moving],
+        )
         if self.moves:
+            self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving]))
             self._standing = NodeDistances(grid, second=len(solids) > 1)
             self._standing.copy_from(self._nodes)
             self.moving = kernels.Moving()
@@ -151,28 +159,20 @@ class CutCells:
             return
         if dt == 0.0:
             raise ValueError("dt = 0: a velocity needs two different times")
-        turn, shift = np.zeros((len(self.names), 3, 3)), np.zeros((len(self.names), 3))
-        for number, _, motion in self._moving():
-            if isinstance(motion, RigidMotion):
-                turn[number], shift[number] = motion.velocity_field()
-                continue
-            way = motion.pose(time + dt).after(motion.pose(time).inverse())
-            turn[number], shift[number] = (way.rotation - np.eye(3)) / dt, way.translation / dt
-        self.turn.assign(turn.astype(np.float32))
-        self.shift.assign(shift.astype(np.float32))
-        grid = self.grid
-        near = [*self._moved_from, *self._moved_to]
-        if not near:
+        self._turn.host[self._moving], self._shift.host[self._moving] = self.motions.velocity_fields(time, dt)
+        self._turn.send()
+        self._shift.send()
+        near = _around([box for box in (self._moved_from, self._moved_to) if box is not None])
+        if near is None:
             return
-        low, high = np.min([block[0] for block in near], axis=0), np.max([block[1] for block in near], axis=0)
-        for axis, (field, open_, wall) in enumerate(zip(self.velocity, self.open, self.wall, strict=True)):
-            first = [max(int(node), 1) for node in low]
-            last = [min(int(high[a]) - 1, count + (a == axis)) for a, count in enumerate(grid.counts)]
-            if any(a > b for a, b in zip(first, last, strict=True)):
-                continue  # only the ring is near
-            window = grid.window(first, last)
-            inputs = [self.moving, grid.planes, axis, grid.spacing, wp.vec3i(*grid.origin), open_, wall, self.turn, self.shift, field]
-            window.launch(kernels.velocity_kernel, inputs)
+        grid = self.grid
+        first = np.maximum(near[0], 1)
+        last = np.minimum(near[1] - 1, np.array(grid.counts) + 1)
+        if (first <= last).all():
+            fields = [field for each in (self.open, self.wall, self.velocity) for field in (*each, *each[1:2])[:3]]  # in 2-D no third one
+            inputs = [self.moving, grid.planes, grid.spacing, wp.vec3i(*grid.origin), wp.vec3i(*grid.counts)]
+            window = grid.window(first.tolist(), last.tolist())
+            window.launch(kernels.velocity_kernel, [*inputs, *fields[:6], self.turn, self.shift, *fields[6:]])
         self._moved_from = self._moved_to
 
     def moving_block(self) -> tuple[list[int], list[int]] | None:
@@ -180,31 +180,48 @@ class CutCells:
 
         Low and high cell (x, y, z), both included.
         """
-        if not self._moved_to:
+        if self._moved_to is None:
             return None
-        low = np.min([block[0] for block in self._moved_to], axis=0) - 1
-        high = np.max([block[1] for block in self._moved_to], axis=0)
-        first, last = np.maximum(low, 1), np.minimum(high, self.grid.counts)
+        low, high = self._moved_to
+        first, last = np.maximum(low - 1, 1), np.minimum(high, self.grid.counts)
         return (first.tolist(), last.tolist()) if (first <= last).all() else None
-
-    def _moving(self) -> list[tuple[int, Geometry, Motion]]:
-        """Return the solids that move, with their numbers, as the scene places them."""
-        return [(number, s.geometry, s.motion) for number, s in enumerate(self.solids, start=1) if s.motion is not None]
 
     def _enter_moving(self, time: float) -> None:
         """Enter the solids that move into the distances, and mark again the cells that only their centers tell about."""
-        placed = [(number, geometry.moved(motion.pose(time))) for number, geometry, motion in self._moving()]
-        self._enter(placed)
-        every = [s.geometry for s in self.solids if s.motion is None] + [geometry for _, geometry in placed]
-        near = [nodes_near(self.grid, geometry) for _, geometry in placed]
-        self._moved_to = [block for block in near if block is not None]
-        for low, high in self._moved_to:
-            self._sampler.look_at_centers(self._nodes, every, low, high, self.base)
+        rotations, translations = self.motions.poses([time])
+        self._poses = rotations[0], translations[0]
+        for run in self._runs:
+            if isinstance(run, ShapeTable):
+                run.place(rotations[0, run.places], translations[0, run.places])
+        self._enter()
+        boxes = []
+        for run in self._runs:
+            if isinstance(run, ShapeTable):
+                near = (run.low < run.high).all(axis=1)
+                boxes += [(run.low[near].min(axis=0), run.high[near].max(axis=0))] if near.any() else []
+            elif (box := nodes_near(self.grid, self._placed(run))) is not None:
+                boxes.append(box)
+        self._moved_to = _around(boxes)
+        if self._moved_to is not None:
+            self._sampler.look_at_centers(self._nodes, self._all_placed, *self._moved_to, self.base)
 
-    def _enter(self, placed: Sequence[tuple[int, Geometry]]) -> None:
-        """Enter the distances of solids, with their numbers, where they are."""
-        for number, geometry in placed:
-            self._sampler.enter(self._nodes, number, geometry)
+    def _placed(self, place: int) -> Geometry:
+        """Return a solid that moves where it is, by its place among those."""
+        rotations, translations = self._poses
+        return self.solids[self._moving[place] - 1].geometry.moved(Pose(rotations[place], translations[place]))
+
+    def _all_placed(self) -> list[Geometry]:
+        """Return all solids where they are."""
+        standing = [solid.geometry for solid in self.solids if solid.motion is None]
+        return [*standing, *(self._placed(place) for place in range(len(self._moving)))]
+
+    def _enter(self) -> None:
+        """Enter the distances of the solids that move where they are."""
+        for run in self._runs:
+            if isinstance(run, ShapeTable):
+                run.enter(self._nodes, self._sampler.snap)
+            else:
+                self._sampler.enter(self._nodes, self._moving[run], self._placed(run))
 
     def _join(self) -> None:
         """Bring distances, and the marks in `base`, to where they are told by other nodes."""
@@ -266,3 +283,20 @@ def _ring(grid: StaggeredGrid, open_sides: int) -> np.ndarray:
     host[1:-1, 1:-1, 1:-1] = 0
     host[open_ring(grid.shape, open_sides)] = 0
     return host
+
+
+def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
+    """Return the box around boxes of nodes; None: there are none."""
+    if not boxes:
+        return None
+    return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+
+
+def _runs(grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]) -> Iterator[ShapeTable | int]:
+    """Cut solids, in order, into tables of those next to each other that tables hold, and the places of others."""
+    for held, of in groupby(range(len(solids)), key=lambda place: ShapeTable.holds(solids[place][1])):
+        if held:
+            places = list(of)
+            yield ShapeTable(grid, [solids[place] for place in places], places)
+        else:
+            yield from of

@@ -131,12 +131,12 @@ def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open:
     return wp.max(solid, 0), part
 
 
-@cell_kernel("warp_lcp.grid.cut_cells")
-def velocity_kernel(
-    k, j, i, S: Moving, planes: int, axis: int, spacing: float, origin: wp.vec3i, open: F32, wall: I16, turn: _TURNS, shift: _SHIFTS,
-    velocity: F32,
+@wp.func
+def face_velocity(
+    S: Moving, axis: int, planes: int, spacing: float, origin: wp.vec3i, k: int, j: int, i: int, open: F32, wall: I16, turn: _TURNS,
+    shift: _SHIFTS,
 ):  # fmt: skip
-    """Fill the mean velocity of what is not open of each face [m/s], at its center turn x + shift of a solid that moves."""
+    """Return the mean velocity of what is not open of a face [m/s], at its center turn x + shift of a solid that moves."""
     value = float(0.0)
     solid, part = moving_part(S, axis, planes, k, j, i, open, wall)
     if solid > 0:
@@ -145,7 +145,21 @@ def velocity_kernel(
         if planes == 1:
             x[2] = 0.0
         value = part * (wp.dot(turn[solid][axis], x) + shift[solid][axis])
-    velocity[k, j, i] = value
+    return value
+
+
+@cell_kernel("warp_lcp.grid.cut_cells")
+def velocity_kernel(
+    k, j, i, S: Moving, planes: int, spacing: float, origin: wp.vec3i, counts: wp.vec3i, ax: F32, ay: F32, az: F32, wx: I16, wy: I16,
+    wz: I16, turn: _TURNS, shift: _SHIFTS, u: F32, v: F32, w: F32,
+):  # fmt: skip
+    """Fill the velocities of the lower faces of cells, and of the domain's upper ones."""
+    if j <= counts[1] and (planes == 1 or k <= counts[2]):
+        u[k, j, i] = face_velocity(S, 0, planes, spacing, origin, k, j, i, ax, wx, turn, shift)
+    if i <= counts[0] and (planes == 1 or k <= counts[2]):
+        v[k, j, i] = face_velocity(S, 1, planes, spacing, origin, k, j, i, ay, wy, turn, shift)
+    if planes == 2 and i <= counts[0] and j <= counts[1]:
+        w[k, j, i] = face_velocity(S, 2, planes, spacing, origin, k, j, i, az, wz, turn, shift)
 
 
 options = {"enable_backward": False, "module": "warp_lcp.grid.capacity"}
@@ -173,6 +187,23 @@ def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state:
             cut_cell(near, capacity, planes, k, j, i)
 
 
+@wp.kernel(**options)
+def cut_in_order_kernel(low: wp.vec3i, high: wp.vec3i, origin: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
+    """Integrate over the cut cells of a box, color after color; one thread."""
+    colors = COLORS * COLORS
+    if planes == 2:
+        colors = colors * COLORS
+    for color in range(colors):
+        z = (color // (COLORS * COLORS) - origin[2]) % COLORS
+        y = (color // COLORS % COLORS - origin[1]) % COLORS
+        x = (color % COLORS - origin[0]) % COLORS
+        for k in range(low[0] + (z + COLORS) % COLORS, high[0], COLORS):
+            for j in range(low[1] + (y + COLORS) % COLORS, high[1], COLORS):
+                for i in range(low[2] + (x + COLORS) % COLORS, high[2], COLORS):
+                    if state[k, j, i] == wp.int8(CUT):
+                        cut_cell(near, capacity, planes, k, j, i)
+
+
 def integrate_kernel(
     window: Window, planes: int, near: wp.array, state: wp.array, capacity: wp.array, origin: tuple[int, int, int] = (0, 0, 0)
 ) -> None:
@@ -188,6 +219,10 @@ def integrate_kernel(
     """
     everywhere = Window((1, 0, 0) if planes == 1 else (0, 0, 0), (2 if planes == 1 else state.shape[0], *state.shape[1:]), window.device)
     everywhere.run(OPEN_CELLS, planes=planes, state=state, capacity=capacity)
+    if window.device.is_cpu:
+        inputs = [wp.vec3i(*window.low), wp.vec3i(*window.high), wp.vec3i(*origin), planes, near, state, capacity]
+        wp.launch(cut_in_order_kernel, 1, inputs, device=window.device)
+        return
     chunks = -(-(window.high[2] - window.low[2]) // window.cells.grain)
     for color in itertools.product(range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)):
         z, y, x = ((c - before) % COLORS for c, before in zip(color, reversed(origin), strict=True))

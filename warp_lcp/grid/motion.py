@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -115,10 +114,18 @@ class Motion(Protocol):
 class RigidMotion(Motion, Protocol):
     """Motion of a body moved by forces: its velocity is part of a state."""
 
-    def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s].
+    @staticmethod
+    def poses_of(motions: Sequence[Any], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return rotations, shape (m, n, 3, 3), and translations, shape (m, n, 3) [m].
 
-        A point x of the solid moves at turn x + shift.
+        Poses of n such motions at m times [s].
+        """
+
+    @staticmethod
+    def velocity_fields_of(motions: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return turns, shape (n, 3, 3) [1/s], and shifts, shape (n, 3) [m/s].
+
+        A point x of a solid moves at turn x + shift.
         """
 
 
@@ -285,33 +292,102 @@ class Keyframes:
         return Pose.about(np.asarray(self.center), rotation, shift)
 
 
-def top_speed(motion: Motion, bounds: np.ndarray | None, size: np.ndarray, time: float, span: float) -> float:
-    """Return the largest future speed of a point of a solid in the domain [m/s].
-
-    A rigid body is fastest at a corner of a box around it; velocities are means over a few parts of the span.
+class Motions:
+    """Motions of several solids, evaluated together.
 
     Args:
-        motion: of the solid.
-        bounds: low and high corner [m] of a box around the solid as it is placed, shape (2, 3); None: it has no limits.
-        size: of the domain [m], shape (3,), z = 0 in 2-D.
-        time: [s].
-        span: time to look ahead [s], > 0.
+        motions: of n solids.
     """
-    domain = np.stack([np.zeros(3), size])
-    poses = [motion.pose(moment) for moment in np.linspace(time, time + span, SPEED_SAMPLES + 1)]
-    fastest = 0.0
-    for pose, later in pairwise(poses):
-        way = later.after(pose.inverse())
-        for place, step in ((pose, way), (later, way.inverse())):  # it may be in the domain at one end of the way only
-            low, high = domain
-            if bounds is not None:
-                placed = place.apply(_corners(np.where(size > 0.0, bounds, 0.0)))
-                low, high = np.maximum(low, placed.min(axis=0)), np.minimum(high, placed.max(axis=0))
-            if (low <= high).all():
-                corners = _corners(np.stack([low, high]))
-                moved = step.apply(corners) - corners
-                fastest = max(fastest, float(np.linalg.norm(moved, axis=1).max()) * SPEED_SAMPLES / span)
-    return fastest
+
+    def __init__(self, motions: Sequence[Motion]) -> None:
+        self.motions = tuple(motions)
+        rigid = [isinstance(motion, RigidMotion) for motion in motions]
+        kinds = dict.fromkeys(type(motion) for motion, is_rigid in zip(motions, rigid, strict=True) if is_rigid)
+        of_kind = {kind: [n for n, motion in enumerate(motions) if type(motion) is kind] for kind in kinds}
+        self._groups: list[tuple[Any, list[int], list[Any]]] = [
+            (kind, numbers, [motions[n] for n in numbers]) for kind, numbers in of_kind.items()
+        ]
+        self._prescribed = [n for n, is_rigid in enumerate(rigid) if not is_rigid]
+
+    def __len__(self) -> int:
+        """Return the number of motions."""
+        return len(self.motions)
+
+    def poses(self, times: Sequence[float] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return rotations, shape (m, n, 3, 3), and translations, shape (m, n, 3) [m].
+
+        Args:
+            times: m of them [s].
+        """
+        times = np.asarray(times, dtype=np.float64)
+        rotations, translations = np.empty((len(times), len(self), 3, 3)), np.empty((len(times), len(self), 3))
+        for kind, numbers, members in self._groups:
+            rotations[:, numbers], translations[:, numbers] = kind.poses_of(members, times)
+        for number in self._prescribed:
+            for m, time in enumerate(times.tolist()):
+                pose = self.motions[number].pose(time)
+                rotations[m, number], translations[m, number] = pose.rotation, pose.translation
+        return rotations, translations
+
+    def velocity_fields(self, time: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return turns, shape (n, 3, 3) [1/s], and shifts, shape (n, 3) [m/s].
+
+        A point x of a solid moves at turn x + shift: its displacement from `time` on divided by the
+        time dt [s] that it takes, or the velocity of the state of a `RigidMotion`.
+        """
+        turns, shifts = np.empty((len(self), 3, 3)), np.empty((len(self), 3))
+        for kind, numbers, members in self._groups:
+            turns[numbers], shifts[numbers] = kind.velocity_fields_of(members)
+        for number in self._prescribed:
+            motion = self.motions[number]
+            way = motion.pose(time + dt).after(motion.pose(time).inverse())
+            turns[number], shifts[number] = (way.rotation - np.eye(3)) / dt, way.translation / dt
+        return turns, shifts
+
+    def top_speed(self, bounds: Sequence[np.ndarray | None], size: np.ndarray, time: float, span: float) -> float:
+        """Return the largest future speed of a point of a solid in the domain [m/s].
+
+        A rigid body is fastest at a corner of a box around it; velocities are means over a few parts of the span.
+
+        Args:
+            bounds: low and high corner [m] of a box around each solid as it is placed, shape (2, 3); None: it has no limits.
+            size: of the domain [m], shape (3,), z = 0 in 2-D.
+            time: [s].
+            span: time to look ahead [s], > 0.
+        """
+        if not self.motions:
+            return 0.0
+        limited = np.array([box is not None for box in bounds])[:, None]
+        boxes = np.array([np.zeros((2, 3)) if box is None else np.where(size > 0.0, box, 0.0) for box in bounds])
+        R, t = self.poses(np.linspace(time, time + span, SPEED_SAMPLES + 1))
+        before, after = (R[:-1], t[:-1]), (R[1:], t[1:])
+        way = _after(after, _inverse(before))
+        fastest = 0.0
+        for place, step in ((before, way), (after, _inverse(way))):  # it may be in the domain at one end of the way only
+            placed = _applied(place, _corners(boxes))
+            low = np.where(limited, np.maximum(0.0, placed.min(axis=-2)), 0.0)
+            high = np.where(limited, np.minimum(size, placed.max(axis=-2)), size)
+            corners = _corners(np.stack([low, high], axis=-2))
+            speeds = np.linalg.norm(_applied(step, corners) - corners, axis=-1).max(axis=-1) * SPEED_SAMPLES / span
+            fastest = max(fastest, float(speeds.max(initial=0.0, where=(low <= high).all(axis=-1))))
+        return fastest
+
+
+def _applied(pose: tuple[np.ndarray, np.ndarray], points: np.ndarray) -> np.ndarray:
+    """Return points, shape (..., k, 3), transformed by poses, shapes (..., 3, 3) and (..., 3)."""
+    rotation, translation = pose
+    return np.asarray(points @ rotation.swapaxes(-1, -2) + translation[..., None, :])
+
+
+def _after(pose: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the compositions of poses, as `Pose.after`."""
+    return pose[0] @ other[0], (pose[0] @ other[1][..., None])[..., 0] + pose[1]
+
+
+def _inverse(pose: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverse poses, as `Pose.inverse`."""
+    back = pose[0].swapaxes(-1, -2)
+    return back, (-back @ pose[1][..., None])[..., 0]
 
 
 def kinks(motion: Motion) -> tuple[float, ...]:
@@ -399,8 +475,8 @@ class _Turns:
 
 
 def _corners(bounds: np.ndarray) -> np.ndarray:
-    """Return the corners of a box, shape (8, 3), from its low and high one, shape (2, 3)."""
-    return cast(np.ndarray, bounds[ENDS, np.arange(3)])
+    """Return the corners of boxes, shape (..., 8, 3), from their low and high one, shape (..., 2, 3)."""
+    return bounds[..., ENDS, np.arange(3)]
 
 
 def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:

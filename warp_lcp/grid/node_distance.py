@@ -6,7 +6,7 @@ nearest to its center. Distances below `FAR` cells are exact, others are at leas
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,15 @@ import warp as wp
 
 from warp_lcp.grid import node_distance_kernels as kernels
 from warp_lcp.grid.node_distance_kernels import COARSE, FAR, Nearest
-from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.grid.solids import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
 from warp_lcp.grid.solids_kernels import block_of, item_points
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.rows.host_array import HostArray
 
+NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
+KINDS: dict[Any, int] = {Box: kernels.BOX, Sphere: kernels.SPHERE, Capsule: kernels.CAPSULE, Plane: kernels.PLANE}
+UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of a solid without an end
 SNAP = 1e-6  # of the domain's longest side: distances below it are rounding errors of float32 positions, and count as 0
 
 
@@ -60,15 +64,95 @@ class NodeDistances:
 
 def nodes_near(grid: StaggeredGrid, geometry: Geometry, reach: float = FAR) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the first stored node and the one past the last (x, y, z) within `reach` cells of a solid's bounds; None: there are none."""
-    end = np.array(grid.shape[::-1])
-    low, high = np.zeros(3, dtype=np.int64), end.copy()
     bounds = geometry.bounds()
-    if bounds is not None:
-        touched = np.clip(bounds / grid.spacing + 1.0 - np.array(grid.origin) + np.array([[-reach], [reach]]), -1.0, end)
-        low, high = np.ceil(np.maximum(touched[0], 0.0)).astype(np.int64), np.minimum(np.floor(touched[1]).astype(np.int64) + 1, end)
-    if grid.dimension == 2:
-        low[2], high[2] = 1, 2
+    low, high = nodes_within(grid, UNLIMITED if bounds is None else bounds, reach)
     return (low, high) if (low < high).all() else None
+
+
+def nodes_within(grid: StaggeredGrid, bounds: np.ndarray, reach: float = FAR) -> tuple[np.ndarray, np.ndarray]:
+    """Return first nodes and those past the last (x, y, z) within `reach` cells of boxes [m], shape (..., 2, 3).
+
+    Shapes (..., 3); not all of one are less than those of the other where no node is near.
+    """
+    end = np.array(grid.shape[::-1])
+    touched = np.clip(bounds / grid.spacing + 1.0 - np.array(grid.origin) + np.array([[-reach], [reach]]), -1.0, end)
+    low = np.ceil(np.maximum(touched[..., 0, :], 0.0)).astype(np.int64)
+    high = np.minimum(np.floor(touched[..., 1, :]).astype(np.int64) + 1, end)
+    if grid.dimension == 2:
+        low[..., 2], high[..., 2] = 1, 2
+    return low, high
+
+
+class ShapeTable:
+    """Solids of boxes, spheres, capsules and planes in one array on the device, to be entered by one launch.
+
+    Args:
+        grid: the grid.
+        solids: number and shape of each as the scene places it, of a kind that `holds` knows.
+        places: of these among the solids that move.
+
+    Attributes:
+        low: first node (x, y, z) near each solid where it is, shape (n, 3).
+        high: one past the last.
+    """
+
+    def __init__(self, grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]], places: Sequence[int]) -> None:
+        self.grid, self.places = grid, list(places)
+        shapes = [part for _, geometry in solids for part in _parts(geometry)]
+        counts = np.array([len(_parts(geometry)) for _, geometry in solids])
+        self._starts = np.cumsum(counts) - counts
+        self._rotation = np.array([shape.placement.rotation for shape in shapes])
+        self._translation = np.array([shape.placement.translation for shape in shapes])
+        self._scale = np.array([shape.placement.scale for shape in shapes])
+        self._origin = np.array([shape.origin() for shape in shapes])
+        self._owner = np.repeat(np.arange(len(solids)), counts)
+        hulls = [shape.hull() for shape in shapes]
+        most = max(1, *(len(corners) for corners, _ in hulls))
+        unlimited = np.zeros((most, 3))
+        self._corners = np.array([np.resize(c, (most, 3)) if len(c) else unlimited for c, _ in hulls])
+        self._margin = np.array([margin for _, margin in hulls])
+        limits = [UNLIMITED if (box := shape.bounds()) is None else np.where(np.isfinite(box), 0.0, box) for shape in shapes]
+        self._limits = np.array(limits)  # infinite where a shape has no end
+        self._solids = HostArray(len(solids), kernels.ShapeGroup, grid.device)
+        self._shapes = HostArray(len(shapes), kernels.PlacedShape, grid.device)
+        for row, shape in zip(self._shapes.host, shapes, strict=True):
+            row["kind"], numbers = KINDS[type(shape)], shape.parameters(grid.device)
+            row["frame"]["scale"], row["frame"]["sign"] = shape.placement.scale * shape.unit_length(), -1.0 if shape.invert else 1.0
+            for number in numbers:
+                row["radius" if isinstance(number, float) else "way"] = number
+        groups = self._solids.host
+        groups["number"], groups["first"], groups["end"] = [number for number, _ in solids], self._starts, self._starts + counts
+        self._block = block_of(np.zeros(3), np.ones(3), grid.spacing, grid.dimension, grid.origin)
+        self.low = self.high = np.zeros((len(solids), 3), dtype=np.int64)
+
+    @staticmethod
+    def holds(geometry: Geometry) -> bool:
+        """Return whether a solid is of boxes, spheres, capsules and planes."""
+        return all(type(part) in KINDS for part in _parts(geometry))
+
+    def place(self, rotation: np.ndarray, translation: np.ndarray) -> None:
+        """Place the solids by poses, shapes (n, 3, 3) and (n, 3) [m]."""
+        turn = rotation[self._owner]
+        R = turn @ self._rotation
+        t = (self._translation[:, None] @ turn.swapaxes(-1, -2))[:, 0] + translation[self._owner]
+        scaled, frame = self._scale[:, None, None], self._shapes.host["frame"]
+        frame["inverse_rotation"] = R.swapaxes(-1, -2)
+        frame["translation"] = t + ((scaled * R) @ self._origin[..., None])[..., 0]
+        corners = scaled * self._corners @ R.swapaxes(-1, -2) + t[:, None]
+        margin = (self._margin * self._scale)[:, None]
+        boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin], axis=1) + self._limits
+        bounds = np.stack([np.minimum.reduceat(boxes[:, 0], self._starts), np.maximum.reduceat(boxes[:, 1], self._starts)], axis=1)
+        self.low, self.high = nodes_within(self.grid, bounds)
+        self._solids.host["low"], self._solids.host["high"] = self.low, self.high
+        self._solids.send()
+        self._shapes.send()
+
+    def enter(self, nodes: NodeDistances, snap: float) -> None:
+        """Enter the solids' distances; those within `snap` [cells] of a surface are 0."""
+        near = (self.low < self.high).all(axis=1)
+        if near.any():
+            window = Window(_kji(self.low[near].min(axis=0)), _kji(self.high[near].max(axis=0)), self.grid.device)
+            window.launch(kernels.enter_solids, [self._block, self._solids.array, self._shapes.array, snap, nodes.struct])
 
 
 class NodeSampler:
@@ -117,12 +201,14 @@ class NodeSampler:
                     inputs = [block, listed, distances, self.snap, number, nodes.struct]
                     wp.launch(kernels.claim_listed, count, inputs, device=self.grid.device)
 
-    def look_at_centers(self, nodes: NodeDistances, solids: Sequence[Geometry], low: np.ndarray, high: np.ndarray, marks: wp.array) -> None:
+    def look_at_centers(
+        self, nodes: NodeDistances, solids: Callable[[], Sequence[Geometry]], low: np.ndarray, high: np.ndarray, marks: wp.array
+    ) -> None:
         """Mark as HOLLOW the cells in the open whose corners all have distance 0: gaps of one cell, where plates have no mark.
 
         Args:
             nodes: the distances to all solids.
-            solids: all of them.
+            solids: returns all of them, if there is such a cell.
             low: first node (x, y, z) from which on cells are considered.
             high: one past the last node.
             marks: int8, one a stored cell (updated).
@@ -143,7 +229,7 @@ class NodeSampler:
                 self.look_at_centers(nodes, solids, begin, end, marks)
         elif found:
             block, listed = self._block(low, high, offset=0.5), self._list[:found]
-            for order, geometry in enumerate(solids):
+            for order, geometry in enumerate(solids()):
                 distances = self._measure(geometry, found, kernels.listed_points, [block, listed])
                 wp.launch(kernels.mark_listed, found, [listed, distances, order == 0, marks], device=self.grid.device)
 
@@ -184,6 +270,11 @@ class NodeSampler:
                 block = self._block(begin, end, before, stride=stride, offset=offset)
                 counts = block.counts
                 yield block, self._measure(geometry, counts[0] * counts[1] * counts[2], item_points, [block])
+
+
+def _parts(geometry: Geometry) -> list[Any]:
+    """Return the shapes that a solid is the union of."""
+    return [shape for part in geometry.parts for shape in _parts(part)] if isinstance(geometry, Union) else [geometry]
 
 
 def _kji(corner: np.ndarray) -> tuple[int, int, int]:

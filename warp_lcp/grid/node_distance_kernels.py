@@ -4,12 +4,25 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
-from warp_lcp.grid.solids_kernels import Block, Distances, Points, first_node, node_position
+from warp_lcp.grid.solids_kernels import (
+    Block,
+    Distances,
+    Points,
+    ShapeFrame,
+    first_node,
+    node_position,
+    to_box,
+    to_capsule,
+    to_plane,
+    to_sphere,
+)
 
 FAR = 4.0  # cells: distances below it are exact, others at least this large
 COARSE = 3  # nodes along an axis of a block in which one distance may stand for all
 ROUNDING = 1.0e-3  # cells: signs this near to 0 are not relied on
 HOLLOW = 1  # a mark of cells with distance 0 at all corners whose center is open: one cell wide gaps
+
+BOX, SPHERE, CAPSULE, PLANE = range(4)  # kinds of a PlacedShape
 
 Listed = wp.array(dtype=wp.vec4i)
 options = {"enable_backward": False, "module": "warp_lcp.grid.node_distance"}
@@ -23,6 +36,42 @@ class Nearest:
     owner: I16
     next_near: F32
     next_owner: I16
+
+
+@wp.struct
+class PlacedShape:
+    """A shape of a solid where it stands."""
+
+    frame: ShapeFrame
+    kind: int  # BOX, SPHERE, CAPSULE or PLANE
+    way: wp.vec3  # half extents of a box, axis of a capsule, normal of a plane
+    radius: float
+
+
+@wp.struct
+class ShapeGroup:
+    """The shapes of a solid, and the box of nodes around it."""
+
+    number: int
+    first: int  # of its shapes
+    end: int  # one past the last
+    low: wp.vec3i  # first node (x, y, z)
+    high: wp.vec3i  # one past the last
+
+
+@wp.func
+def shape_distance(p: wp.vec3, shape: PlacedShape) -> float:
+    """Return the distance of a shape [m]."""
+    d = float(0.0)
+    if shape.kind == BOX:
+        d = to_box(p, shape.frame, shape.way)
+    elif shape.kind == SPHERE:
+        d = to_sphere(p, shape.frame, shape.radius)
+    elif shape.kind == CAPSULE:
+        d = to_capsule(p, shape.frame, shape.way, shape.radius)
+    else:
+        d = to_plane(p, shape.frame, shape.way)
+    return d
 
 
 @wp.func
@@ -55,6 +104,23 @@ def claim_nodes(block: Block, distance: Distances, snap: float, solid: int, node
     """Enter the distances [m] of a solid at a block of nodes."""
     c = wp.tid()
     enter(first_node(block, c), snapped(distance[c], block.spacing, snap), solid, nodes)
+
+
+@cell_kernel("warp_lcp.grid.node_distance")
+def enter_solids(
+    k, j, first, end, block: Block, solids: wp.array(dtype=ShapeGroup), shapes: wp.array(dtype=PlacedShape), snap: float, nodes: Nearest
+):
+    """Enter the distances of several solids, one after the other, at a row of nodes."""
+    for s in range(solids.shape[0]):
+        solid = solids[s]
+        if k >= solid.low[2] and k < solid.high[2] and j >= solid.low[1] and j < solid.high[1]:
+            for i in range(wp.max(first, solid.low[0]), wp.min(end, solid.high[0])):
+                node = wp.vec3i(i, j, k)
+                p = node_position(block, node, block.offset)
+                d = shape_distance(p, shapes[solid.first])
+                for part in range(solid.first + 1, solid.end):
+                    d = wp.min(d, shape_distance(p, shapes[part]))
+                enter(node, snapped(d, block.spacing, snap), solid.number, nodes)
 
 
 @wp.kernel(**options)

@@ -159,17 +159,17 @@ class _Shape(ABC):
 
     def _measure(self, kernel: Any, points: wp.array, out: wp.array) -> None:
         placement, frame, device = self.placement, ShapeFrame(), points.device
-        translation = placement.translation + placement.scale * placement.rotation @ self._origin()
+        translation = placement.translation + placement.scale * placement.rotation @ self.origin()
         frame.inverse_rotation, frame.translation = wp.mat33(placement.rotation.T), wp.vec3(*translation)
-        frame.scale, frame.sign = placement.scale * self._unit(), -1.0 if self.invert else 1.0
-        inputs = [points, frame, *self._parameters(device), out]
+        frame.scale, frame.sign = placement.scale * self.unit_length(), -1.0 if self.invert else 1.0
+        inputs = [points, frame, *self.parameters(device), out]
         launch_list(kernel, points.shape[0], inputs, device=device, cost=self.cost)
 
     def bounds(self) -> np.ndarray | None:
         """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""
         if self.invert:
             return None
-        corners, margin = self._hull()
+        corners, margin = self.hull()
         if not len(corners):
             return None
         placed = self.placement.apply(corners)
@@ -180,20 +180,20 @@ class _Shape(ABC):
         """Return the shape after a change of place [m]; the surface of a mesh, and what is on the device of it, is shared."""
         return replace(self, placement=self.placement.moved(pose))
 
-    def _origin(self) -> np.ndarray:
+    def origin(self) -> np.ndarray:
         """Return the point, in the shape's coordinates, from which its kernel counts."""
         return np.zeros(3)
 
-    def _unit(self) -> float:
+    def unit_length(self) -> float:
         """Return the length, in the shape's coordinates, that its kernel counts as 1."""
         return 1.0
 
     @abstractmethod
-    def _parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[Any]:
         """Return the kernel's arguments after the placement."""
 
     @abstractmethod
-    def _hull(self) -> tuple[np.ndarray, float]:
+    def hull(self) -> tuple[np.ndarray, float]:
         """Return points, shape (m, 3), and a margin around them that cover the shape; no points when nothing does."""
 
 
@@ -226,14 +226,16 @@ class Box(_Shape):
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
 
-    def _origin(self) -> np.ndarray:
+    def origin(self) -> np.ndarray:
+        """Return the point, in the shape's own coordinates, from which its kernel counts."""
         return 0.5 * (in_space(self.lower) + in_space(self.upper))
 
     def _half(self) -> np.ndarray:
         half = 0.5 * (np.asarray(self.upper) - np.asarray(self.lower))
         return np.array([*half, np.inf][:3])
 
-    def _parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[Any]:
+        """Return the kernel's arguments after the placement."""
         return [wp.vec3(*self._half())]
 
     def bounds(self) -> np.ndarray | None:
@@ -246,10 +248,11 @@ class Box(_Shape):
             result[:, 2] = -np.inf, np.inf
         return result
 
-    def _hull(self) -> tuple[np.ndarray, float]:
+    def hull(self) -> tuple[np.ndarray, float]:
+        """Return points, shape (m, 3), and a margin around them that cover the shape."""
         half = np.where(np.isfinite(self._half()), self._half(), 0.0)
         signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
-        return self._origin() + signs * half, 0.0
+        return self.origin() + signs * half, 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,14 +279,17 @@ class Sphere(_Shape):
         object.__setattr__(self, "center", checked_vector("center", self.center))
         object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
-    def _origin(self) -> np.ndarray:
+    def origin(self) -> np.ndarray:
+        """Return the point, in the shape's own coordinates, from which its kernel counts."""
         return in_space(self.center)
 
-    def _parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[Any]:
+        """Return the kernel's arguments after the placement."""
         return [self.radius]
 
-    def _hull(self) -> tuple[np.ndarray, float]:
-        return self._origin()[None], self.radius
+    def hull(self) -> tuple[np.ndarray, float]:
+        """Return points, shape (m, 3), and a margin around them that cover the shape."""
+        return self.origin()[None], self.radius
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,13 +324,16 @@ class Capsule(_Shape):
         object.__setattr__(self, "end", end)
         object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
-    def _origin(self) -> np.ndarray:
+    def origin(self) -> np.ndarray:
+        """Return the point, in the shape's own coordinates, from which its kernel counts."""
         return in_space(self.start)
 
-    def _parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[Any]:
+        """Return the kernel's arguments after the placement."""
         return [wp.vec3(*(in_space(self.end) - in_space(self.start))), self.radius]
 
-    def _hull(self) -> tuple[np.ndarray, float]:
+    def hull(self) -> tuple[np.ndarray, float]:
+        """Return points, shape (m, 3), and a margin around them that cover the shape."""
         return np.stack([in_space(self.start), in_space(self.end)]), self.radius
 
 
@@ -355,13 +364,16 @@ class Plane(_Shape):
         object.__setattr__(self, "point", point)
         object.__setattr__(self, "normal", unit("a plane's normal", normal))
 
-    def _origin(self) -> np.ndarray:
+    def origin(self) -> np.ndarray:
+        """Return the point, in the shape's own coordinates, from which its kernel counts."""
         return in_space(self.point)
 
-    def _parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[Any]:
+        """Return the kernel's arguments after the placement."""
         return [wp.vec3(*in_space(self.normal))]
 
-    def _hull(self) -> tuple[np.ndarray, float]:
+    def hull(self) -> tuple[np.ndarray, float]:
+        """Return points, shape (m, 3), and a margin around them that cover the shape."""
         return np.empty((0, 3)), 0.0
 
 
@@ -422,16 +434,20 @@ class TriangleMesh(_Shape):
         """
         return self.surface.thin_fraction(thickness / self.placement.scale, device)
 
-    def _origin(self) -> np.ndarray:
+    def origin(self) -> np.ndarray:
+        """Return the point, in the shape's own coordinates, from which its kernel counts."""
         return self.surface.center
 
-    def _unit(self) -> float:
+    def unit_length(self) -> float:
+        """Return the length, in the shape's own coordinates, that its kernel counts as 1."""
         return self.surface.size
 
-    def _parameters(self, device: wp.Device) -> list[Any]:
+    def parameters(self, device: wp.Device) -> list[Any]:
+        """Return the kernel's arguments after the placement."""
         return [self.surface.on_device(device).id]
 
-    def _hull(self) -> tuple[np.ndarray, float]:
+    def hull(self) -> tuple[np.ndarray, float]:
+        """Return points, shape (m, 3), and a margin around them that cover the shape."""
         return self.surface.vertices, 0.0
 
 

@@ -28,30 +28,53 @@ def to_shape(p: wp.vec3, frame: ShapeFrame) -> wp.vec3:
     return frame.inverse_rotation * (p - frame.translation) / frame.scale
 
 
-@list_kernel(MODULE)
-def box_distance(i, points: Points, frame: ShapeFrame, half: wp.vec3, out: Distances):
-    """Measure a box of half extents `half` (infinite in z in 2-D) about the origin."""
-    q = to_shape(points[i], frame)
+@wp.func
+def to_box(p: wp.vec3, frame: ShapeFrame, half: wp.vec3) -> float:
+    """Return the distance of a box of half extents `half` (infinite in z in 2-D) about the origin."""
+    q = to_shape(p, frame)
     x = wp.abs(q[0]) - half[0]
     y = wp.abs(q[1]) - half[1]
     z = wp.abs(q[2]) - half[2]
     outside = wp.length(wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(z, 0.0)))
-    out[i] = frame.sign * frame.scale * (outside + wp.min(wp.max(x, wp.max(y, z)), 0.0))
+    return frame.sign * frame.scale * (outside + wp.min(wp.max(x, wp.max(y, z)), 0.0))
+
+
+@wp.func
+def to_sphere(p: wp.vec3, frame: ShapeFrame, radius: float) -> float:
+    """Return the distance of a sphere about the origin."""
+    return frame.sign * frame.scale * (wp.length(to_shape(p, frame)) - radius)
+
+
+@wp.func
+def to_capsule(p: wp.vec3, frame: ShapeFrame, axis: wp.vec3, radius: float) -> float:
+    """Return the distance of all within `radius` of the segment from the origin along `axis`."""
+    q = to_shape(p, frame)
+    along = wp.clamp(wp.dot(q, axis) / wp.dot(axis, axis), 0.0, 1.0)
+    return frame.sign * frame.scale * (wp.length(q - along * axis) - radius)
+
+
+@wp.func
+def to_plane(p: wp.vec3, frame: ShapeFrame, normal: wp.vec3) -> float:
+    """Return the distance of the half-space below the plane through the origin with a unit `normal`."""
+    return frame.sign * frame.scale * wp.dot(to_shape(p, frame), normal)
+
+
+@list_kernel(MODULE)
+def box_distance(i, points: Points, frame: ShapeFrame, half: wp.vec3, out: Distances):
+    """Measure a box."""
+    out[i] = to_box(points[i], frame, half)
 
 
 @list_kernel(MODULE)
 def sphere_distance(i, points: Points, frame: ShapeFrame, radius: float, out: Distances):
-    """Measure a sphere about the origin."""
-    q = to_shape(points[i], frame)
-    out[i] = frame.sign * frame.scale * (wp.length(q) - radius)
+    """Measure a sphere."""
+    out[i] = to_sphere(points[i], frame, radius)
 
 
 @list_kernel(MODULE)
 def capsule_distance(i, points: Points, frame: ShapeFrame, axis: wp.vec3, radius: float, out: Distances):
-    """Measure all within `radius` of the segment from the origin along `axis`."""
-    q = to_shape(points[i], frame)
-    along = wp.clamp(wp.dot(q, axis) / wp.dot(axis, axis), 0.0, 1.0)
-    out[i] = frame.sign * frame.scale * (wp.length(q - along * axis) - radius)
+    """Measure a capsule."""
+    out[i] = to_capsule(points[i], frame, axis, radius)
 
 
 @list_kernel(MODULE)
@@ -62,9 +85,8 @@ def least_distance(i, other: Distances, out: Distances):
 
 @list_kernel(MODULE)
 def plane_distance(i, points: Points, frame: ShapeFrame, normal: wp.vec3, out: Distances):
-    """Measure the half-space below the plane through the origin with a unit `normal`."""
-    q = to_shape(points[i], frame)
-    out[i] = frame.sign * frame.scale * wp.dot(q, normal)
+    """Measure a half-space."""
+    out[i] = to_plane(points[i], frame, normal)
 
 
 @list_kernel(MODULE)

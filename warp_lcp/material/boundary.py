@@ -15,7 +15,7 @@ import warp as wp
 from warp_lcp.grid.advection import MARGIN, advect, advect_with_distance, clearance, push_out
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.level_set import whole_cell_capacity
-from warp_lcp.grid.motion import kinks, top_speed
+from warp_lcp.grid.motion import kinks
 from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -243,8 +243,8 @@ class CutBoundary:
         self._counts, self._dt = Reading(grid.device, 3, wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
-        self._moving = [(solid.motion, solid.geometry.bounds()) for solid in cut.solids if solid.motion is not None]
-        self.kinks = tuple(time for motion, _ in self._moving for time in kinks(motion))
+        self._motions, self._bounds = cut.motions, [solid.geometry.bounds() for solid in cut.solids if solid.motion is not None]
+        self.kinks = tuple(time for motion in self._motions.motions for time in kinks(motion))
         self._find_walls()
         self._join_sides()
 
@@ -255,7 +255,7 @@ class CutBoundary:
         """
         size = self.grid.extent
         size[self.grid.dimension :] = 0.0
-        return max((top_speed(motion, bounds, size, time, span) for motion, bounds in self._moving), default=0.0)
+        return self._motions.top_speed(self._bounds, size, time, span)
 
     def begin_step(self, time: float, dt: float) -> None:
         """Compute the velocity of the solids from `time` on [s]."""
@@ -356,6 +356,5 @@ class CutBoundary:
         return float(np.abs(lines[1] - lines[-1]).max())
 
     def _find_walls(self) -> None:
-        self.touch.zero_()
-        for axis, wall in enumerate(self.cut.wall):
-            self.grid.domain.launch(kernels.touch_cut_kernel, [axis, wall, self.cut.separating, self.touch])
+        walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third
+        self.grid.domain.launch(kernels.touch_cut_kernel, [self.grid.planes, *walls, self.cut.separating, self.touch])

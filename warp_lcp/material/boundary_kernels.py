@@ -49,13 +49,20 @@ def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), plan
 
 
 @cell_kernel("warp_lcp.material.boundary")
-def touch_cut_kernel(k, j, i, axis: int, wall: I16, separating: wp.array(dtype=wp.uint8), touch: U8):
-    """Add the walls on the two faces of each cell along an axis; -1 is a face that is open."""
-    found = int(touch[k, j, i])
+def touch_cut_kernel(k, j, i, planes: int, wx: I16, wy: I16, wz: I16, separating: wp.array(dtype=wp.uint8), touch: U8):
+    """Find the walls on the faces of each cell; -1 is a face that is open."""
+    found = int(0)
     for side in range(2):
-        owner = int(wall[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)])
-        if owner >= 0:
-            found = found | touch_of(separating[owner])
+        x = int(wx[k, j, i + side])
+        if x >= 0:
+            found = found | touch_of(separating[x])
+        y = int(wy[k, j + side, i])
+        if y >= 0:
+            found = found | touch_of(separating[y])
+        if planes == 2:
+            z = int(wz[k + side, j, i])
+            if z >= 0:
+                found = found | touch_of(separating[z])
     touch[k, j, i] = wp.uint8(found)
 
 

@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_newton import ContactNewton
@@ -97,8 +95,9 @@ class ContactProblem:
     def islands(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the contacts sorted by islands of touching bodies, and island starts."""
         pairs = self.second < self.bodies
-        links = coo_array((np.ones(int(pairs.sum())), (self.first[pairs], self.second[pairs])), shape=(self.bodies, self.bodies))
-        group = connected_components(links, directed=False)[1][self.first] if pairs.any() else self.first
+        group = self.first
+        if pairs.any():
+            group = _components(self.first[pairs].tolist(), self.second[pairs].tolist(), self.bodies)[group]
         order = np.argsort(group, kind="stable")
         starts = np.flatnonzero(np.diff(group[order], prepend=-1))
         return order, np.append(starts, len(order))
@@ -130,20 +129,17 @@ class ContactProblem:
         k, rows, q = self.one.shape
         order, starts = self.islands()
         diagonal, yields = (values.reshape(k, rows)[order] for values in self.yields())
-        x = np.zeros(k * rows) if start is None else start[order].ravel()
-        residual, rounds, J = (
-            np.zeros(len(starts) - 1),
-            np.zeros(len(starts) - 1),
-            np.concatenate([self.one[order], self.other[order]], axis=2),
-        )
-        w = np.zeros((self.bodies + 1) * q)
-        fields = {"J": J, "b": self.b[order], "e": yields, "d": diagonal, "mu": self.friction[order], "w": w, "x": x, "residual": residual}
-        fields["rounds"] = rounds
-        given = {name: _real(field) for name, field in fields.items()} | {name: _real(np.zeros(k * rows)) for name in ("g", "way", "best")}
-        given |= {"one": _index(self.first[order]), "other": _index(self.second[order]), "starts": _index(starts)}
+        J = np.concatenate([self.one[order], self.other[order]], axis=2)
+        x = np.zeros((k, rows)) if start is None else start[order]
+        fields = (x, J, self.b[order], yields, diagonal, self.friction[order])
+        size, work = k * rows, 3 * k * rows + (self.bodies + 1) * q
+        reals = np.concatenate([*(np.ravel(field) for field in fields), np.zeros(work)])
+        indices = np.concatenate([self.first[order], self.second[order], starts]).astype(np.int32)
+        residual, rounds = np.zeros((2, len(starts) - 1))
         islands = Rows.entries(len(residual), wp.get_device("cpu"))
-        NNCG.bind(islands, q=q, dim=rows, rtol=stopping.rtol, most=stopping.max_iterations, **given).launch()
-        x = x.reshape(k, rows)
+        given = {"reals": _warp(reals), "indices": _warp(indices), "residual": _warp(residual), "rounds": _warp(rounds)}
+        NNCG.bind(islands, q=q, dim=rows, contacts=k, rtol=stopping.rtol, most=stopping.max_iterations, **given).launch()
+        x = reals[:size].reshape(k, rows)
         for island in np.flatnonzero(residual > unsolved):
             mine = slice(starts[island], starts[island + 1])
             x[mine], residual[island], more = self.part(order[mine])._go_on(stopping.rtol, x[mine])
@@ -170,10 +166,25 @@ class ContactProblem:
         return ContactImpulses(newton.x.reshape(x.shape), newton.residual, newton.steps + sweeps)
 
 
-def _real(values: np.ndarray) -> wp.array[Any]:
-    """Return float64 values as Warp sees them, in the same memory."""
-    return wp.array(np.ascontiguousarray(values).ravel(), dtype=wp.float64, device="cpu", copy=False)
+def _components(first: list[int], second: list[int], bodies: int) -> np.ndarray:
+    """Return for each body the least one that links to it through pairs of bodies, shape (bodies,)."""
+    least = list(range(bodies))
+    for pair in zip(first, second, strict=True):
+        low, high = sorted(_root(least, body) for body in pair)
+        least[high] = low
+    return np.array([_root(least, body) for body in range(bodies)])
 
 
-def _index(values: np.ndarray) -> wp.array[Any]:
-    return wp.array(values.astype(np.int32), dtype=wp.int32, device="cpu", copy=False)
+def _root(least: list[int], body: int) -> int:
+    """Follow links to smaller bodies to their end, and shorten them."""
+    end = body
+    while least[end] != end:
+        end = least[end]
+    while least[body] != end:
+        least[body], body = end, least[body]
+    return end
+
+
+def _warp(values: np.ndarray) -> wp.array[Any]:
+    """Return contiguous values as Warp sees them, in the same memory."""
+    return wp.array(values, dtype=wp.float64 if values.dtype == np.float64 else wp.int32, device="cpu", copy=False)

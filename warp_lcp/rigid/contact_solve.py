@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rigid.body import AXES, PLANAR, BodyStates, in_space, rotation_by
+from warp_lcp.rigid.body import AXES, PLANAR, BodyStates, cross, in_space, rotation_by
 from warp_lcp.rigid.contact_detection import NONE, ContactDetection, FoundContacts, Place, between
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, JointPart
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
@@ -73,6 +73,7 @@ class ContactSolve:
         self._size = np.array([shape.size for shape in shapes])
         self._friction = np.array([body.friction for body in bodies])
         self._bounce = np.array([body.restitution for body in bodies])
+        self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # and the rotations that they are of
         self._roots_of_inertias = np.linalg.cholesky(bodies.inverse_inertia)
 
     def check_start(self, time: float) -> None:
@@ -194,7 +195,7 @@ class ContactSolve:
             nearest = int(np.linalg.norm(found.point - point, axis=1).argmin())
             point, normal = found.point[nearest], found.normal[nearest]
         arms = point - at
-        speeds = six[:, :3] + np.cross(six[:, 3:], arms)
+        speeds = six[:, :3] + cross(six[:, 3:], arms)
         frames = contact_frames(normal[None], self.dimension, ((speeds[:1] - speeds[1:], 0.0),))
         contacts.frames[k], contacts.one[k] = frames[0], _rows(arms[:1], frames, self.dimension)[0]
         contacts.other[k] = -_rows(arms[1:], frames, self.dimension)[0]
@@ -352,18 +353,13 @@ class ContactSolve:
         """Return the problem of the first rows of each contact, as many as b has, shape (k, rows)."""
         one, other = (rows[:, : b.shape[1]] for rows in (contacts.one, contacts.other))
         first, second = contacts.first, contacts.second
-        roots = self._roots_or_none()
+        roots = self._all_roots()[1]
         return ContactProblem(first, second, one @ roots[first], other @ roots[second], b, friction, len(self.bodies))
 
     def _weighted(self, rows: JointRows) -> JointRows:
         """Return joints' rows as those of a problem."""
-        roots = self._roots_or_none()
+        roots = self._all_roots()[1]
         return replace(rows, one=rows.one @ roots[rows.first], other=rows.other @ roots[rows.second])
-
-    def _roots_or_none(self) -> np.ndarray:
-        """Return `_roots`, and 0 in the place of what is no body, shape (n + 1, q, q)."""
-        roots = self._roots()
-        return np.concatenate([roots, np.zeros((1, *roots.shape[1:]))])
 
     def _apart(self, found: FoundContacts) -> FoundContacts:
         """Return the contacts of pairs that no joint holds together."""
@@ -381,10 +377,13 @@ class ContactSolve:
         for number, obstacle in enumerate(self.detection.obstacles):
             if obstacle.motion is not None and (here := found.obstacle == number).any():
                 moved[here] = _carried(obstacle.motion, point[here], time, dt)
-        six, at = (np.pad(values, ((0, 1), (0, 0))) for values in (self.bodies.velocities(), self.bodies.position))
+        at = np.concatenate([self.bodies.position, np.zeros((1, 3))])
         mine, others = point - at[first], point - at[second]
-        slip = six[first, :3] + np.cross(six[first, 3:], mine) - six[second, :3] - np.cross(six[second, 3:], others) - moved
-        ways = () if gravity is None else ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, ALONG_SLIP * falls))
+        ways: tuple[tuple[np.ndarray, float], ...] = ()
+        if gravity is not None and dim == 3:  # there is one tangent in a plane
+            six = np.concatenate([self.bodies.velocities(), np.zeros((1, 6))])
+            slip = six[first, :3] + cross(six[first, 3:], mine) - six[second, :3] - cross(six[second, 3:], others) - moved
+            ways = ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, ALONG_SLIP * falls))
         frames = contact_frames(normal, dim, ways)
         one, other = _rows(mine, frames, dim), -_rows(others, frames, dim)
         standing = second == n
@@ -409,10 +408,18 @@ class ContactSolve:
 
     def _roots(self) -> np.ndarray:
         """Return G with G G' the inverse mass of each body, shape (n, q, q)."""
-        roots = np.zeros((len(self.bodies), 6, 6))
-        roots[:, AXES, AXES] = 1.0 / np.sqrt(self.bodies.mass)[:, None]
-        roots[:, 3:, 3:] = self.bodies.rotation @ self._roots_of_inertias
-        return roots if self.dimension == 3 else roots[:, PLANAR][:, :, PLANAR]
+        return self._all_roots()[0]
+
+    def _all_roots(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return `_roots`, and these with 0 in the place of what is no body, shape (n + 1, q, q)."""
+        rotation = self.bodies.rotation
+        if self._found_roots is None or not np.array_equal(self._found_roots[0], rotation):
+            roots = np.zeros((len(self.bodies), 6, 6))
+            roots[:, AXES, AXES] = 1.0 / np.sqrt(self.bodies.mass)[:, None]
+            roots[:, 3:, 3:] = rotation @ self._roots_of_inertias
+            roots = roots if self.dimension == 3 else roots[:, PLANAR][:, :, PLANAR]
+            self._found_roots = rotation.copy(), roots, np.concatenate([roots, np.zeros((1, *roots.shape[1:]))])
+        return self._found_roots[1:]
 
     def _velocities(self) -> np.ndarray:
         six = self.bodies.velocities()
@@ -421,7 +428,7 @@ class ContactSolve:
 
 def _rows(arms: np.ndarray, frames: np.ndarray, dimension: int) -> np.ndarray:
     """Return the velocities along frames of points `arms` from a body's center, of its velocities, shape (k, dimension, q)."""
-    both = np.concatenate([frames, np.cross(arms[:, None], frames)], axis=2)
+    both = np.concatenate([frames, cross(arms[:, None], frames)], axis=2)
     return both if dimension == 3 else both[:, :, PLANAR]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
 
-from warp_lcp.rigid.body import BodyStates
+from warp_lcp.rigid.body import BodyStates, cross
 
 SAME_PLACE = 0.05  # of a body's size: a contact this close to one of the last step starts from its impulse
 KEPT = 32  # contacts remembered for each body, at most
@@ -163,9 +163,9 @@ def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.n
     """
     if dimension == 2:
         return np.stack([normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1)
-    u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    u = cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     for way, least in ways:
         along = way - (way * normal).sum(axis=1)[:, None] * normal
         u = np.where((np.linalg.norm(along, axis=1) > least)[:, None], along, u)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return np.stack([normal, u, np.cross(normal, u)], axis=1)
+    return np.stack([normal, u, cross(normal, u)], axis=1)

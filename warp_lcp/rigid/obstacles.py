@@ -12,6 +12,8 @@ from warp_lcp.grid.solids import Box, Plane
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rigid.contact_shape import ContactShape
 
+PLACED = Pose.identity()  # of what stands where the scene places it
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Obstacle:
@@ -33,7 +35,7 @@ class Obstacle:
 
     def pose(self, time: float) -> Pose:
         """Return the pose at a time [s]."""
-        return Pose.identity() if self.motion is None else self.motion.pose(time)
+        return PLACED if self.motion is None else self.motion.pose(time)
 
 
 def domain_walls(size: Sequence[float], *, open_sides: int = 0, endless: Sequence[int] = ()) -> Obstacle:

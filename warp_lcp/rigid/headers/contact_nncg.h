@@ -1,17 +1,22 @@
 // Kernel of contacts between rigid bodies.
 
 // kernel warp_lcp.rigid.contacts.nncg: Solve the islands first <= t < last, whose contacts follow
-// each other, by nonlinear conjugate gradients on projected sweeps. J: rows, 2 q entries each, for
-// the first and the second body of the row's contact; w = J' x, q entries a body. `residual` and
-// `rounds` are of each island: relative to the residual of x = 0, and iterations taken. EACH
-// iterations lie between looks at the residual, which costs as much as a sweep.
+// each other, by nonlinear conjugate gradients on projected sweeps. `reals` holds x, J, b, e, d, mu,
+// then room for g, way, best and w. J: rows, 2 q entries each, for the first and the second body of
+// the row's contact; w = J' x, q entries a body. `indices` holds a contact's bodies, and an island's
+// first contact. `residual` and `rounds` are of each island: relative to the residual of x = 0, and
+// iterations taken. EACH iterations lie between looks at the residual, which costs as much as a
+// sweep.
 //   compute    float64
-//   whole      float64 J, b, e, d, mu, w, g, way, best, x; int32 one, other, starts
+//   whole      float64 reals; int32 indices
 //   box        float64 residual, rounds
-//   numbers    int q, dim; float64 rtol; int most
+//   numbers    int q, dim, contacts; float64 rtol; int most
 //   constants  EACH = 8
 EXACT_MATH
-const int m = 2*q;
+const int m = 2*q, size = dim*contacts;
+double *x = reals, *J = x + size, *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
+double *g = mu + contacts, *way = g + size, *best = way + size, *w = best + size;
+const int *one = indices, *other = one + contacts, *starts = other + contacts;
 for (int t = first; t < last; ++t) {
     const int low = dim*starts[t], high = dim*starts[t + 1];
     auto velocity = [&](int i) {
@@ -41,13 +46,13 @@ for (int t = first; t < last; ++t) {
         for (int i = low; i < high; ++i) { const double r = d[i]*(x[i] - clipped(i, x[i] - velocity(i)/d[i])); s += r*r; }
         return sqrt(s);
     };
-    double reference = 0.0, size = 0.0;
+    double reference = 0.0, squares = 0.0;
     for (int i = low; i < high; ++i) {
-        size += b[i]*b[i];
+        squares += b[i]*b[i];
         if (i % dim == 0 && b[i] < 0.0) reference += b[i]*b[i];
     }
     reference = sqrt(reference);
-    if (reference <= 1e-15*sqrt(size)) {
+    if (reference <= 1e-15*sqrt(squares)) {
         for (int i = low; i < high; ++i) x[i] = 0.0;
         residual[t] = 0.0;
         rounds[t] = 0.0;

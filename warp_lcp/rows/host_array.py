@@ -1,0 +1,32 @@
+"""Arrays that the host fills and kernels read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+
+class HostArray:
+    """An array filled by the host and read by kernels: one memory on the CPU, two on a GPU.
+
+    Args:
+        count: elements.
+        dtype: of them, a Warp type or struct.
+        device: where kernels read them.
+
+    Attributes:
+        host: NumPy array to write to.
+        array: what kernels take, up to date after `send`.
+    """
+
+    def __init__(self, count: int, dtype: Any, device: wp.Device) -> None:
+        self.array: wp.array[Any] = wp.zeros(count, dtype=dtype, device=device)
+        self._shared = wp.get_device(device).is_cpu
+        self.host: Any = self.array.numpy() if self._shared else np.zeros_like(self.array.numpy())
+
+    def send(self) -> None:
+        """Bring `array` up to date."""
+        if not self._shared:
+            self.array.assign(self.host)
