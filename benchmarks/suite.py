@@ -130,6 +130,12 @@ PEERS = Suite(
     "10 minutes; peers: OSQP, PIQP, Clarabel; PETSc, AMGCL by themselves",
 )
 RUN = Suite("run", "steps per second of built-in scenes, and the cost of particles", "2 minutes")
+HOST = Suite(
+    "host",
+    "host time of a step by stage, beside its native calls alone; native calls, launches, host reads and allocations of each",
+    "2 minutes",
+    scenes=True,
+)
 SAND = Suite("sand", "sand: the coupled methods at equal residual, the yield sets, steps of large scenes", "6 minutes")
 CONTACTS = Suite(
     "contacts", "rigid contacts: methods on the scenes of figures 2.9 and 2.11, NNCG against PGS at equal sweeps", "5 minutes", False

@@ -1,0 +1,322 @@
+"""Host time of a simulation step by stage, beside the native work in it: `python -m warp_lcp.benchmarks.host`.
+
+A step is Python that prepares operations, and native calls that execute tables of them (`warp_lcp.rows.team.Team.run`). The *floor* of a
+stage is the time of its native calls alone: each is repeated from the same memory, without Python in between, and the fastest one counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import gc
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.harness.report import markdown, write
+from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.rows.team import COUNT, RUN, UNFINISHED, Team
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.simulator import simulators
+
+TITLE = "Host time of a step by stage"
+SCENES = ("dam-break-2d", "column-collapse-2d", "floating-bodies-2d", "dam-break")
+RESOLUTION = 32  # cells along the longest side: so few that a step is mostly host time
+SKIPPED, STEPS = 30, 20  # steps before the measured ones, in which the material begins to move; steps of a round
+REPLAYS = 5  # of a native call
+OUTSIDE = "outside stages"
+CALLS, OPERATIONS = "native calls", "operations"
+LAUNCHES, COPIES, READS, ALLOCATIONS = "Warp launches", "copies and fills", "host reads", "allocations"
+# Calls by kind, and where callers look them up. Each launch by Warp loads its module first, whatever name `wp.launch` was called by.
+COUNTED: dict[str, tuple[tuple[Any, str], ...]] = {
+    LAUNCHES: ((wp.Module, "load"), (wp.Launch, "launch")),
+    COPIES: ((wp, "copy"), (wp.array, "assign"), (wp.array, "zero_"), (wp.array, "fill_")),
+    READS: ((wp.array, "numpy"),),
+    ALLOCATIONS: tuple((wp, n) for n in ("zeros", "zeros_like", "ones", "ones_like", "full", "full_like", "empty", "empty_like", "clone")),
+}
+COUNTS = (CALLS, OPERATIONS, *COUNTED)
+
+
+class StageTimer:
+    """Stopwatch of a simulation that adds up the processor's seconds of each stage, those of stages within it excluded.
+
+    Attributes:
+        seconds: by stage, in the order of their first begin; `OUTSIDE` between `begin` and `end`.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._running: list[str] = []
+        self._since = 0.0
+
+    @property
+    def current(self) -> str:
+        """The innermost stage that runs now."""
+        return self._running[-1] if self._running else OUTSIDE
+
+    @contextmanager
+    def stage(self, name: str, *arrays: wp.array | None) -> Iterator[None]:
+        """Measure a stage."""
+        self._switch()
+        self._running.append(name)
+        try:
+            yield
+        finally:
+            self._switch()
+            self._running.pop()
+
+    def beside(self, name: str) -> AbstractContextManager[None]:
+        """Measure a stage."""
+        return self.stage(name)
+
+    def wrote(self, name: str, *files: Path) -> None:
+        """Do nothing: steps write no files."""
+
+    def _switch(self) -> None:
+        now = time.process_time()
+        if self._running:
+            self.seconds[self.current] += now - self._since
+        self._since = now
+
+
+class StepRecorder:
+    """Counts the calls of steps by stage and replays their native calls, while it is entered.
+
+    Args:
+        timer: says which stage is running.
+        replays: of each native call; 0: only count.
+
+    Attributes:
+        counts: by stage, of `COUNTS`.
+        native: seconds of the native calls by stage, the fastest replay of each.
+    """
+
+    def __init__(self, timer: StageTimer, replays: int = REPLAYS) -> None:
+        self.counts: dict[str, Counter[str]] = defaultdict(Counter)
+        self.native: dict[str, float] = defaultdict(float)
+        self._timer, self._replays, self._within = timer, replays, False
+        self._arrays: list[wp.array] = []
+        self._table: Any = None  # that the team executes
+        self._patches = ExitStack()
+
+    def __enter__(self) -> StepRecorder:
+        """Begin to count."""
+        for kind, functions in COUNTED.items():
+            for owner, name in functions:
+                self._replace(owner, name, self._counted(kind, getattr(owner, name)))
+        self._replace(Team, "run", self._run(Team.run))
+        if self._replays:
+            # All arrays are kept from here on, so that none is freed that a replay writes to.
+            self._arrays = [a for a in gc.get_objects() if type(a) is wp.array]
+            self._replace(Team, "_do", self._replayed(Team._do))
+            self._replace(wp.array, "__init__", self._kept(wp.array.__init__))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """End to count."""
+        self._patches.close()
+        self._arrays = []
+
+    def _replace(self, owner: Any, name: str, function: Callable[..., Any]) -> None:
+        self._patches.enter_context(patch.object(owner, name, function))
+
+    def _counted(self, kind: str, plain: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that counts its calls, but not those that another counted function makes."""
+
+        def call(*args: Any, **options: Any) -> Any:
+            if self._within:
+                return plain(*args, **options)
+            self.counts[self._timer.current][kind] += 1
+            self._within = True
+            try:
+                return plain(*args, **options)
+            finally:
+                self._within = False
+
+        return call
+
+    def _run(self, plain: Callable[..., Any]) -> Callable[..., Any]:
+        def run(team: Team, table: Any) -> None:
+            self.counts[self._timer.current].update({CALLS: 1, OPERATIONS: int(table.words[COUNT])})
+            self._table = table
+            plain(team, table)
+
+        return run
+
+    def _kept(self, plain: Callable[..., None]) -> Callable[..., None]:
+        def init(array: wp.array, *args: Any, **options: Any) -> None:
+            plain(array, *args, **options)
+            self._arrays.append(array)
+
+        return init
+
+    def _replayed(self, plain: Callable[..., None]) -> Callable[..., None]:
+        """Return the native call, which is then repeated from the memory that it began with: the last one leaves what the first did."""
+
+        def do(team: Team, asked: Any) -> None:
+            if asked.mode != RUN:
+                return plain(team, asked)
+            before = [(begin, ctypes.string_at(begin, end - begin)) for begin, end in self._memory()]
+            seconds = [self._timed(plain, team, asked)]
+            for _ in range(self._replays if not self._table.words[UNFINISHED] else 0):
+                for begin, content in before:
+                    ctypes.memmove(begin, content, len(content))
+                seconds.append(self._timed(plain, team, asked))
+            self.native[self._timer.current] += min(seconds)
+            return None
+
+        return do
+
+    @staticmethod
+    def _timed(run: Callable[..., None], *args: Any) -> float:
+        begun = time.process_time()
+        run(*args)
+        return time.process_time() - begun
+
+    def _memory(self) -> list[tuple[int, int]]:
+        """Return where the memory of all arrays begins and ends; views own none."""
+        owners = [a for a in self._arrays if a.ptr and a.capacity and a.device.is_cpu and (a.deleter or isinstance(a._ref, np.ndarray))]
+        return sorted({(a.ptr, a.ptr + a.capacity) for a in owners if a.is_contiguous})
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Measure steps of each scene."""
+    scenes = [options.scene] if options.scene else SCENES
+    found: dict[str, list[Record]] = {}
+    for name in scenes:
+        for size in options.sizes or (RESOLUTION,):
+            options.say(f"{name}, {size} cells")
+            found[f"{name}, {size} cells"] = scene_records(name, size, options.device, STEPS, options.repeat)
+    return results(found, machine(options.device, elements=1 << 22, repeat=options.repeat))
+
+
+def scene_records(name: str, resolution: int, device: str, steps: int, rounds: int) -> list[Record]:
+    """Return records of a scene: of its whole step, and of each stage.
+
+    Args:
+        name: of a scene, or its file.
+        resolution: cells along the longest side.
+        device: of the CPU.
+        steps: of a round, whose mean is a sample.
+        rounds: samples.
+
+    Raises:
+        ValueError: the device is not the CPU, a number is not positive, or the simulation has no stages.
+    """
+    if not wp.get_device(device).is_cpu:
+        raise ValueError(f"--device {device}: the suite host measures the CPU")
+    for what, number in (("steps", steps), ("rounds", rounds)):
+        if number < 1:
+            raise ValueError(f"{what} = {number}: must be >= 1")
+    scene = load_scene(name, [f"domain.resolution={resolution}"])
+    simulation: Any = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    if not hasattr(simulation, "watch"):  # a `warp_lcp.simulation.Profiled`
+        raise ValueError(f"{name}: its simulation has no stages")
+
+    def step() -> None:
+        simulation.step(min(simulation.stable_dt(), scene.time.dt_max))
+
+    for _ in range(SKIPPED):
+        step()
+    samples: dict[str, list[float]] = defaultdict(lambda: [0.0] * rounds)
+    for turn in range(rounds):
+        simulation.watch = timer = StageTimer()
+        with timer.stage(OUTSIDE):
+            for _ in range(steps):
+                step()
+        for stage, seconds in timer.seconds.items():
+            samples[stage][turn] = 1e3 * seconds / steps
+    simulation.watch = timer = StageTimer()
+    with StepRecorder(timer, 0) as counted, timer.stage(OUTSIDE):
+        for _ in range(steps):
+            step()
+    simulation.watch = timer = StageTimer()
+    with StepRecorder(timer) as replayed, timer.stage(OUTSIDE):
+        step()
+    return _records(f"{name}, {resolution} cells", samples, counted.counts, replayed.native, steps)
+
+
+def _records(
+    label: str, samples: dict[str, list[float]], counts: dict[str, Counter[str]], native: dict[str, float], steps: int
+) -> list[Record]:
+    """Return a record of the step and one of each stage, the longest first."""
+    for stage in counts.keys() | native.keys():
+        samples[stage]  # a stage that the rounds had not
+    whole = [sum(parts) for parts in zip(*samples.values(), strict=True)]
+    records = [(label, whole, sum(counts.values(), Counter()), sum(native.values()), "step")]
+    for stage in sorted(samples, key=lambda stage: -min(samples[stage])):
+        records.append((f"{label}: {stage}", samples[stage], counts[stage], native[stage], stage))
+    return [
+        Record(
+            name,
+            {"host": Figure.least(taken, "ms"), "native": Figure(1e3 * floor, "ms")}
+            | {kind: Figure(number[kind] / steps) for kind in COUNTS},
+            {"stage": stage},
+        )
+        for name, taken, number, floor, stage in records
+    ]
+
+
+def results(found: dict[str, list[Record]], *machines: Record) -> Results:
+    """Return records, a table and a chart of each scene."""
+    remark = (
+        f"Processor's milliseconds of a step, {wl.get_threads()} thread(s): least of the rounds, in which stages do not overlap. "
+        f"Native: the native calls of one step alone, least of {REPLAYS + 1} each. The rest: means of a step."
+    )
+    records = [*machines, *(record for of_scene in found.values() for record in of_scene)]
+    tables = [Table(label, ["stage", "host [ms]", "share [%]", "native [ms]", *COUNTS], _rows(own), remark) for label, own in found.items()]
+    bars = {own.name: own.figures["host"].value for of_scene in found.values() for own in of_scene[1:]}
+    return Results(records, tables, [Bars("stages", "Host time of a step by stage", "ms", bars)])
+
+
+def _rows(records: Sequence[Record]) -> list[list[str]]:
+    whole = records[0].figures["host"].value
+    rows = []
+    for r in records:
+        host, native = r.figures["host"].value, r.figures["native"].value
+        counts = [f"{r.figures[kind].value:.4g}" for kind in COUNTS]
+        rows.append([str(r.facts["stage"]), f"{host:.3f}", f"{100 * host / whole:.1f}", f"{native:.3f}", *counts])
+    return rows
+
+
+def main() -> None:
+    """Print a table of each scene, and write files if asked."""
+    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.host", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--scene", action="append", help=f"name or file; may be repeated; default: {', '.join(SCENES)}")
+    parser.add_argument("--resolution", type=int, default=RESOLUTION, help="cells along the longest side")
+    parser.add_argument("--steps", type=int, default=STEPS, help="of a round")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="folder of host.json, host.md and host-stages.png")
+    given = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    found = {}
+    try:
+        wl.set_threads(given.threads)
+        for name in given.scene or SCENES:
+            label = f"{name}, {given.resolution} cells"
+            found[label] = scene_records(name, given.resolution, "cpu", given.steps, given.rounds)
+            for line in [f"## {label}", "", *markdown(results({label: found[label]}).tables[0]), ""]:
+                sys.stdout.write(f"{line}\n")
+            sys.stdout.flush()
+    except ValueError as error:
+        parser.error(str(error))
+    if given.out:
+        given.out.mkdir(parents=True, exist_ok=True)
+        for line in write("host", TITLE, results(found, machine("cpu", elements=1 << 22)), given.out):
+            sys.stdout.write(f"{line}\n")
+
+
+if __name__ == "__main__":
+    main()
