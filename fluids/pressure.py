@@ -30,8 +30,7 @@ from warp_lcp.rows.vectors import convert
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
 THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
-F32, F64, I8, U8 = wp.float32, wp.float64, wp.int8, wp.uint8
-FACES = {f"{what}_{axis}": F32 for what in ("open", "solid") for axis in "xyz"}
+FACES = tuple(f"{what}_{axis}" for what in ("open", "solid") for axis in "xyz")
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h", CONSTANTS)
 COUNT = KERNELS["fluids.pressure.count_fluid"]
 

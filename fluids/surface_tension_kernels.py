@@ -22,7 +22,6 @@ NEAR = wp.constant(2.0)  # cells from the surface, beyond which parallel surface
 BAND = 0.02  # cells whose share is nearer to 0 or 1 are too far from the surface to matter
 HALF = 0.3  # the part of the shares on either side of the surface that its area is found from
 FARTHEST = 1.5  # cells from one beside the surface to the smooth surface
-PROFILE = {"planes": int, "linear": wp.float32, "cubic": wp.float32}  # of the distance that a smooth share means
 KERNELS = KernelFile(
     Path(__file__).parent / "headers/surface_tension.h",
     CONSTANTS | {"BAND": BAND, "FARTHEST": FARTHEST, "THETA_MIN": THETA_MIN, "HALF": HALF},

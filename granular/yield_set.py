@@ -36,7 +36,7 @@ CONSTANTS = {
     "GAIN": GAIN, "HALFWAY": HALFWAY,
 }  # fmt: skip
 
-F32, F64, U8, I32 = wp.float32, wp.float64, wp.uint8, wp.int32
+F64, U8, I32 = wp.float64, wp.uint8, wp.int32
 
 
 def xyz(**fields: Any) -> dict[str, Any]:

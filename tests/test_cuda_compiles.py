@@ -272,6 +272,7 @@ def modules_of_every_kernel(reals):
 
 def kernels_not_taken():
     """Return the kernels of headers that nothing of the above has made a pass of."""
+    interleaved_passes(2)  # which a CPU alone runs
     taken = {(made.header.resolve(), made.declared) for made in gc.get_objects() if isinstance(made, RowPass) and made.declared}
     return [f"{path}:{section.line}" for path in {header for header, _ in taken} for section in sections(path).values()
             if section.kind == "kernel" and (path, section.name) not in taken]  # fmt: skip

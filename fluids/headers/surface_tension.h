@@ -1,4 +1,5 @@
-// Kernels of surface tension.
+// Kernels of surface tension. linear, cubic: coefficients of the distance that a smooth share
+// means.
 
 // snippet smooth_share: The smooth share of liquid, 2 once - twice, and the distance to its
 // surface [cells], > 0 outside, that it means on a plane: with it central differences are those of

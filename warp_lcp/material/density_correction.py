@@ -27,13 +27,11 @@ from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.rows.vectors import convert
 from warp_lcp.settings import renamed_names
 
-F32, F64 = wp.float32, wp.float64
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
     "LEAST_DENSITY": 0.5,  # that displacements are divided by: thin spray need not carry off what a full cell has too much
     "LEAST_CAPACITY": 0.1,  # that densities are divided by there
     "HALF": 0.5,  # of what a cell holds: with less it is at the surface
 }
-FILLED = {"density": F32, "capacity": F32}
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/density_correction.h", CONSTANTS)

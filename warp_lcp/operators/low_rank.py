@@ -27,7 +27,6 @@ def weigh_kernel(weights: wp.array2d(dtype=wp.float64), c: wp.array(dtype=wp.flo
     out[i] = s
 
 
-ENTRIES = {"entry_rows": wp.int32, "blocks": wp.int32, "values": "V", "count": wp.int32}
 KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
 GATHER = KERNELS["low_rank.gather"]
 SCATTER = KERNELS["low_rank.scatter"]

@@ -39,7 +39,6 @@ def color_kernel(ptr: INDICES, col: INDICES, taken: INDICES, color: INDICES, n: 
         color[i] = c
 
 
-ROWS = {"ptr": wp.int32, "col": wp.int32}  # of a matrix: where each begins, columns of the entries
 KERNELS = KernelFile(Path(__file__).parent / "headers/sparse.h")
 PRODUCT = KERNELS["sparse.product"]
 RELAX = KERNELS["sparse.relax"]

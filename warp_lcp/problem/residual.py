@@ -24,7 +24,6 @@ from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Sums
 
 EPS = float(np.finfo(np.float64).eps)
-f64 = wp.float64
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
 NATURAL = KERNELS["residual.natural"]
 UNKNOWN_SQUARE = KERNELS["residual.unknown_square"]

@@ -26,8 +26,6 @@ from warp_lcp.rows.vectors import Sums, convert
 LEAST_Q = 1e-6  # of q where it divides: measured; less makes D needlessly large, more slows convergence
 
 f64 = wp.float64
-NUMBERS = {"share": f64, "over": f64, "kinks": f64, "seed": wp.int64}
-FORM = {"NATURAL": 0, "UPPER": 0, "PENALIZED": 0, "RANDOM": 0, "FUSED": 0}  # what of the maps a problem needs: the rest is not computed
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/nonsmooth_map.h")

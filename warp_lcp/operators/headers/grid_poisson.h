@@ -1,4 +1,5 @@
-// Kernels of the Poisson matrix of a grid.
+// Kernels of the Poisson matrix of a grid. FIELD_X, FIELD_Y, FIELD_Z: which coefficients are
+// fields.
 
 // snippet coefficients: Coefficients of lower faces: fields or numbers.
 const auto face_x = [&](long long k) -> T { if constexpr (FIELD_X) return fx[k]; else return nx; };

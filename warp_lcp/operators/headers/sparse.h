@@ -1,4 +1,5 @@
-// Kernels of sparse matrices in compressed rows.
+// Kernels of sparse matrices in compressed rows. ptr: where each row begins, col: columns of the
+// entries.
 
 // kernel sparse.product: y = A x, or A x + plus
 //   compute    S

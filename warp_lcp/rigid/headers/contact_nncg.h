@@ -1,4 +1,5 @@
-// Kernel of contacts between rigid bodies.
+// Kernel of contacts between rigid bodies. one, other: a contact's bodies; starts: an island's
+// first contact.
 
 // kernel warp_lcp.rigid.contacts.nncg: Solve the islands first <= t < last, whose contacts follow
 // each other, by nonlinear conjugate gradients on projected sweeps. `reals` holds x, J, b, e, d, mu,

@@ -1,4 +1,4 @@
-// Kernels of the interior-point method.
+// Kernels of the interior-point method. UPPER: whether there are upper bounds.
 
 // snippet path_cells: A loop over the cells of the piece, written out: the compiler orders factors
 // by what it sees in a loop. Sums keep the order they have on grids and elsewhere.

@@ -1,4 +1,5 @@
-// Kernels of nonsmooth Newton methods: the maps, their derivatives, and steps.
+// Kernels of nonsmooth Newton methods: the maps, their derivatives, and steps. Constants say what
+// of the maps a problem needs: the rest is not computed.
 
 // snippet map_numbers: The type R of a map's values, its numbers, and a root that is vectorized in
 // that type.
