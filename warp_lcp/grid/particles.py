@@ -1,5 +1,6 @@
 """Particles in approximate cell order: position, velocity, APIC gradients."""
 
+import math
 import typing
 from dataclasses import dataclass, field, replace
 
@@ -387,6 +388,15 @@ class Particles:
         grid = self.grid
         cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / grid.spacing)
         return np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin)
+
+    def cell_of(self, position: typing.Sequence[float]) -> tuple[int, int, int]:
+        """Return the interior cell (x, y, z), counted from 0, of one position [m] that is finite; see `cells_of`."""
+        grid = self.grid
+        x, y, z = (
+            min(max(math.floor(float(v) / grid.spacing), 0), n - 1) - o
+            for v, n, o in zip(position, grid.domain_counts, grid.origin, strict=True)
+        )
+        return x, y, z
 
     def arrays(self) -> dict[str, wp.array]:
         """Return the arrays of the particles by name."""

@@ -8,6 +8,7 @@ of the larger grid, so that a point has the same in all parts, and lies in store
 """
 
 import ctypes
+import struct
 import typing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ import warp as wp
 
 from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
-from warp_lcp.rows.layout import BLANK, grain
+from warp_lcp.rows.layout import grain
 from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
 from warp_lcp.rows.program import Launch, clear, launch_ranges
 from warp_lcp.settings import renamed_names
@@ -67,6 +68,11 @@ def cell_index(coordinate: float, count: int):
     return wp.min(int(inside(coordinate, count)), count)
 
 
+def _corners(choose: typing.Callable[[int, int], int], one: tuple[int, int, int], other: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Return the smaller or the larger of two corners' coordinates, `choose` being min or max."""
+    return choose(one[0], other[0]), choose(one[1], other[1]), choose(one[2], other[2])
+
+
 @dataclass(frozen=True)
 class Window:
     """Box of stored cells, low <= (k, j, i) < high, over which kernels run.
@@ -92,10 +98,10 @@ class Window:
 
     def common(self, other: "Window") -> "Window | None":
         """Return the intersection with another window; None if it is empty."""
-        low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
-        if not (low < high).all():
+        low, high = _corners(max, self.low, other.low), _corners(min, self.high, other.high)
+        if low[0] >= high[0] or low[1] >= high[1] or low[2] >= high[2]:
             return None
-        return replace(Window.of(low.tolist(), high.tolist(), self.device), near=self.near)
+        return Window(low, high, self.device, self.near)
 
     @cached_property
     def cells(self) -> typing.Any:
@@ -221,17 +227,12 @@ class Window:
         return self
 
 
-NO_CELLS = CellRange()
+NO_CELLS, BOX_OF_CELLS = CellRange(), struct.Struct("7i")  # members of a CellRange from `rows` on
 
 
-def _native(struct: typing.Any) -> typing.Any:
+def _native(made: typing.Any) -> typing.Any:
     """Return the type of a Warp struct's memory."""
-    return type(struct.__ctype__())
-
-
-def _set(native: typing.Any, members: dict[str, int]) -> None:
-    for name, value in members.items():
-        setattr(native, name, value)
+    return type(made.__ctype__())
 
 
 class _RangeMemory:
@@ -245,6 +246,12 @@ class _RangeMemory:
     def take(self, cells: typing.Any, tasks: int) -> None:
         """Take a CellRange over."""
         ctypes.memmove(self.first[1], ctypes.addressof(cells.__ctype__()), self.first[2])
+        self.tasks.value = tasks
+
+    def take_box(self, rows: int, k: int, j: int, i: int, end: int, tasks: int) -> None:
+        """Take a box of whole rows over, see `CellRange`."""
+        ctypes.memset(self.first[1], 0, self.first[2])
+        BOX_OF_CELLS.pack_into(self.range, _native(NO_CELLS).rows.offset, rows, 1, k, j, i, end, end - i)
         self.tasks.value = tasks
 
 
@@ -295,15 +302,11 @@ class ActiveWindow(Window):
         for number, value in zip((*self.first, *self.sizes), (k, j, planes, rows), strict=True):
             number.value = value
         if window.near is None:  # as `Rows.box` and `Window.cells` have it: a task takes a row
-            box = {"planes": planes, "rows": rows, "nx": end - i, "grain": max(end - i, 1), "chunks": int(end > i)}
-            cells = {"rows": rows, "chunks": 1, "k": k, "j": j, "i": i, "end": end, "grain": end - i}
+            some = int(end > i)
             for memory in self._rows:
-                memory.take(BLANK, window.low)
-                memory.tasks.value = planes * rows * box["chunks"]
-                _set(memory.layout, box | {"slab": 1})
+                memory.take_box(end - i, rows, planes, max(end - i, 1), some, window.low)
             for of_cells in self._ranges:
-                of_cells.take(NO_CELLS, planes * rows)
-                _set(of_cells.range, cells)
+                of_cells.take_box(rows, k, j, i, end, planes * rows)
             return
         for memory, rows_ in zip(self._rows, (window._shared, window._whole), strict=True):
             memory.take(rows_.single, window.low)
@@ -367,10 +370,9 @@ class DirtyRegion:
         This one becomes the last. None: all cells.
         """
         now, last = (window and window.now.common(self.all)) or self.all, self._last
-        low, high = np.minimum(now.low, last.low), np.maximum(now.high, last.high)
         self._last = now
         near = None if now.near is None or last.near is None else now.near | last.near
-        return replace(Window.of(low.tolist(), high.tolist(), now.device), near=near)
+        return Window(_corners(min, now.low, last.low), _corners(max, now.high, last.high), now.device, near)
 
 
 def _in_part(pieces: wp.array) -> typing.Any:
@@ -515,8 +517,8 @@ class StaggeredGrid:
         """All cells without the ring."""
         return self.window((1, 1, 1), self.counts)
 
-    def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0) -> Window:
-        """Return the window of cells from low to high, grown and clipped.
+    def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0, shift: int = 0) -> Window:
+        """Return the window of cells from low to high, moved by `shift` along each axis, grown and clipped.
 
         (x, y, z), both included.
 
@@ -528,8 +530,8 @@ class StaggeredGrid:
                 first.append(1)
                 last.append(2)
                 continue
-            first.append(min(max(int(low[axis]) - grow, 0), self.counts[axis] + 1))
-            last.append(max(min(int(high[axis]) + grow + 1, self.counts[axis] + 2), first[-1] + 1))
+            first.append(min(max(int(low[axis]) + shift - grow, 0), self.counts[axis] + 1))
+            last.append(max(min(int(high[axis]) + shift + grow + 1, self.counts[axis] + 2), first[-1] + 1))
         return Window.of(first, last, self.device)
 
 

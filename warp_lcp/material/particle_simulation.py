@@ -118,6 +118,7 @@ class ParticleSimulation(ParticleCheckpoints):
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
         self._faces_know = False  # the velocity of the particles, around them
+        self._ends = grid.extent - 0.5 * MARGIN * grid.spacing  # [m]; a tent at the very end would reach beyond what is stored
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
         at_once = self.shared or self.band is not None
         self._transfer_to_grid = LaunchGraph(grid.device, self._launch_particles_to_grid, at_once=at_once)
@@ -183,7 +184,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
     def _follow(self, totals: ParticleTotals, dt: float) -> None:
         """Lay another grid if the material leaves this one in a step, or has become much smaller."""
-        if self._coverage is None:
+        if self._coverage is None or (self._coverage.domain == self.grid and not self._coverage.active and not self.scene.domain.boundless):
             return
         way = travel(totals.max_speed, float(np.linalg.norm(self.gravity)), dt, self.grid.spacing)
         grow = self.reach + 3 + way  # `window`, a cell off the grid's end, where the step brings the material
@@ -273,8 +274,8 @@ class ParticleSimulation(ParticleCheckpoints):
 
     def _reached(self, totals: ParticleTotals) -> Window:
         """Return the cells that the particles can touch in a step."""
-        low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
-        box = self.grid.window(low, high, grow=self.reach + 2)
+        low, high = (self.particles.cell_of(corner) for corner in (totals.low, totals.high))
+        box = self.grid.window(low, high, grow=self.reach + 2, shift=1)
         return box if self.vicinity is None else self.vicinity.window(box, self.particles, self.reach + 2, self.step_count)
 
     def top_speed(self, totals: ParticleTotals) -> float:
@@ -439,9 +440,11 @@ class ParticleSimulation(ParticleCheckpoints):
         """
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = self.particles.totals()
-        axes = slice(self.grid.dimension)
-        end = self.grid.extent - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored
-        if totals.finite and (totals.low[axes] >= 0.0).all() and (totals.high[axes] <= end[axes]).all():
+        end = self._ends
+        inside = all(
+            low >= 0.0 and high <= most for low, high, most in zip(totals.low[: self.grid.dimension], totals.high, end, strict=False)
+        )
+        if totals.finite and inside:
             return totals if self.band is None else self.band.with_interior(totals)
         raise SimulationFailed(f"{when} step {self.step_count}: {self._trouble(totals, end)}")
 

@@ -7,6 +7,7 @@ and a patch of the launch, (offset in the arguments, address, bytes), has it cop
 from __future__ import annotations
 
 import ctypes
+import struct
 from typing import Any
 
 import warp as wp
@@ -17,6 +18,7 @@ _BLANK: Any = RowLayout()
 LAYOUT = type(_BLANK.__ctype__())
 LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
 ARRAY_BYTES = ctypes.sizeof(wp.array(dtype=wp.uint8).__ctype__())
+BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")  # members of a RowLayout from `nx` to `slab`; first (k, j, i)
 FORMATS: dict[Any, Any] = {
     wp.float32: ctypes.c_float, wp.float64: ctypes.c_double, wp.int32: ctypes.c_int32, wp.int64: ctypes.c_int64, wp.bool: ctypes.c_bool,
     float: ctypes.c_float, int: ctypes.c_int32, bool: ctypes.c_bool,
@@ -112,6 +114,13 @@ class RowsMemory:
     def sized(self) -> int:
         """Address of the number of tasks."""
         return ctypes.addressof(self.tasks)
+
+    def take_box(self, nx: int, rows: int, planes: int, grain: int, chunks: int, place: tuple[int, int, int]) -> None:
+        """Take whole rows of a box over, see `RowLayout`."""
+        ctypes.memset(ctypes.addressof(self.layout), 0, LAYOUT_BYTES)
+        BOX.pack_into(self.layout, LAYOUT.nx.offset, nx, rows, planes, grain, chunks, 1)
+        PLACE.pack_into(self.place, 0, *place)
+        self.tasks.value = planes * rows * chunks
 
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Take rows over.

@@ -229,6 +229,7 @@ class Table:
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
         self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
         self.cut = total > len(self._kept)
+        self.asked: Arguments | None = None  # of a team of one thread, which is the same as long as that
 
 
 class Team:
@@ -241,6 +242,7 @@ class Team:
 
     def __init__(self, size: int, entry: Entry) -> None:
         self.size, self._entry = size, entry
+        self._function, self._bounds = entry.function, ctypes.c_void_p(entry.bounds)
         self.words = (ctypes.c_uint64 * (THREADS + 8 * size))()
         self.address = ctypes.addressof(self.words)
         for i, function in enumerate(_system()):
@@ -257,6 +259,9 @@ class Team:
 
     def run(self, table: Table) -> None:
         """Work through a table: with the others if nobody else uses them."""
+        if self.size == 1 and table.again is None:
+            self._run_alone(table)
+            return
         with self._lock:
             self._inside += 1
             share = SHARED if table.cut and self.size > 1 and self._inside == 1 else DONE_ALONE
@@ -283,6 +288,21 @@ class Team:
         for check in table.checks:
             check()
 
+    def _run_alone(self, table: Table) -> None:
+        """Work through a table with the caller's thread."""
+        asked = table.asked
+        if asked is None:
+            asked = table.asked = Arguments(self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE)
+        try:
+            self._do(asked)
+            while table.words[UNFINISHED]:  # the interpreter has looked after signals
+                self._do(Arguments(self.address, table.address, RUN, 0, RESUMED, PATIENCE))
+        except BaseException:
+            self._do(Arguments(self.address, table.address, CANCEL))
+            raise
+        for check in table.checks:
+            check()
+
     def stop(self) -> None:
         """Send the others home; what is called later is done by the caller."""
         self._do(Arguments(self.address, 0, QUIT))
@@ -302,7 +322,7 @@ class Team:
         self._do(Arguments(self.address, 0, SERVE, me))
 
     def _do(self, asked: Arguments) -> None:
-        self._entry.function(ctypes.c_void_p(self._entry.bounds), ctypes.byref(asked))
+        self._function(self._bounds, ctypes.byref(asked))
 
 
 def patience(table: Table) -> int:
