@@ -309,7 +309,7 @@ class ActiveWindow(Window):
                 of_cells.take_box(rows, k, j, i, end, planes * rows)
             return
         for memory, rows_ in zip(self._rows, (window._shared, window._whole), strict=True):
-            memory.take(rows_.single, window.low)
+            memory.take(rows_.single)  # whose pieces have their own planes and rows
         for of_cells, pieces in zip(self._ranges, (window._pieces, window._hulls), strict=True):
             of_cells.take(_in_part(pieces), len(pieces))
         self.hulls.point_to(window._hulls)
