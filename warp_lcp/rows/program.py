@@ -93,7 +93,7 @@ def launch_ranges(
         ordered: whether tasks write what others read or write.
     """
     tasks = math.prod(dim)
-    if device.is_cuda or team() is None or (launch is None and tasks * cells < 8 * CELLS):
+    if device.is_cuda or team() is None or (launch is None and tasks * cells < 4 * CELLS):
         (launch or wp.launch)(kernel, dim, inputs, device=device)
     elif tasks:
         made = wp.launch(kernel, (1,) * len(dim), inputs, device=device, record_cmd=True)
