@@ -103,7 +103,8 @@ def scatter(
     if grid.device.is_cuda:
         rows = Rows.listed(count, grid.device)
     else:
-        shares = 1 if touched is None else max(1, min(SHARES * get_threads(), grid.shape[3 - grid.dimension] // LEAST_PLANES))
+        planes = grid.shape[3 - grid.dimension]
+        shares = 1 if touched is None else min(SHARES * get_threads(), -(-planes // LEAST_PLANES))
         rows = Rows.listed(shares, grid.device, 1, weight=1 << 20)  # a share is a piece
     given |= {"touched": touched, "runs": runs, "count": number, "chunk": CPU_GRAIN, "shares": shares}
     passed.bind(rows, **on_grid(grid), position=position, **given).launch()

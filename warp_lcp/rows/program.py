@@ -139,7 +139,7 @@ def launch_ranges(
         sized: address of the number of tasks then; 0: that of `dim`.
     """
     tasks, recorded = math.prod(dim), launch is None and is_recording()
-    if device.is_cuda or team() is None or (launch is None and not recorded and tasks * cells < 8 * CELLS):
+    if device.is_cuda or team() is None or (launch is None and not recorded and tasks * cells < 4 * CELLS):
         (launch or wp.launch)(kernel, dim, [value_of(v) for v in inputs], device=device)
     elif tasks or (recorded and sized):
         made = wp.launch(kernel, (1,) * len(dim), [value_of(v) for v in inputs], device=device, record_cmd=True)
