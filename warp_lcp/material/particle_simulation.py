@@ -120,9 +120,9 @@ class ParticleSimulation(ParticleCheckpoints):
         self._faces_know = False  # the velocity of the particles, around them
         self._ends = grid.extent - 0.5 * MARGIN * grid.spacing  # [m]; a tent at the very end would reach beyond what is stored
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
-        at_once = self.shared or self.band is not None
+        at_once = self.shared
         self._transfer_to_grid = LaunchGraph(grid.device, self._launch_particles_to_grid, at_once=at_once)
-        self._extrapolation = LaunchGraph(grid.device, self._continue, at_once=at_once)
+        self._extrapolation = LaunchGraph(grid.device, self._launch_extrapolation, at_once=at_once)
         self._transfer_to_particles = LaunchGraph(grid.device, self._launch_grid_to_particles, at_once=at_once)
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
@@ -311,8 +311,11 @@ class ParticleSimulation(ParticleCheckpoints):
         """
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
             self._extrapolation.run(window, list(known), kind, contact, self._layer_filled(), variant=window.near is None)
-            if self.sources is not None:
-                self.sources.hold(self.velocity, [])
+
+    def _launch_extrapolation(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
+        self._continue(window, known, kind, contact, join)
+        if self.sources is not None:
+            self.sources.hold(self.velocity, [])
 
     def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
         """Continue the velocity among the boundary's walls; `join` is called after each layer."""
