@@ -37,6 +37,7 @@ from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rigid.body import PLANAR
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, missed_by_far
 
