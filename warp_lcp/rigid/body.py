@@ -288,7 +288,10 @@ class BodyStates(Sequence[RigidBody]):
         return result
 
     def apply_impulses(self, impulses: np.ndarray) -> None:
-        """Apply impulses [N s] and angular impulses [N m s], shape (n, k), less the parts that walls take."""
+        """Apply impulses, less the parts that walls take.
+
+        Shape (n, k) [N s, N m s]; as `RigidBody.apply_impulse` of each.
+        """
         self.given += in_space(impulses)
         held = [impulse if body.hold is None else body.hold @ impulse for body, impulse in zip(self, impulses, strict=True)]
         self.push(np.array(held).reshape(impulses.shape))
@@ -453,7 +456,10 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the cross products of vectors, shapes (..., 3); as `np.cross`, whose checks take ten times as long."""
+    """Return cross products of vectors, shapes (..., 3).
+
+    As `np.cross`, whose checks take ten times as long.
+    """
     result = np.empty(np.broadcast_shapes(one.shape, other.shape))
     for axis, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
         result[..., axis] = one[..., j] * other[..., k] - one[..., k] * other[..., j]
