@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
 import warp as wp
 
 import warp_lcp as wl
@@ -15,6 +14,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rows.host_array import HostArray
 
 SPARE = 1.5  # room for entries, times those there are when there is none left
 
@@ -57,7 +57,8 @@ class BodyCoupling:
         S.walls, S.bodies = walls_of(grid, boundary), len(bodies.bodies)
         S.low, S.rows, S.row = wp.vec3i(*low.tolist()), int((high - low)[1]), int((high - low)[2])
         S.body = wp.array(body, dtype=wp.int32, device=grid.device)
-        S.center = wp.zeros(len(bodies.bodies), dtype=wp.vec3d, device=grid.device)
+        self._center = HostArray(len(bodies.bodies), wp.vec3d, grid.device)
+        S.center = self._center.array
         self._solids = S
         rows = grid.shape[0] * grid.shape[1]
         self._counts, self._offsets = (wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2))
@@ -78,15 +79,15 @@ class BodyCoupling:
             kind: int8 of AIR, FLUID, SOLID.
         """
         grid, S = self.grid, self._solids
-        S.center.assign(np.array([body.position for body in self.bodies.bodies]))
+        self._center.host[:] = self.bodies.bodies.position
+        self._center.send()
         block = self.boundary.cut.moving_block()
         window = None if block is None else grid.window(*block).common(self._solved)
         self._counts.zero_()
         total = 0
         if window is not None:
             window.launch_rows(kernels.enter_kernel, [S, kind, self._counts, None, None, None, None])
-            wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
-            total = int(self._offsets.numpy()[-1]) + int(self._counts.numpy()[-1])
+            total = self._add_up()
         if total > self.columns.capacity:
             self.columns.reserve(round(SPARE * total))
         if total and window is not None:
@@ -99,8 +100,7 @@ class BodyCoupling:
     def push(self, x: wp.array) -> None:
         """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""
         sums = self.columns.gather(x.flatten()).numpy()
-        for body, impulse in zip(self.bodies.bodies, self._scale * sums.reshape(-1, self.width), strict=True):
-            body.apply_impulse(impulse)
+        self.bodies.bodies.apply_impulses(self._scale * sums.reshape(-1, self.width))
 
     def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Move particles buried by a body with it.
@@ -120,5 +120,17 @@ class BodyCoupling:
 
     def _weights(self) -> np.ndarray:
         """Return rho dx^d M^-1 of all bodies, block diagonal."""
-        inverses = [body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies]
-        return self._share * self._scale * np.asarray(scipy.linalg.block_diag(*inverses))
+        inverses = self.bodies.bodies.inverse_masses(self.grid.dimension)
+        n = np.arange(len(inverses))
+        blocks = np.zeros((len(n), self.width, len(n), self.width))
+        blocks[n, :, n] = self._share * self._scale * inverses
+        return blocks.reshape(len(n) * self.width, -1)
+
+    def _add_up(self) -> int:
+        """Fill the entries before each row; return the number of all."""
+        if self.grid.device.is_cpu:
+            counts, offsets = self._counts.numpy(), self._offsets.numpy()
+            np.subtract(np.cumsum(counts), counts, out=offsets, casting="unsafe")
+        else:
+            wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
+        return int(self._offsets.numpy()[-1]) + int(self._counts.numpy()[-1])

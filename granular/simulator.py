@@ -37,6 +37,7 @@ from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.rigid.body import PLANAR
 from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, missed_by_far
@@ -352,16 +353,15 @@ class SandSimulation(ParticleSimulation):
         dimension, bodies = self.grid.dimension, self.bodies.bodies
         self.carried.begin(
             self.packing, self.velocity, self.weights, density=self.scene.physics.density,
-            velocity=np.array([body.velocities(dimension) for body in bodies]),
-            inverse_mass=np.array([body.inverse_mass(dimension) for body in bodies]),
+            velocity=bodies.velocities() if dimension == 3 else bodies.velocities()[:, PLANAR],
+            inverse_mass=bodies.inverse_masses(dimension),
         )  # fmt: skip
 
     def _push_bodies(self, dt: float) -> None:
         """Give the bodies what the sand has done to them, and the faces beside them the velocity that this leaves."""
         if self.carried is None or self.bodies is None:
             return
-        for body, impulse in zip(self.bodies.bodies, self.carried.impulses(), strict=True):
-            body.apply_impulse(impulse)
+        self.bodies.bodies.apply_impulses(self.carried.impulses())
         self.solids.begin_step(self.time, dt)
         if self.sources is not None:
             self.sources.hold(self.solids.velocity, [])
