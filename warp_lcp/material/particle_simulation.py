@@ -118,6 +118,7 @@ class ParticleSimulation(ParticleCheckpoints):
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
         self._faces_know = False  # the velocity of the particles, around them
+        self._columns: tuple[str, ...] | None = None  # of the log, once they are asked for
         self._ends = grid.extent - 0.5 * MARGIN * grid.spacing  # [m]; a tent at the very end would reach beyond what is stored
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
         at_once = self.shared
@@ -412,7 +413,10 @@ class ParticleSimulation(ParticleCheckpoints):
     def logged(self, row: Row) -> Row:
         """Return the entries of a row that the log has columns for, in their order."""
         bodies = self.bodies.row() if self.bodies is not None else {}
-        return {name: (row | bodies).get(name) for name in self.columns()}
+        found = row | bodies
+        if self._columns is None:
+            self._columns = self.columns()
+        return {name: found.get(name) for name in self._columns}
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns, see `warp_lcp.material.particle_log.columns`."""
