@@ -297,6 +297,7 @@ class ComponentFinder:
         Args:
             scratch: memory, or None.
             joined: stored cell types, of which FLUID neighbors are one component.
+            launch: launches or records.
         """
         A, rows = self._A, self._A.stencil.rows
         if scratch is None:

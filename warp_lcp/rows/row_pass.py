@@ -18,7 +18,7 @@ import warp as wp
 from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
 from warp_lcp.rows.native import HEADERS, shared, text
 from warp_lcp.rows.program import Launch, perform
-from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Stage, get_threads, ranges, team
+from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Stage, get_threads, memory_of, ranges, team
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
@@ -419,7 +419,8 @@ class Bound(NamedTuple):
     def stage(self, lag: int = 0, **members: int) -> Stage:
         """Return the pass for the team, as a stage of a wave whose layout has these members."""
         L = put(copy_of(self.layout), members) if members else self.layout
-        memory = ctypes.create_string_buffer(bytes(L.__ctype__()) + bytes(self.fields.__ctype__()))
+        values = bytes(L.__ctype__()) + bytes(self.fields.__ctype__())
+        memory = memory_of(ctypes.c_char, len(values)).from_buffer_copy(values)
         entry = self.form.entry(L, self.fields)
         return Stage(entry, memory, self, L.rows * L.chunks, threads(L)[0], lag, max(L.fz, 1), L.n1)
 
