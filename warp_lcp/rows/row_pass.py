@@ -409,11 +409,13 @@ class Bound(NamedTuple):
         """Launch the pass, or record it."""
         if self.rows.device.is_cuda or team() is None:
             (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
-        elif 0 not in threads(self.layout):
-            perform(self._operation(), launch)
+        elif (made := self.operation()) is not None:
+            perform(made, launch)
 
-    def _operation(self) -> Operation:
-        """Return the pass for the team, cut into ranges of tasks."""
+    def operation(self) -> Operation | None:
+        """Return the pass for the team, cut into ranges of tasks; None where it has no task, or is not for the team."""
+        if self.rows.device.is_cuda or team() is None or 0 in threads(self.layout):
+            return None
         return ranges(self.stage(), self.layout.grain * self.rows.weight, ordered=self.form.declared.ordered)
 
     def stage(self, lag: int = 0, **members: int) -> Stage:
