@@ -66,6 +66,12 @@ class Arguments(ctypes.Structure):
     )  # fmt: skip
 
 
+@functools.cache
+def memory_of(kind: Any, count: int) -> Any:
+    """Return the type of an array of C: one that Python does not keep takes it longer to make than a table to run."""
+    return kind * count
+
+
 class Entry:
     """A kernel on the CPU: what C calls, and the bounds of a launch.
 
@@ -145,7 +151,7 @@ class Operation:
         self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0, sized: int = 0
     ) -> None:
         made = [word for stage in stages for word in stage.words]
-        self._stages, self._kept, self.chunks = (ctypes.c_uint64 * len(made))(*made), stages, chunks
+        self._stages, self._kept, self.chunks = memory_of(ctypes.c_uint64, len(made))(*made), stages, chunks
         self.check: Callable[[], object] | None = None
         self.condition, self.sized = 0, sized
         self.words = kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks
@@ -217,7 +223,7 @@ class Table:
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
         sizes = [LANE_WORDS * n + operation.chunks for n, operation in zip(lanes, self._kept, strict=True)]  # what is left, and the cuts
         at = TABLE_WORDS + OPERATION_WORDS * len(self._kept)
-        self.words = (ctypes.c_uint64 * (at + sum(sizes)))()
+        self.words = memory_of(ctypes.c_uint64, 1 << (at + sum(sizes)).bit_length())()
         self.address = ctypes.addressof(self.words)
         total, made = 0, []
         for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
