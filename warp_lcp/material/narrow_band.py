@@ -344,7 +344,7 @@ class NarrowBand:
         """Launch a pass in which the depth of the window's cells falls to what their neighbors allow."""
         if self.grid.device.is_cpu:
             clear(self._changed)
-        last = dict(zip(("last_plane", "last_row"), (0, 0) if forth else self._last, strict=True))
+        last: dict[str, Any] = dict(zip(("last_plane", "last_row"), (0, 0) if forth else self._last, strict=True))
         self._window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=self.grid.planes, **last)
 
     def _relax(self, fallen: int = 0) -> None:
