@@ -63,8 +63,8 @@ class WindowTally:
             self._reading.changed()
 
     def on_device(self) -> Any:
-        """Return what is found, a number a column, where it is on a GPU; None on the CPU."""
-        return None if self._tally is None else self._tally.found
+        """Return what is found, a number a column, where kernels find it."""
+        return self._reading.array if self._tally is None else self._tally.found
 
     def read(self) -> list[float]:
         """Return what the last launch found."""
