@@ -389,7 +389,7 @@ class Particles:
         cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / grid.spacing)
         return np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin)
 
-    def cell_of(self, position: typing.Sequence[float]) -> tuple[int, int, int]:
+    def cell_of(self, position: typing.Sequence[float] | np.ndarray) -> tuple[int, int, int]:
         """Return the interior cell (x, y, z), counted from 0, of one position [m] that is finite; see `cells_of`."""
         grid = self.grid
         x, y, z = (
