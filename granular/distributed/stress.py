@@ -42,7 +42,8 @@ class SharedPacking(Packing):
     def __init__(self, part: Subdomain, base: wp.array, capacity: wp.array, **more: Any) -> None:
         self._part = part
         self._forest: StarForest | None = None  # of this step's sand
-        known = Window.of(*zip(*((axis.start, axis.stop) for axis in part.known.slices), strict=True), part.grid.device)
+        low, high = ([getattr(axis, end) for axis in part.known.slices] for end in ("start", "stop"))
+        known = Window.of(low, high, part.grid.device)
         super().__init__(part.grid, base, capacity, counted=part.owned, known=known, **more)
 
     def update(self, *arguments: Any) -> None:

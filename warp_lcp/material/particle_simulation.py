@@ -273,7 +273,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
     def _reached(self, totals: ParticleTotals) -> Window:
         """Return the cells that the particles can touch in a step."""
-        low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
+        low, high = self.particles.cells_of(np.stack((totals.low, totals.high))) + 1
         box = self.grid.window(low, high, grow=self.reach + 2)
         return box if self.vicinity is None else self.vicinity.window(box, self.particles, self.reach + 2, self.step_count)
 
