@@ -14,7 +14,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
-from warp_lcp.rows.program import launch
+from warp_lcp.rows.program import LaunchGraph, clear, launch
 
 
 class Walls:
@@ -119,6 +119,7 @@ class SandSolids:
         self.base, self.index = grid.field(wp.int8), grid.field(wp.int32)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
+        self._setting = LaunchGraph(grid.device, self._launch_velocity)
         self._cells: np.ndarray | None = None  # `index` as `walls` know it
         fits = cuts and isinstance(boundary, CutBoundary) and not boundary.moves and boundary.sides is None
         self.cut = CutWalls(grid, boundary.cut, friction, self._counted) if fits and isinstance(boundary, CutBoundary) else None
@@ -181,16 +182,20 @@ class SandSolids:
 
     def begin_step(self, time: float, dt: float) -> None:
         """Find how fast the solids move in the step that starts at `time` [s] and lasts `dt` [s]."""
+        self._boundary.begin_step(time, dt)
+        if self.velocity:
+            self._setting.run()
+
+    def _launch_velocity(self) -> None:
+        """Launch what sets the velocity of the solids' faces."""
         boundary, grid = self._boundary, self.grid
-        boundary.begin_step(time, dt)
         if self.moves and isinstance(boundary, CutBoundary):
             cut = boundary.cut
             for axis, field in enumerate(self.velocity):
                 inputs = [axis, grid.planes, grid.spacing, wp.vec3i(*grid.origin), self.index, cut.turn, cut.shift, field]
                 grid.everywhere.launch(kernels.wall_velocity_kernel, inputs)
         else:
-            for field in self.velocity:  # a source that has stopped has left its own
-                field.zero_()
+            clear(*self.velocity)  # a source that has stopped has left its own
 
 
 def wall_faces(index: np.ndarray, dimension: int, counted: Window | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
