@@ -222,6 +222,11 @@ class Window:
         launch_ranges(kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
 
     @property
+    def identity(self) -> typing.Hashable:
+        """By what recorded launches tell windows apart."""
+        return self.low, self.high, id(self.near)
+
+    @property
     def now(self) -> "Window":
         """The window itself; of an `ActiveWindow` the one that it stands for."""
         return self
@@ -281,6 +286,8 @@ class ActiveWindow(Window):
             object.__setattr__(self, name, value)  # which a dataclass that is frozen does not allow otherwise
         self.move_to(window)
 
+    __eq__, __hash__ = object.__eq__, object.__hash__
+    identity = property(id)
     low = property(lambda self: self._now.low)
     high = property(lambda self: self._now.high)
     near = property(lambda self: self._now.near)

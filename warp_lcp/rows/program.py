@@ -343,6 +343,19 @@ class Program:
         return ""
 
 
+def _identity(argument: Any) -> Hashable:
+    """Return by what a recording knows an argument: an array by its address, unless it is replaced by others; a list by its elements."""
+    if isinstance(argument, wp.array):
+        slot = getattr(argument, "slot", None)
+        return (argument.ptr, argument.shape) if slot is None else slot.address
+    if isinstance(argument, (list, tuple)):
+        return tuple(map(_identity, argument))
+    return getattr(argument, "identity", argument)  # type: ignore[no-any-return]
+
+
+MOST_RECORDED = 32  # sequences of a graph
+
+
 class LaunchGraph:
     """What a step launches between two decisions of the host: recorded at the first run, on the CPU then one native call.
 
@@ -366,17 +379,20 @@ class LaunchGraph:
         """Launch everything, or record that among the launches of a program that is being recorded.
 
         Args:
-            arguments: of `record`; the same in each run.
-            variant: by what `record` decides which of several sequences it launches; each is recorded once.
+            arguments: of `record`. Other arrays or objects are recorded for themselves.
+            variant: by what else `record` decides which of several sequences it launches; each is recorded once.
         """
         if self.at_once or RECORDING.program is not None or team() is None:
             self._record(*arguments)
             return
         if self._threads != get_threads():
             self._programs, self._threads = {}, get_threads()
-        program = self._programs.get(variant)
+        key = (variant, *map(_identity, arguments))
+        program = self._programs.get(key)
         if program is None:
-            program = self._programs[variant] = self._recorded(arguments)
+            if len(self._programs) >= MOST_RECORDED:
+                self._programs.clear()
+            program = self._programs[key] = self._recorded(arguments)
         elif LaunchGraph.verify and (other := self._recorded(arguments).differs(program)):
             raise AssertionError(f"a recorded launch differs: {other}")
         program.run()
