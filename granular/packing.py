@@ -103,7 +103,10 @@ class Packing:
 
     @property
     def densest(self) -> float:
-        """Largest fraction of a cell whose kernel is open for more than a half, in units of the densest packing."""
+        """Largest fraction of a cell, in units of the densest packing.
+
+        Of cells whose capacity is more than a half.
+        """
         return float(self._found.numpy()[1])
 
     def _launch(self, density: wp.array, velocity: Sequence[wp.array], solid: Sequence[wp.array]) -> None:
