@@ -142,6 +142,7 @@ class Particles:
         self._columns: dict[str, Column] = {}
         self._memory = ListMemory(grid.device)
         self._grow(0)
+        self._publish()
         self.append(position, velocity, kept)
 
     @property

@@ -33,7 +33,7 @@ class Scalar:
 
     __slots__ = ("_cells", "_scaled", "_value")
 
-    def __init__(self, value: float = 0.0) -> None:
+    def __init__(self, value: float = 0) -> None:
         self._cells: dict[Any, Any] = {}  # the number in each type that kernels take it in
         self._scaled: dict[float, Scalar] = {}
         self._value = value

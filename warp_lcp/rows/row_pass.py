@@ -237,8 +237,8 @@ class RowPass:
             for name in names:
                 value = given[name]
                 found = 0 if value is None else value.size
-                if not found and name in self.optional:
-                    given[name] = None  # a slice of nothing has an address
+                if not found and name in self.optional and getattr(value, "slot", None) is None:
+                    given[name] = None  # a slice of nothing has an address; of a list that grows it is read when it runs
                 if found != expected is not None and (found or name not in self.optional):
                     raise ValueError(f"{self.label}: {name} has {found} elements, not {expected}")
                 if found and not (value.is_contiguous and value.device is device):
