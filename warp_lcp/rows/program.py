@@ -350,7 +350,7 @@ def _identity(argument: Any) -> Hashable:
         return (argument.ptr, argument.shape) if slot is None else slot.address
     if isinstance(argument, (list, tuple)):
         return tuple(map(_identity, argument))
-    return getattr(argument, "identity", argument)  # type: ignore[no-any-return]
+    return getattr(argument, "identity", argument)
 
 
 MOST_RECORDED = 32  # sequences of a graph
