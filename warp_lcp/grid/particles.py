@@ -415,7 +415,10 @@ class Particles:
         return np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin)
 
     def cell_of(self, position: typing.Sequence[float] | np.ndarray) -> tuple[int, int, int]:
-        """Return the interior cell (x, y, z), counted from 0, of one position [m] that is finite; see `cells_of`."""
+        """Return the interior cell (x, y, z), counted from 0, of one position [m].
+
+        The position is finite; see `cells_of`.
+        """
         grid = self.grid
         x, y, z = (
             min(max(math.floor(float(v) / grid.spacing), 0), n - 1) - o

@@ -261,7 +261,9 @@ class _RangeMemory:
 
 
 class ActiveWindow(Window):
-    """The window of the current step, in memory: launches that are recorded with it visit the window of the step in which they run.
+    """Window of the current step, in memory that recorded launches read.
+
+    A launch that is recorded with it visits the window of the step in which it runs.
 
     Args:
         window: the first one.
@@ -525,9 +527,9 @@ class StaggeredGrid:
         return self.window((1, 1, 1), self.counts)
 
     def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0, shift: int = 0) -> Window:
-        """Return the window of cells from low to high, moved by `shift` along each axis, grown and clipped.
+        """Return the window of cells from low to high, moved, grown and clipped.
 
-        (x, y, z), both included.
+        (x, y, z), both included; moved by `shift` along each axis.
 
         Of a box beyond what is stored a layer of what is nearest is left.
         """
