@@ -2,8 +2,9 @@
 
 import gc
 import weakref
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,6 +54,42 @@ def test_elements_lie_side_by_side_on_the_rows_device(double):
             double.bind(rows, x=strided, y=y)
     with pytest.raises(ValueError, match=r"misuse\.double: x is on cpu, not .*cuda:7"):
         double.bind(replace(rows, device=SimpleNamespace(alias="cuda:7")), x=y, y=y)
+
+
+@dataclass(frozen=True, slots=True)
+class Fields:
+    """More than a kernel takes: arrays of any length."""
+
+    x: Any
+    y: Any
+    other: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """One member alone."""
+
+    y: Any
+
+
+def test_a_kernel_takes_the_members_of_structs_that_it_declares(double):
+    x, y, z, rows = array(np.arange(10.0)), zeros(10), zeros(10), Rows.flat(10, CPU)
+    double.bind(rows, Fields(x, y)).launch()
+    np.testing.assert_array_equal(y.numpy(), 2 * np.arange(10))
+    double.bind(rows, Fields(x, y), y=z, x=y).launch()  # keywords override members
+    np.testing.assert_array_equal(z.numpy(), 4 * np.arange(10))
+    double.bind(rows, Target(z), x=x).launch()
+    np.testing.assert_array_equal(z.numpy(), y.numpy())
+    with pytest.raises(TypeError, match=r"misuse\.double: missing \['x'\] in Target, unknown \[\]"):
+        double.bind(rows, Target(z))
+    with pytest.raises(TypeError, match=r"misuse\.double: missing \[\], unknown \['other'\]"):
+        double.bind(rows, Fields(x, y), other=0)
+    with pytest.raises(TypeError, match=r"misuse\.double: Fields, Target: two of them have \['y'\]"):
+        double.bind(rows, Fields(x, y), Target(z))
+    with pytest.raises(TypeError, match=r"misuse\.double: dict is not a dataclass"):
+        double.bind(rows, {"x": x, "y": y})
+    with pytest.raises(ValueError, match=r"misuse\.double: y has 9 elements, not 10"):
+        double.bind(rows, Fields(x, zeros(9)))
 
 
 @pytest.mark.parametrize("absent", [None, zeros(0), zeros(20)[5:5]], ids=["None", "empty", "a slice of nothing"])

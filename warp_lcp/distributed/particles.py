@@ -286,10 +286,13 @@ class SharedParticles(Particles):
         bits = [[part.cuts >> 2 * axis + side & 1 for axis in range(3)] for side in range(2)]
         low = [box + 1 if cut else -ENDLESS for box, cut in zip(part.box.low, bits[0], strict=True)]
         high = [box + 1 if cut else ENDLESS for box, cut in zip(part.box.high, bits[1], strict=True)]
-        ends = dict(zip((f"{end}_{axis}" for end in ("low", "high") for axis in "xyz"), map(float, low + high), strict=True))
+        low_x, low_y, low_z, high_x, high_y, high_z = map(float, low + high)
         found = wp.empty(self.count - first, dtype=wp.uint8, device=grid.device)
         if len(found):
-            launch(WHERE, len(found), grid, position=self.position[first:], where=found, reach=float(REACH), **ends)
+            launch(
+                WHERE, len(found), grid, position=self.position[first:], where=found, reach=float(REACH), low_x=low_x, low_y=low_y,
+                low_z=low_z, high_x=high_x, high_y=high_y, high_z=high_z,
+            )  # fmt: skip
         return np.asarray(found.numpy())
 
     def _cells(self, which: np.ndarray) -> np.ndarray:

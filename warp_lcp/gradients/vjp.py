@@ -174,16 +174,17 @@ def _classified(problem: LCP, result: SolveResult, x: Any, g: Any) -> tuple[Any,
     residual, rows, layout = NaturalResidual(problem), _rows(problem), problem.layout
     problem.bounds.refresh()
     residual.affine(x)
-    given = {"x": x, "y": residual.y, "d": residual.diagonal, "unknown": problem.unknown, "unit": residual.unit}
-    tally, bounds = Tally(LARGEST, problem.device), problem.bounds.operands
-    tally.take(rows, bounds=bounds, **given)
+    tally, bounds, y, d = Tally(LARGEST, problem.device), problem.bounds.operands, residual.y, residual.diagonal
+    tally.take(rows, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit)
     square, largest = tally.read()
     norm, allowed = float(square) ** 0.5, CHANGED * result.residual
     if not norm <= allowed and not norm <= allowed + residual.rounding_floor(x, ROUNDING):
         raise ValueError(f"result has a residual of {norm:.1e} instead of {result.residual:.1e}: its problem has changed in place since")
     cells, side = wp.clone(problem.unknown), layout.zeros(i8)
-    given |= {"b": problem.b, "g": g, "cells": cells, "side": side, "tolerance": float(largest), "rounding": ROUNDING}
-    free, degenerate, wrong = Sums(rows, 3).of(SETS, bounds=bounds, **given)
+    free, degenerate, wrong = Sums(rows, 3).of(
+        SETS, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit, b=problem.b, g=g, cells=cells, side=side,
+        tolerance=float(largest), rounding=ROUNDING,
+    )  # fmt: skip
     if wrong:
         raise ValueError(f"cotangent holds {int(wrong)} values that are not finite")
     return residual.y, cells, side, int(free), int(degenerate)

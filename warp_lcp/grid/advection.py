@@ -22,6 +22,7 @@ interpolation 23 %. A distance is interpolated linearly, which is exact where it
 
 import functools
 import typing
+from dataclasses import dataclass
 from pathlib import Path
 
 import warp as wp
@@ -98,6 +99,27 @@ def clearance_kernel(cells: wp.array3d(dtype=wp.int8), planes: int, distance: in
             room[k, j, i] = wp.int8(distance)
 
 
+@dataclass(frozen=True, slots=True)
+class FaceVelocity:
+    """Velocity on the lower faces of cells, float32 or float64, as kernels take it.
+
+    Attributes:
+        u: component along x [m/s].
+        v: component along y [m/s].
+        w: component along z [m/s]; None in 2-D.
+    """
+
+    u: wp.array
+    v: wp.array
+    w: wp.array | None
+
+    @classmethod
+    def of(cls, components: list[wp.array]) -> "FaceVelocity":
+        """Return the velocity of two or three components."""
+        u, v, w = [*components, None][:3]
+        return cls(u, v, w)
+
+
 def clearance(grid: StaggeredGrid, cells: wp.array) -> wp.array:
     """Return the distance to the nearest SOLID cell in cells, diagonals counting 1.
 
@@ -131,9 +153,10 @@ def advect(
         endless: has bit n set if axis n has no end: velocities beyond its sides are those at the other, as the ring's are. Particles may
             end up there.
     """
-    u, v, w = [*fields, None][:3]
-    given = {"u": u, "v": v, "w": w, "room": room, "stopped": stopped, "h": scaled(dt, 1.0 / grid.spacing)}
-    launch(advect_pass(endless), len(position), grid, position=position, **given)
+    launch(
+        advect_pass(endless), len(position), grid, FaceVelocity.of(fields), position=position, room=room, stopped=stopped,
+        h=scaled(dt, 1.0 / grid.spacing),
+    )  # fmt: skip
 
 
 def advect_with_distance(
@@ -158,9 +181,10 @@ def advect_with_distance(
         open_sides: of `warp_lcp.grid.sides.side_bits`: particles cross them and end on them or beyond.
         endless: has bit n set if axis n has no end, see `advect`; its sides are open, and alike.
     """
-    u, v, w = [*fields, None][:3]
-    given = {"u": u, "v": v, "w": w, "distance": distance, "stopped": stopped, "h": scaled(dt, 1.0 / grid.spacing)}
-    launch(distance_pass(endless), len(position), grid, position=position, open_sides=open_sides, **given)
+    launch(
+        distance_pass(endless), len(position), grid, FaceVelocity.of(fields), position=position, distance=distance, stopped=stopped,
+        h=scaled(dt, 1.0 / grid.spacing), open_sides=open_sides,
+    )  # fmt: skip
 
 
 def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0) -> None:
@@ -197,9 +221,10 @@ def carry_field(
         least: see `out`.
         before: cells (x, y, z) of a larger grid before this one, whose places are rounded as there.
     """
-    u, v, w = [*velocity, None][:3]
     if min(window.low) < 1:
         window = Window.of([max(start, 1) for start in window.low], window.high, window.device)
-    given = {"u": u, "v": v, "w": w, "level": level, "field": field, "out": out}
-    given |= dict(zip(("before_x", "before_y", "before_z"), before, strict=True))
-    window.run(carry_pass(axis), planes=grid.planes, h=way, least=least, **given)
+    before_x, before_y, before_z = before
+    window.run(
+        carry_pass(axis), FaceVelocity.of(velocity), planes=grid.planes, h=way, least=least, level=level, field=field,
+        out=out, before_x=before_x, before_y=before_y, before_z=before_z,
+    )  # fmt: skip

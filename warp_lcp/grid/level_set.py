@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.grid import level_set_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate
-from warp_lcp.grid.particle_loops import on_grid, scatter, touched_planes
+from warp_lcp.grid.particle_loops import scatter, touched_planes
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import COPY, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
@@ -98,8 +98,10 @@ class LevelSet:
             if capacity is not None:
                 free = self._scratch[1] if density is self._scratch[0] else self._scratch[0]
                 smooth = self._smoothed(window, capacity, free, self._scratch[2])
-        found = {"phi": self.phi, "known": self._known, "spread": self._spread, "limit": self.limit}
-        window.run(kernels.DISTANCE, density=density, capacity=capacity, smooth=smooth, base=base, **found)
+        window.run(
+            kernels.DISTANCE, density=density, capacity=capacity, smooth=smooth, base=base, phi=self.phi, known=self._known,
+            spread=self._spread, limit=self.limit,
+        )  # fmt: skip
         if smooth is not None:
             shifted = next(field for field in self._scratch if field is not smooth)
             window.launch(kernels.wall_shift_kernel, [self._spread**2, self.limit, smooth, self.phi, self._known, shifted])
@@ -135,9 +137,9 @@ class LevelSet:
         self._volume.changed()
 
     def _launch_volume(self, distance: wp.array | None) -> None:
-        grid, found = self.grid, {"phi": self.phi, "known": self._known, "distance": distance}
+        grid = self.grid
         assert self._volume is not None
-        self._volume.take(self._box, **found, planes=grid.planes, parts=PARTS[grid.dimension])
+        self._volume.take(self._box, phi=self.phi, known=self._known, distance=distance, planes=grid.planes, parts=PARTS[grid.dimension])
 
     @property
     def measured(self) -> float:
@@ -164,12 +166,13 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
         particles_a_cell: particles in a full cell at rest.
         density: float32 (written, 0 away from particles).
     """
-    given = {"position": particles.position, "density": density, "each": 1.0 / particles_a_cell}
+    position, each = particles.position, 1.0 / particles_a_cell
     clear(density)
     if particles.offsets is not None:
-        window.run(kernels.GATHER, offsets=particles.offsets, **given, **on_grid(grid))
+        window.run(kernels.GATHER, grid.placement, position=position, offsets=particles.offsets, density=density, each=each)
     else:
-        scatter(kernels.SCATTER, grid, touched=touched_planes(grid, particles.position), runs=particles.runs, **given)
+        touched = touched_planes(grid, position)
+        scatter(kernels.SCATTER, grid, position, touched, runs=particles.runs, density=density, each=each)
 
 
 def whole_cell_capacity(grid: StaggeredGrid, base: wp.array, capacity: wp.array) -> None:

@@ -15,7 +15,6 @@ import functools
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -144,7 +143,6 @@ CLOSEST = 0.01  # of an edge: how near to its end a point may come, so that no t
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/surface_mesh.h", {"CLOSEST": CLOSEST})
 COUNT = KERNELS["warp_lcp.grid.marching_cubes.count"]
-_PLACED = {"dx": wp.float32} | dict.fromkeys(("before_x", "before_y", "before_z", "most_x", "most_y", "most_z"), int)
 POINTS = KERNELS["warp_lcp.grid.marching_cubes.points"]
 CORNERS = KERNELS["warp_lcp.grid.marching_cubes.corners"]
 
@@ -191,9 +189,11 @@ class MarchingCubes:
         cells = Window(low, high, device)  # between the centers of cells and of their upper neighbors
         owned, made = self._counted(cells, phi)
         points = wp.empty(_total(owned[1]), dtype=wp.vec3, device=device)
-        placed: dict[str, Any] = dict(zip(_PLACED, [grid.spacing, *grid.origin, *grid.domain_counts], strict=True))
-        given = {"phi": phi, "planes": grid.planes, "number": number}
-        cells.run(POINTS, whole=True, counts=owned[0], ends=owned[1], into=points, **placed, **given)
+        most_x, most_y, most_z = grid.domain_counts
+        cells.run(
+            POINTS, grid.placement, whole=True, counts=owned[0], ends=owned[1], into=points, phi=phi, number=number,
+            most_x=most_x, most_y=most_y, most_z=most_z,
+        )  # fmt: skip
         return DeviceMesh(points, self._corners(cells, phi, number, made))
 
     def corners(self, phi: wp.array, number: wp.array, cells: Window) -> wp.array:
@@ -218,8 +218,10 @@ class MarchingCubes:
     def _corners(self, cells: Window, phi: wp.array, number: wp.array, made: tuple[wp.array, wp.array]) -> wp.array:
         """Return the triangles of cells, whose rows have so many."""
         corners = wp.empty((_total(made[1]), self.grid.dimension), dtype=wp.int32, device=cells.device)
-        given = {"phi": phi, "planes": self.grid.planes, "number": number, "table": self._table, "into": corners}
-        cells.run(CORNERS, whole=True, counts=made[0], ends=made[1], **given)
+        cells.run(
+            CORNERS, whole=True, counts=made[0], ends=made[1], phi=phi, planes=self.grid.planes, number=number, table=self._table,
+            into=corners,
+        )  # fmt: skip
         return corners
 
 

@@ -7,7 +7,7 @@ alias, gathers from the fields included.
 
 import ctypes
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,8 @@ from warp_lcp.rows.program import is_recording
 from warp_lcp.rows.team import get_threads
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from warp_lcp.grid.staggered import StaggeredGrid
 
 CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
@@ -82,7 +84,7 @@ def touched_planes(grid: "StaggeredGrid", position: wp.array[Any]) -> wp.array[w
 
 
 def scatter(
-    passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], touched: wp.array[wp.int32] | None, *,
+    passed: RowPass, grid: "StaggeredGrid", position: wp.array[Any], touched: wp.array[wp.int32] | None, *structs: "DataclassInstance",
     runs: wp.array[wp.int32] | None = None, **given: Any,
 ) -> None:  # fmt: skip
     """Launch a pass in which particles add to a field: on the CPU each task has planes of its own (rows in 2-D).
@@ -93,7 +95,8 @@ def scatter(
         position: theirs.
         touched: what `touched_planes` returns for them.
         runs: of `Particles`.
-        given: what else the pass takes.
+        structs: what else the pass takes, see `RowPass.bind`.
+        given: likewise.
     """
     count, shares = len(position), 1
     listed = getattr(position, "listed", None) if is_recording() else None
@@ -107,13 +110,29 @@ def scatter(
         shares = 1 if touched is None else min(SHARES * get_threads(), -(-planes // LEAST_PLANES))
         rows = Rows.listed(shares, grid.device, 1, weight=1 << 20)  # a share is a piece
     given |= {"touched": touched, "runs": runs, "count": number, "chunk": CPU_GRAIN, "shares": shares}
-    passed.bind(rows, **on_grid(grid), position=position, **given).launch()
+    given["position"] = position
+    passed.bind_arguments(rows, (grid.placement, *structs), given).launch()
 
 
-def on_grid(grid: "StaggeredGrid") -> dict[str, Any]:
-    """Return what passes are told of a grid: its spacing [m], and the cells of a larger one before it."""
-    before = dict(zip(("before_x", "before_y", "before_z"), grid.origin, strict=True))
-    return {"planes": grid.planes, "dx": grid.spacing, "inverse_dx": 1.0 / grid.spacing, **before}
+@dataclass(frozen=True, slots=True)
+class GridPlacement:
+    """Spacing of a grid and its place in a larger one, as kernels over particles take them.
+
+    Attributes:
+        planes: nodes along z that a tent function spans: 1 in 2-D, 2 in 3-D.
+        dx: spacing [m].
+        inverse_dx: 1 / dx [1/m].
+        before_x: cells of the larger grid before the first cell along x.
+        before_y: likewise along y.
+        before_z: likewise along z.
+    """
+
+    planes: int
+    dx: float
+    inverse_dx: float
+    before_x: int
+    before_y: int
+    before_z: int
 
 
 def chunks(count: int, device: wp.Device) -> Rows:
@@ -121,13 +140,16 @@ def chunks(count: int, device: wp.Device) -> Rows:
     return Rows.entries(count, device, 1 if device.is_cuda else CPU_GRAIN, weight=PARTICLE)
 
 
-def launch(passed: RowPass, count: int, grid: "StaggeredGrid", **given: Any) -> None:
-    """Launch a pass over the first particles of a list.
+def launch(passed: RowPass, count: int, grid: "StaggeredGrid", *structs: "DataclassInstance", **given: Any) -> None:
+    """Launch a pass, bound as by `RowPass.bind` with the grid's placement, over the first particles of a list.
 
     A launch that is recorded takes as many as the list has when it runs, if one of its arrays is of a `ListMemory`.
     """
-    listed = next((a.listed for a in given.values() if hasattr(a, "listed")), None) if is_recording() else None
+    rows, listed = chunks(count, grid.device), None
+    if is_recording():
+        arrays = [*given.values(), *(getattr(s, f.name) for s in structs for f in fields(s))]
+        listed = next((a.listed for a in arrays if hasattr(a, "listed")), None)
     if listed is not None:
-        passed.bind(replace(chunks(count, grid.device), memory=listed.rows), **on_grid(grid), **given).launch()
-    elif count:
-        passed.bind(chunks(count, grid.device), **on_grid(grid), **given).launch()
+        rows = replace(rows, memory=listed.rows)
+    if count or listed is not None:
+        passed.bind_arguments(rows, (grid.placement, *structs), given).launch()

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.particle_loops import CPU_GRAIN, MARGIN, ListMemory, launch, on_grid
+from warp_lcp.grid.particle_loops import CPU_GRAIN, MARGIN, ListMemory, launch
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
@@ -323,8 +323,8 @@ class Particles:
 
     def _launch_numbers(self) -> None:
         grid = self.grid
-        counts = dict(zip(("nx", "ny", "nz"), grid.counts, strict=True))
-        launch(kernels.NUMBER, self.count, grid, position=self.position, key=self.key, **counts)
+        nx, ny, nz = grid.counts
+        launch(kernels.NUMBER, self.count, grid, position=self.position, key=self.key, nx=nx, ny=ny, nz=nz)
 
     def sort(self) -> None:
         """Sort the particles by cell (stable, so that runs are repeatable)."""
@@ -364,7 +364,7 @@ class Particles:
         if self.count == 0:
             return ParticleTotals()
         if self._tally is not None:
-            self._tally.take(self._rows_of_totals(), position=self.position, velocity=self.velocity, **on_grid(self.grid))
+            self._tally.take(self._rows_of_totals(), self.grid.placement, position=self.position, velocity=self.velocity)
             total = self._tally.read()
         else:
             self._totals.run()
@@ -390,11 +390,12 @@ class Particles:
 
     def _launch_totals(self) -> None:
         """Launch the sums over the particles, and those of the threads' sums."""
-        rows, given = replace(self._rows_of_totals(), memory=self._total_rows), on_grid(self.grid)
-        kernels.TOTAL.bind(rows, position=self.position, velocity=self.velocity, **given, out=self._partials).launch()
-        arrays: dict[str, typing.Any] = {"partials": self._partials, "results": self._found.array}
-        numbers: dict[str, typing.Any] = {"places_of_sums": self._places, "sums_": len(kernels.TOTAL.sums)}
-        kernels.ADD_IN_ORDER.bind(Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True), **arrays, **numbers).launch()
+        rows = replace(self._rows_of_totals(), memory=self._total_rows)
+        kernels.TOTAL.bind(rows, self.grid.placement, position=self.position, velocity=self.velocity, out=self._partials).launch()
+        columns = Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True)
+        kernels.ADD_IN_ORDER.bind(
+            columns, partials=self._partials, results=self._found.array, places_of_sums=self._places, sums_=len(kernels.TOTAL.sums)
+        ).launch()
 
     def totals_stay(self, stay: bool) -> None:
         """Declare that positions and velocities are unchanged since `totals`.
@@ -459,10 +460,12 @@ def sort_keys(
     each = -(-bits // rounds)
     (here, there), (moved_to, moved_from), before = keys, order[::-1], None
     for shift in range(0, rounds * each, each):
-        given = {"counts": counts, "digits": 1 << each}
-        kernels.SORT_COUNT.bind(rows, key=here, shift=shift, **given).launch()
-        kernels.SORT_BEGIN.bind(Rows.entries(1, device), pieces=pieces, **given).launch()
-        kernels.SORT_PLACE.bind(rows, key=here, order=before, sorted=there, moved=moved_to, shift=shift, **given).launch()
+        digits = 1 << each
+        kernels.SORT_COUNT.bind(rows, key=here, counts=counts, digits=digits, shift=shift).launch()
+        kernels.SORT_BEGIN.bind(Rows.entries(1, device), counts=counts, digits=digits, pieces=pieces).launch()
+        kernels.SORT_PLACE.bind(
+            rows, key=here, order=before, sorted=there, moved=moved_to, counts=counts, digits=digits, shift=shift
+        ).launch()
         here, there, before, moved_to, moved_from = there, here, moved_to, moved_from, moved_to
 
 

@@ -17,12 +17,16 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.particle_loops import GridPlacement
 from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
 from warp_lcp.rows.layout import grain
 from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
 from warp_lcp.rows.program import Launch, clear, launch_ranges
 from warp_lcp.settings import renamed_names
+
+if typing.TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/staggered.h")
 CLEAR: dict[typing.Any, RowPass] = {
@@ -146,16 +150,19 @@ class Window:
         visited = self.near[self.low[0] : self.high[0], self.low[1] : self.high[1]].any(axis=2)
         return np.where(visited.reshape(*visited.shape, *[1] * (rows.ndim - 2)), rows, 0)
 
-    def run(self, passed: RowPass, *, whole: bool = False, launch: Launch | None = None, **given: typing.Any) -> None:
+    def run(
+        self, passed: RowPass, *structs: "DataclassInstance", whole: bool = False, launch: Launch | None = None, **given: typing.Any
+    ) -> None:
         """Launch a pass over the box, or record it with `Program.launch`.
 
         Args:
             passed: with fields of a `box`.
+            structs: with fields and numbers, see `RowPass.bind`.
             whole: a thread takes a whole row, for counts of a row.
             launch: of a program.
             given: fields and numbers by name.
         """
-        passed.bind(self._whole if whole else self._shared, **given).launch(launch)
+        passed.bind_arguments(self._whole if whole else self._shared, structs, given).launch(launch)
 
     def rows_of_sums(self, planes: int) -> Rows:
         """Return the rows of a pass that sums.
@@ -515,6 +522,11 @@ class StaggeredGrid:
     def interior(self, host: np.ndarray) -> np.ndarray:
         """Return the view (nz, ny, nx) of a host field without its ring."""
         return host[1:-1, 1:-1, 1:-1]
+
+    @cached_property
+    def placement(self) -> GridPlacement:
+        """Spacing and place of the grid, as kernels over particles take them."""
+        return GridPlacement(self.planes, self.spacing, 1.0 / self.spacing, *self.origin)
 
     @cached_property
     def everywhere(self) -> Window:

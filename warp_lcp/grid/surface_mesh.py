@@ -136,15 +136,19 @@ class SurfaceMesh:
         smooth = self._smoothed(raw, first, second, self._passes)
         thin, phi = (field for field in self._fields if field is not smooth)
         thin.zero_()
-        given = {"smooth": smooth, "capacity": self._capacity, "thin": thin, "gain": self._gain, "most": self._most}
-        launch(kernels.BOOST, len(position), lattice, each=self._each, position=position, **given)
+        launch(
+            kernels.BOOST, len(position), lattice, position=position, each=self._each, smooth=smooth, capacity=self._capacity,
+            thin=thin, gain=self._gain, most=self._most,
+        )  # fmt: skip
         self._mirror(thin, fold=True)
         if self._thin_passes:
             done = self._smoothed(thin, phi, thin, self._thin_passes)
             thin, phi = done, phi if done is thin else thin
         window = lattice.everywhere
-        shares = {"smooth": smooth, "thin": thin, "capacity": self._capacity, "planes": lattice.planes, "spread": self._spread}
-        window.run(kernels.DISTANCE, phi=phi, known=self._known, **shares)
+        window.run(
+            kernels.DISTANCE, phi=phi, known=self._known, smooth=smooth, thin=thin, capacity=self._capacity, planes=lattice.planes,
+            spread=self._spread,
+        )  # fmt: skip
         if self._room is not None:
             extrapolate(window, self._known, phi, EXTENDED)
             window.run(kernels.CARVE, room=self._room, phi=phi)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
@@ -10,6 +10,9 @@ from warp_lcp.grid.staggered import KERNELS, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Tally
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 CUDA_SUMS = 1 << 20  # columns of cells, a thread each, into which a GPU cuts a grid: some waves of the largest ones
 CUDA_PLANES = 16  # of one of them, at least
@@ -37,24 +40,22 @@ class WindowTally:
             self._partials, self._host = (wp.zeros(columns * rows, dtype=wp.float64, device=device) for _ in range(2))
             self._reading, self._columns = Reading(device, columns), Rows.flat(columns, device, serial=True)
 
-    def take(self, window: Window, **given: Any) -> None:
-        """Launch the pass over a window."""
+    def take(self, window: Window, *structs: DataclassInstance, **given: Any) -> None:
+        """Launch the pass, bound as by `RowPass.bind`, over a window."""
+        rows_of_sums = window.rows_of_sums(self._planes)
         if self._tally is not None:
-            self._tally.take(window.rows_of_sums(self._planes), **given)
+            self._tally.launch(rows_of_sums, structs, given)
             return
-        self._declared.bind(window.rows_of_sums(self._planes), **given, out=self._partials).launch()
-        box, numbers = self._counted or window, dict[str, Any]()
-        if isinstance(window, ActiveWindow):
-            numbers |= {"hulls": window.pieces, "pieces": window.hull_pieces}
-        elif window.near is not None:
-            numbers |= {"hulls": len(window._hulls), "pieces": window._hulls}
-        else:
-            numbers |= {"hulls": 0, "pieces": None}
-        numbers |= dict(zip(("first_k", "first_j", "planes", "rows_"), _numbers(window), strict=True))
-        numbers |= dict(zip(("box_k", "box_j", "box_planes", "box_rows"), _numbers(box), strict=True))
-        arrays = {"partials": self._partials, "host": self._host, "results": self._reading.array}
-        sizes: dict[str, Any] = {"sums_": len(self._declared.sums), "all_planes": self._shape[0], "all_rows": self._shape[1]}
-        ADD_ROWS.bind(self._columns, **arrays, **numbers, **sizes).launch()
+        given["out"] = self._partials
+        self._declared.bind_arguments(rows_of_sums, structs, given).launch()
+        first_k, first_j, planes, rows = _numbers(window)
+        box_k, box_j, box_planes, box_rows = _numbers(self._counted or window)
+        hulls, pieces = _hulls(window)
+        ADD_ROWS.bind(
+            self._columns, partials=self._partials, host=self._host, results=self._reading.array, hulls=hulls, pieces=pieces,
+            first_k=first_k, first_j=first_j, planes=planes, rows_=rows, box_k=box_k, box_j=box_j, box_planes=box_planes,
+            box_rows=box_rows, sums_=len(self._declared.sums), all_planes=self._shape[0], all_rows=self._shape[1],
+        ).launch()  # fmt: skip
         self._reading.changed()
 
     def changed(self) -> None:
@@ -77,3 +78,10 @@ def _numbers(window: Window) -> tuple[Any, ...]:
     if isinstance(window, ActiveWindow):
         return *window.first, *window.sizes
     return *window.low[:2], *window.rows
+
+
+def _hulls(window: Window) -> tuple[Any, Any]:
+    """Return how many pieces of rows a window in part has, and those; 0 and None: all of its box."""
+    if isinstance(window, ActiveWindow):
+        return window.pieces, window.hull_pieces
+    return (0, None) if window.near is None else (len(window._hulls), window._hulls)

@@ -22,7 +22,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
-from warp_lcp.grid.particle_loops import launch, on_grid, scatter, touched_planes
+from warp_lcp.grid.particle_loops import launch, scatter, touched_planes
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.memory import Scalar, value_of
@@ -85,11 +85,16 @@ def particles_to_faces(
     for axis, (field, weight) in enumerate(zip(fields, weights, strict=True)):
         window.clear(field, weight)
         gradient = affine[axis] if affine else None
-        particles = {"position": position, "velocity": velocity, "gradient": gradient, "axis": axis}
         if offsets is not None:
-            window.run(passes.gather_weights, offsets=offsets, field=field, weight=weight, **particles, **on_grid(grid))
+            window.run(
+                passes.gather_weights, grid.placement, position=position, velocity=velocity, gradient=gradient, axis=axis,
+                offsets=offsets, field=field, weight=weight,
+            )  # fmt: skip
             continue
-        scatter(passes.scatter, grid, touched=touched, runs=runs, momentum=field, weight=weight, **particles)
+        scatter(
+            passes.scatter, grid, position, touched, runs=runs, velocity=velocity, gradient=gradient, axis=axis, momentum=field,
+            weight=weight,
+        )  # fmt: skip
         window.launch(passes.normalize, [weight, field])
 
 
@@ -112,8 +117,10 @@ def faces_to_particles(
     for axis, field in enumerate(fields):
         gradient = affine[axis] if affine else None
         old = saved[axis] if saved and flip > 0.0 else None
-        particles = {"position": position, "velocity": velocity, "gradient": gradient}
-        launch(passes.interpolate, len(position), grid, axis=axis, flip=flip, field=field, saved=old, **particles)
+        launch(
+            passes.interpolate, len(position), grid, position=position, velocity=velocity, gradient=gradient, axis=axis, flip=flip,
+            field=field, saved=old,
+        )  # fmt: skip
 
 
 @cell_kernel("warp_lcp.grid.gravity")

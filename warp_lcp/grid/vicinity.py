@@ -88,9 +88,11 @@ class Vicinity:
         if self._marks is None:
             self._marks = wp.zeros(math.prod(self._shape), dtype=wp.uint8, device=self.grid.device)
         self._marks.zero_()
-        sizes = dict(zip(("in_z", "in_y", "in_x"), self._shape, strict=True))
-        given = {"position": particles.position, "marks": self._marks, "segment": SEGMENT}
-        launch(MARK, len(particles.position), self.grid, **given, **sizes)
+        in_z, in_y, in_x = self._shape
+        launch(
+            MARK, len(particles.position), self.grid, position=particles.position, marks=self._marks, segment=SEGMENT,
+            in_z=in_z, in_y=in_y, in_x=in_x,
+        )  # fmt: skip
         near = np.zeros(self._shape, dtype=np.uint8)
         part = tuple(slice(low, high) for low, high in zip(box.low, box.high, strict=True))
         part = (*part[:2], slice(part[2].start // SEGMENT, -(-part[2].stop // SEGMENT)))

@@ -116,9 +116,11 @@ class ConjugateGradient:
         self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
         self._reduction = Reduction(r.size, r.device, self._scalars, threads=None if rows is None else rows.places, across=across)
         self._program: Program | None = None
-        rows, given = rows or rows_of(r), {"direction": self._p, "scalars": self._scalars}
-        self._direction = DIRECTION.bind(rows, z=preconditioner.z, **given)
-        self._update = UPDATE.bind(rows, q=self._q, w=weight, x=self.x, r=r, out=self._reduction.partials, **given)
+        rows = rows or rows_of(r)
+        self._direction = DIRECTION.bind(rows, z=preconditioner.z, direction=self._p, scalars=self._scalars)
+        self._update = UPDATE.bind(
+            rows, direction=self._p, q=self._q, w=weight, x=self.x, r=r, scalars=self._scalars, out=self._reduction.partials
+        )
 
     def solve(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> tuple[int, float]:
         """Iterate from x = 0 until the residual norm is at most the tolerance.

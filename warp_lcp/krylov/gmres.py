@@ -119,13 +119,15 @@ class GMRES:
 
     def _combine(self, factors: wp.array[Any], x: wp.array[Any], count: int, *, sign: float = 1.0, of: wp.array[Any] | None = None) -> None:
         """x += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
-        fields = {"basis": self._basis if of is None else of, "size": x.size}
-        self._sums.of(COMBINE, self._restart + 1, **fields, factors=factors, x=x, count=count, sign=sign)
+        basis = self._basis if of is None else of
+        self._sums.of(COMBINE, slot=self._restart + 1, basis=basis, size=x.size, factors=factors, x=x, count=count, sign=sign)
 
     def _stored(self, place: int) -> np.ndarray:
         """Store `_q`, normalized, as a vector; return the sums."""
-        given = {"basis": self._basis, "size": self._q.size, "place": place, "sums": self._sums.scalars, "x": self._q}
-        STORE.bind(rows_of(self._q), **given, last=self._restart + 1).launch()
+        STORE.bind(
+            rows_of(self._q), basis=self._basis, size=self._q.size, place=place, sums=self._sums.scalars, x=self._q,
+            last=self._restart + 1,
+        ).launch()  # fmt: skip
         return self._sums.scalars.numpy()
 
     def _rotate(self, k: int) -> None:

@@ -86,8 +86,7 @@ class DensityMonitor:
 
     def _launch(self, density: wp.array) -> None:
         b = self.boundary
-        filled = {"base": b.base, "density": density, "capacity": b.capacity}
-        self._crowd.take(self._cells, **filled, most=self.max_density)
+        self._crowd.take(self._cells, base=b.base, density=density, capacity=b.capacity, most=self.max_density)
 
     def _find(self, density: wp.array, particles: Particles, window: Window) -> None:
         """Find the particles' density."""
@@ -104,6 +103,27 @@ class DensityMonitor:
         """
         above, held, densest = self._read()
         return above / held if held > 0.0 else 0.0, densest
+
+
+@dataclass(frozen=True, slots=True)
+class DensityFields:
+    """Fields of the problem that moves material out of overfull cells.
+
+    Attributes:
+        kind: int8 cell types of the problem (written).
+        b: right-hand side (written).
+        x: solution of the last problem, the start of this one.
+        density: of the material, in units of that at rest, float32.
+        capacity: open share of each cell's kernel, float32; None: 1.
+        inside: cells deep inside, which may lack material; None: none.
+    """
+
+    kind: wp.array
+    b: wp.array
+    x: wp.array
+    density: wp.array
+    capacity: wp.array | None
+    inside: wp.array | None
 
 
 @dataclass(frozen=True)
@@ -222,8 +242,10 @@ class DensityCorrection:
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None
-            fields = {"x": self.x, "kind": self._kind, "open": open_, "density": self.density, "capacity": self.boundary.capacity}
-            self.grid.domain.run(self._displace, **fields, axis=axis, most=longest, dx=self._way, d=field)
+            self.grid.domain.run(
+                self._displace, x=self.x, kind=self._kind, open=open_, density=self.density, capacity=self.boundary.capacity,
+                axis=axis, most=longest, dx=self._way, d=field,
+            )  # fmt: skip
 
     def _launch_preparation(self, particles: Particles, window: Window, fill: Fill | None, contact: wp.array | None) -> None:
         """Launch the density and the set-up of the problem."""
@@ -245,19 +267,12 @@ class DensityCorrection:
     def _prepare(self, contact: wp.array | None) -> None:
         """Set up the problem, and count over-full cells."""
         b, most = self.boundary, self.max_density
-        fields: dict[str, Any] = {
-            "kind": self._kind,
-            "b": self._b,
-            "x": self.x,
-            "density": self.density,
-            "capacity": b.capacity,
-            "inside": self._inside,
-        }
-        self._over.take(self._solved, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
+        fields = DensityFields(self._kind, self._b, self.x, self.density, b.capacity, self._inside)
+        self._over.take(self._solved, fields, base=b.base, contact=contact, most=most, gain=self.gain)
         if self._inside is not None:
-            numbers: dict[str, Any] = {"least": min(most, 2.0 - most), "planes": self.grid.planes - 1}
             self._join()
-            self._lacking.take(self._solved, **fields, **numbers, lower=self._lower)
+            least, planes = min(most, 2.0 - most), self.grid.planes - 1
+            self._lacking.take(self._solved, fields, least=least, planes=planes, lower=self._lower)
 
     def _found(self) -> tuple[float, float]:
         """Return how many cells are over-full or lack material deep inside, and the largest density."""

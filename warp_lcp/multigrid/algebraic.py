@@ -21,6 +21,7 @@ from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
 from warp_lcp.multigrid.coarsest_kernels import PINNED
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
+from warp_lcp.operators.compressed_rows import RowEntries
 from warp_lcp.operators.sparse import GATHER, PRODUCT, SparseOperator
 from warp_lcp.rows import Bound, KernelFile, Rows
 from warp_lcp.rows.fields import kept, zeros
@@ -44,11 +45,11 @@ class DeviceMatrix:
         self.shape, self.device = host.shape, device
         self.indptr, self.indices = (kept(v, wp.int32, device) for v in (host.indptr, host.indices))
         self.values = kept(host.data, real, device)
-        self.rows, self.operands = Rows.flat(self.shape[0], device), {"ptr": self.indptr, "col": self.indices, "a": self.values}
+        self.rows, self.entries = Rows.flat(self.shape[0], device), RowEntries(self.indptr, self.indices, self.values)
 
     def product(self, x: wp.array[Any], y: wp.array[Any], launch: Launch, *, add: bool = False) -> None:
         """y = A x, or y + A x."""
-        PRODUCT.bind(self.rows, **self.operands, x=x, plus=y if add else None, y=y).launch(launch)
+        PRODUCT.bind(self.rows, self.entries, x=x, plus=y if add else None, y=y).launch(launch)
 
 
 def product_pass(left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]) -> Bound:
@@ -67,8 +68,10 @@ def product_pass(left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hos
     at = wp.zeros(C.shape[1], dtype=wp.int32, device="cpu")
     wp.launch(places_kernel, 1, [*patterns, at, place, A.shape[0]], device="cpu")
     begins = wp.array(ends[A.indptr[:-1]], dtype=wp.int64, device=left.device)
-    given = {"right": right.indptr, "b": right.values, "starts": out.indptr, "place": place.to(left.device), "result": out.values}
-    return MULTIPLY.bind(left.rows, **left.operands, **given, begins=begins)
+    return MULTIPLY.bind(
+        left.rows, left.entries, right=right.indptr, b=right.values, starts=out.indptr, place=place.to(left.device),
+        result=out.values, begins=begins,
+    )  # fmt: skip
 
 
 class AlgebraicLevel:
@@ -95,8 +98,8 @@ class AlgebraicLevel:
 
     def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, launch: Launch, *, from_zero: bool = False) -> None:
         """y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
-        given = {"inverse": self.inverse, "x": x, "b": self.b, "y": y, "omega": omega, "from_zero": from_zero}
-        SMOOTH.bind(self.A.rows, **self.A.operands, **given).launch(launch)
+        A = self.A
+        SMOOTH.bind(A.rows, A.entries, inverse=self.inverse, x=x, b=self.b, y=y, omega=omega, from_zero=from_zero).launch(launch)
 
 
 class AlgebraicHierarchy:
@@ -134,9 +137,10 @@ class AlgebraicHierarchy:
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take a free set (uint8 field) and a shift D >= 0 (float64 field; None: 0), and coarsen."""
         finest, A = self.levels[0], self.source
-        given = {"d": A.diagonal(), "free": free, "shift": shift, "inverse": finest.inverse, "scale": self.scale, "weight": self.weight}
-        pattern = {**finest.A.operands, "a": A.values, "order": self._order, "m": finest.A.values}
-        FILL.bind(finest.A.rows, **pattern, **given).launch()
+        FILL.bind(
+            finest.A.rows, finest.A.entries, a=A.values, order=self._order, m=finest.A.values, d=A.diagonal(), free=free,
+            shift=shift, inverse=finest.inverse, scale=self.scale, weight=self.weight,
+        ).launch()  # fmt: skip
         self._coarsening.run()
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
@@ -170,7 +174,7 @@ class AlgebraicHierarchy:
             INVERSE.bind(coarse.A.rows, ptr=coarse.A.indptr, a=coarse.A.values, inverse=coarse.inverse).launch(launch)
         if self.inverts:
             last = self.levels[-1]
-            launch(densify_kernel, last.size, [*last.A.operands.values(), self._matrix], device=self.device)
+            launch(densify_kernel, last.size, [last.A.indptr, last.A.indices, last.A.values, self._matrix], device=self.device)
             launch(factor_kernel, 1, [self._matrix, wp.float64(PINNED[self.real])], device=self.device)
             launch(invert_kernel, last.size, [self._matrix, self._inverse], device=self.device)
         return program
@@ -185,7 +189,7 @@ class AlgebraicHierarchy:
         assert P is not None
         L.sweep(L.t, L.x, first, launch, from_zero=from_zero)
         L.sweep(L.x, L.t, second, launch)
-        REMAINDER.bind(L.A.rows, **L.A.operands, x=L.x, b=L.b, y=L.t).launch(launch)
+        REMAINDER.bind(L.A.rows, L.A.entries, x=L.x, b=L.b, y=L.t).launch(launch)
         L.R.product(L.t, C.b, launch)
         for visit in range(self._gamma if depth + 2 < len(self.levels) else 1):
             self._visit(depth + 1, launch, from_zero=visit == 0)

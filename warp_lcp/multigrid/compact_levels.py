@@ -56,12 +56,14 @@ class DenseInverse:
 
     def making(self, stencil: PaddedStencil, real: Any, launch: Launch) -> None:
         """Launch the passes that make the inverse."""
-        turns: dict[str, Any] = dict(zip(("periodic_x", "periodic_y", "periodic_z"), stencil.periodic, strict=True))
-        nz, ny, nx = self._counts
-        rows = Rows.of(stencil.padding, self._device, whole=True)
-        ASSEMBLE.bind(rows, stencil=stencil, matrix=self.matrix.flatten(), cells=nx, lines=ny, planes=nz, **turns).launch(launch)
-        fields = {"matrix": self.matrix.flatten(), "inverse": self.inverse.flatten(), "own": self._own}
-        ELIMINATE.bind(Rows.flat(1, self._device, serial=True), **fields, m=nz * ny * nx, least=PINNED[real]).launch(launch)
+        (px, py, pz), (nz, ny, nx) = stencil.periodic, self._counts
+        matrix, inverse = self.matrix.flatten(), self.inverse.flatten()
+        rows, one = Rows.of(stencil.padding, self._device, whole=True), Rows.flat(1, self._device, serial=True)
+        ASSEMBLE.bind(
+            rows, stencil=stencil, matrix=matrix, cells=nx, lines=ny, planes=nz, periodic_x=px, periodic_y=py, periodic_z=pz
+        ).launch(launch)
+        m, least = nz * ny * nx, PINNED[real]
+        ELIMINATE.bind(one, matrix=matrix, inverse=inverse, own=self._own, m=m, least=least).launch(launch)
 
     def solving(self, level: Any) -> Bound:
         """Return the pass that solves on a level with x and b."""

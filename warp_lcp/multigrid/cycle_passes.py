@@ -8,7 +8,11 @@ stiff, so they are multiplied by `stiffen`, the over-correction that the prolong
 one cell and not one aggregate away, by `held`.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import warp as wp
 
 from warp_lcp.rows import KernelFile, Wave
 
@@ -35,6 +39,32 @@ HOLD = LEVELS["coarsen.hold"]
 SOLVE = LEVELS["coarsen.solve"]
 INVERT = LEVELS["coarsen.invert"]
 CLEAR = KERNELS["cycle.clear"]
-LOWER = ("lower_x", "lower_y", "lower_z")
 RENEW = LEVELS["renew.clear"]
 SIGN = LEVELS["renew.sign"]
+
+
+@dataclass(frozen=True, slots=True)
+class Coarsening:
+    """What the kernels that coarsen a matrix take, compact or not.
+
+    Attributes:
+        changed: rows of the finer level that have changed, uint8.
+        coarse_changed: rows of the coarser level, uint8 (written).
+        coarse_d: its diagonal (written).
+        cells: of a row of the finer level.
+        periodic_x: whether the finer level is periodic along x.
+        periodic_y: likewise along y.
+        periodic_z: likewise along z.
+        stiffen: factor of weights along axes that are not aggregated.
+        held: factor of the excess of a diagonal over its weights.
+    """
+
+    changed: wp.array[Any]
+    coarse_changed: wp.array[Any]
+    coarse_d: wp.array[Any]
+    cells: int
+    periodic_x: bool
+    periodic_y: bool
+    periodic_z: bool
+    stiffen: float
+    held: float

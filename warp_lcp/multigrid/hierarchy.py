@@ -13,7 +13,7 @@ import warp as wp
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.coarsest_kernels import PINNED, coarsest_kernels
 from warp_lcp.multigrid.compact_levels import DenseInverse, coarser_pattern, mask, weights_block
-from warp_lcp.multigrid.cycle_passes import UNBOUNDED
+from warp_lcp.multigrid.cycle_passes import UNBOUNDED, Coarsening
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
@@ -59,49 +59,59 @@ class Level:
             keeps_weights: whether the weights are not the level's own to clear.
         """
         s = self.stencil
-        weights = dict(zip(passes.LOWER, (None if keeps_weights or s.pattern else s.weights) or (None,) * 3, strict=True))
-        fields = {"x": self.x, "b": self.b, "t": self.t, "diagonals": s.d, **weights}
+        lower_x, lower_y, lower_z = (None if keeps_weights or s.pattern else s.weights) or (None,) * 3
         rows = Rows.of(s.padding, s.device, whole=True)
-        return passes.RENEW.bind(rows, **fields, spans=s.spans, known=self._spans, changed=self.changed)
+        return passes.RENEW.bind(
+            rows, x=self.x, b=self.b, t=self.t, diagonals=s.d, lower_x=lower_x, lower_y=lower_y, lower_z=lower_z, spans=s.spans,
+            known=self._spans, changed=self.changed,
+        )  # fmt: skip
 
     def signing(self, signs: wp.array[Any]) -> Bound:
         """Return the pass that marks rows whose weights hash to other 64 bits than before."""
         s = self.stencil
-        weights = dict(zip(("weight_x", "weight_y", "weight_z"), s.weights or (), strict=True))
-        return passes.SIGN.bind(Rows.of(s.padding, s.device, s.spans, whole=True), **weights, signs=signs, changed=self.changed)
+        assert s.weights is not None
+        weight_x, weight_y, weight_z = s.weights
+        rows = Rows.of(s.padding, s.device, s.spans, whole=True)
+        return passes.SIGN.bind(rows, weight_x=weight_x, weight_y=weight_y, weight_z=weight_z, signs=signs, changed=self.changed)
 
     def coarsening(self, coarse: Level, stiffen: float, held: float) -> Bound:
         """Return the pass that makes those of the coarser level's rows that depend on rows of this level that have changed."""
         s, c = self.stencil, coarse.stencil
-        turns: dict[str, Any] = dict(zip(("periodic_x", "periodic_y", "periodic_z"), s.periodic, strict=True))
-        numbers: dict[str, Any] = {"cells": s.padding.counts[2], "stiffen": stiffen, "held": held, **turns}
+        shared = Coarsening(self.changed, coarse.changed, c.d, s.padding.counts[2], *s.periodic, stiffen, held)
         if coarse.block is not None and c.pattern is not None:
-            given = {"changed": self.changed, "coarse_changed": coarse.changed, "coarse_d": c.d, "coarse_weights": coarse.block}
-            numbers |= {"coarse_size": c.padding.size, "MASK": mask(c.pattern)}
-            return passes.COARSEN_COMPACT.bind(self._coarser_rows(coarse), stencil=s, **given, **numbers)
-        names = ("coarse_d", "coarse_wx", "coarse_wy", "coarse_wz")
-        fields = dict(zip(names, (c.d, *(c.weights or ())), strict=True)) | {"changed": self.changed, "coarse_changed": coarse.changed}
-        return passes.COARSEN.bind(self._coarser_rows(coarse), stencil=s, **fields, **numbers)
+            return passes.COARSEN_COMPACT.bind(
+                self._coarser_rows(coarse), shared, stencil=s, coarse_weights=coarse.block, coarse_size=c.padding.size,
+                MASK=mask(c.pattern),
+            )  # fmt: skip
+        assert c.weights is not None
+        wx, wy, wz = c.weights
+        return passes.COARSEN.bind(self._coarser_rows(coarse), shared, stencil=s, coarse_wx=wx, coarse_wy=wy, coarse_wz=wz)
 
     def restricting(self, coarse: Level, rows: Rows | None = None) -> Bound:
         """Return the pass that sums the residual over aggregates, all unless told."""
-        fields, there = {"x": self.x, "b": self.b, "coarse": coarse.b}, rows or self._coarser_rows(coarse)
-        return self._once(("restrict", coarse, id(rows)), lambda: passes.RESTRICT.bind(there, stencil=self.stencil, **fields))
+        there = rows or self._coarser_rows(coarse)
+        make = lambda: passes.RESTRICT.bind(there, stencil=self.stencil, x=self.x, b=self.b, coarse=coarse.b)  # noqa: E731
+        return self._once(("restrict", coarse, id(rows)), make)
 
     def bounding(self, coarse: Level, scale: float) -> Bound:
         """Return the pass that finds the bounds of a coarse correction."""
-        fields = {"x": self.x, "lower": self.lower, "upper": self.upper, "coarse_lower": coarse.lower, "coarse_upper": coarse.upper}
-        given: dict[str, Any] = {"stencil": self.stencil, "scale": scale, **fields}
-        return self._once(("bounds", coarse), lambda: passes.COARSE_BOUNDS.bind(self._coarser_rows(coarse), **given))
+        make = lambda: passes.COARSE_BOUNDS.bind(  # noqa: E731
+            self._coarser_rows(coarse), stencil=self.stencil, scale=scale, x=self.x, lower=self.lower, upper=self.upper,
+            coarse_lower=coarse.lower, coarse_upper=coarse.upper,
+        )  # fmt: skip
+        return self._once(("bounds", coarse), make)
 
     def correcting(
         self, coarse: Level, scale: float, *, projected: bool, rows: Rows | None = None, x: wp.array[Any] | None = None
     ) -> Bound:
         """Return the pass that adds `scale` times the coarse correction to x, or another field, clipped if projected."""
         there = rows or self._finer_rows(coarse)
-        fields = {"x": self.x if x is None else x, "coarse": coarse.x, **self._sides(projected)}
-        given: dict[str, Any] = {"stencil": self.stencil, "scale": scale, "projected": projected, **fields}
-        return self._once((coarse, projected, id(rows)), lambda: passes.CORRECT.bind(there, **given))  # which keeps the rows
+        lower, upper = self._sides(projected)
+        make = lambda: passes.CORRECT.bind(  # noqa: E731
+            there, stencil=self.stencil, scale=scale, projected=projected, x=self.x if x is None else x, coarse=coarse.x,
+            lower=lower, upper=upper,
+        )  # fmt: skip
+        return self._once((coarse, projected, id(rows)), make)  # which keeps the rows
 
     def filling(self, name: str) -> list[Stage]:
         """Return what fills the ghost cells of a field, x or t."""
@@ -146,8 +156,8 @@ class Level:
             made = self._bound[key] = make()
         return made
 
-    def _sides(self, projected: bool) -> dict[str, Any]:
-        return {"lower": self.lower, "upper": self.upper} if projected else {"lower": None, "upper": None}
+    def _sides(self, projected: bool) -> tuple[wp.array[Any] | None, wp.array[Any] | None]:
+        return (self.lower, self.upper) if projected else (None, None)
 
     def _coarser_rows(self, coarse: Level) -> Rows:
         return coarse.stencil.rows.beside(self.stencil.rows, coarse.factors)
@@ -164,10 +174,12 @@ class Level:
 
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.
         """
-        fields = {"x": x, "y": y, "b": self.b, **self._sides(projected)}
-        numbers: dict[str, Any] = {"omega": omega, "projected": projected, "from_zero": from_zero}
-        key = kind, id(rows), y is self.x, *numbers.values()
-        return self._once(key, lambda: kind.bind(rows or self.stencil.rows, stencil=self.stencil, **numbers, **fields))
+        lower, upper = self._sides(projected)
+        make = lambda: kind.bind(  # noqa: E731
+            rows or self.stencil.rows, stencil=self.stencil, x=x, y=y, b=self.b, lower=lower, upper=upper, omega=omega,
+            projected=projected, from_zero=from_zero,
+        )  # fmt: skip
+        return self._once((kind, id(rows), y is self.x, omega, projected, from_zero), make)
 
 
 class Hierarchy:
@@ -317,8 +329,9 @@ class Hierarchy:
             program.launch(kernels.invert, CUDA_THREADS, inputs, device=self.device, block_dim=CUDA_THREADS)
             return
         program.launch(kernels.factor, 1, [*inputs, last.changed, matrix], device=self.device)
-        fields = {"changed": last.changed, "matrix": matrix, "inverse": inverse}
-        passes.INVERT.bind(Rows.flat(m, self.device), **fields, m=m, flags=last.changed.size).launch(program.launch)
+        passes.INVERT.bind(
+            Rows.flat(m, self.device), changed=last.changed, matrix=matrix, inverse=inverse, m=m, flags=last.changed.size
+        ).launch(program.launch)
 
     @cached_property
     def cycle(self) -> Program:

@@ -10,6 +10,7 @@ side, for winds at Peclet numbers up to 1e4 that turn, for anisotropy of 1 : 100
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -27,7 +28,6 @@ from warp_lcp.rows.program import Program
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/lines.h")
 FILL = KERNELS["lines.fill"]
-FACTORS = {"fx": int, "fy": int}
 EDGES = KERNELS["lines.edges"]
 CORNERS = KERNELS["lines.corners"]
 GALERKIN = KERNELS["lines.galerkin"]
@@ -43,6 +43,29 @@ COLUMNS = 256  # that one thread of a CPU solves for together: their cells of a 
 EVEN = 0.5  # least ratio of weights along the two axes for point sweeps
 
 
+@dataclass(frozen=True, slots=True)
+class LineFields:
+    """Fields of a level as the kernels of line multigrid take them.
+
+    Attributes:
+        x: iterate.
+        b: right-hand side.
+        t: buffer.
+        d: diagonal.
+        weights: minus the coefficients, one field an offset, one after another.
+        size: elements of a field.
+        cells: of a row.
+    """
+
+    x: wp.array[Any]
+    b: wp.array[Any]
+    t: wp.array[Any]
+    d: wp.array[Any]
+    weights: wp.array[Any]
+    size: int
+    cells: int
+
+
 class LineLevel:
     """One grid: its stored stencil, iterate x, right-hand side b, a buffer t, factors of its lines, and shares in the next coarser one."""
 
@@ -53,6 +76,7 @@ class LineLevel:
         self.weights, self.shares = make(8), make(4)
         self.restricts = self.shares if symmetric else make(4)
         self.x, self.b, self.t, self.d = (padding.zeros(real, device) for _ in range(4))
+        self.fields = LineFields(self.x, self.b, self.t, self.d, self.weights, n, padding.counts[2])
         self.lines = [(make(1), make(1)) for _ in range(2)]  # one over pivots and multiples, along x and along y
         each = tuple(self.weights[i * n : (i + 1) * n] for i in range(8))
         self.stencil = PaddedStencil(padding, self.d, each, (), pattern=AROUND)
@@ -63,43 +87,44 @@ class LineLevel:
 
     def transferring(self) -> list[Bound]:
         """Return the passes that make shares."""
-        given: dict[str, Any] = {"d": self.d, "weights": self.weights, "size": self.padding.size}
-        given |= dict(zip(FACTORS, self.factors, strict=True))
-        kinds: list[dict[str, Any]] = [{"SAME": 1}] if self.restricts is self.shares else [{"RESTRICTION": 0}, {"RESTRICTION": 1}]
+        fx, fy = self.factors
+        same = int(self.restricts is self.shares)
         passes = []
-        for shares, kind in zip((self.shares, self.restricts), kinds, strict=False):
-            passes += [EDGES.bind(self.rows, **given, shares=shares, **kind)]
-            passes += [CORNERS.bind(self.rows, **given, shares=shares, **kind)] if self.factors == (2, 2) else []
+        for restriction, shares in enumerate([self.shares] if same else [self.shares, self.restricts]):
+            for kernel in (EDGES, CORNERS) if self.factors == (2, 2) else (EDGES,):
+                passes.append(kernel.bind(self.rows, self.fields, shares=shares, fx=fx, fy=fy, SAME=same, RESTRICTION=restriction))
         return passes
 
     def factoring(self) -> list[Bound]:
         """Return the passes that eliminate along lines."""
-        made = []
-        for rows, (pivots, multiples), along in zip((self.rows, self.columns), self.lines, self._along, strict=True):
-            fields = {"unused": self.d, "weights": self.weights, "diagonals": self.d, "pivots": pivots, "multiples": multiples}
-            made.append(FACTOR.bind(rows, **fields, size=self.padding.size, **along))
-        return made
-
-    @property
-    def _along(self) -> list[dict[str, Any]]:
         _, ny, nx = self.padding.counts
-        return [{"step": 1, "count": nx}, {"step": self.padding.row, "count": ny}]
+        made = []
+        for rows, (pivots, multiples), step, count in zip(
+            (self.rows, self.columns), self.lines, (1, self.padding.row), (nx, ny), strict=True
+        ):
+            made.append(
+                FACTOR.bind(rows, self.fields, unused=self.d, diagonals=self.d, pivots=pivots, multiples=multiples, step=step, count=count)
+            )
+        return made
 
     def coarsening(self, coarse: LineLevel) -> Bound:
         """Return the pass that makes the next level's matrix."""
-        constants: dict[str, Any] = dict(zip(("FX", "FY"), self.factors, strict=True))
-        sizes: dict[str, Any] = {"size": self.padding.size, "coarse_size": coarse.padding.size, "cells": self.padding.counts[2]}
-        fields = {"weights": self.weights, "diagonals": self.d, "shares": self.shares, "restricts": self.restricts, "unused": self.t}
+        fx, fy = self.factors
         rows = coarse.rows.beside(self.rows, (*self.factors, 1))
-        return GALERKIN.bind(rows, **fields, coarse_weights=coarse.weights, coarse_d=coarse.d, **sizes, **constants)
+        return GALERKIN.bind(
+            rows, self.fields, unused=self.t, diagonals=self.d, shares=self.shares, restricts=self.restricts,
+            coarse_weights=coarse.weights, coarse_d=coarse.d, coarse_size=coarse.padding.size, FX=fx, FY=fy,
+        )  # fmt: skip
 
     @cached_property
     def _zebras(self) -> tuple[list[Bound], list[Bound]]:
         """Sweeps of rows and of columns, each of both colors."""
-        common: dict[str, Any] = {"stencil": self.stencil, "x": self.x, "b": self.b, "t": self.t, "weights": self.weights}
-        (px, mx), (py, my), common["size"] = *self.lines, self.padding.size
-        across = [ZEBRA_X.bind(self.rows, **common, pivots=px, multiples=mx, color=color) for color in (0, 1)]
-        along = [ZEBRA_Y.bind(self.columns, **common, pivots=py, multiples=my, color=color, **self._along[1]) for color in (0, 1)]
+        (px, mx), (py, my) = self.lines
+        fields, s, step, count = self.fields, self.stencil, self.padding.row, self.padding.counts[1]
+        across = [ZEBRA_X.bind(self.rows, fields, stencil=s, pivots=px, multiples=mx, color=color) for color in (0, 1)]
+        along = [
+            ZEBRA_Y.bind(self.columns, fields, stencil=s, pivots=py, multiples=my, color=color, step=step, count=count) for color in (0, 1)
+        ]
         return across, along
 
     def smoothing(self, *, up: bool) -> list[Bound]:
@@ -109,22 +134,18 @@ class LineLevel:
 
     def restricting(self, coarse: LineLevel) -> list[Bound]:
         """Return what hands the residual on."""
-        return [RESIDUAL.bind(self.rows, stencil=self.stencil, x=self.x, b=self.b, t=self.t), self.handing_down(coarse)]
+        return [RESIDUAL.bind(self.rows, self.fields, stencil=self.stencil), self.handing_down(coarse)]
 
     def handing_down(self, coarse: LineLevel) -> Bound:
         """Return what makes t the coarse right-hand side."""
-        numbers: dict[str, Any] = {
-            "size": self.padding.size,
-            "cells": self.padding.counts[2],
-            **dict(zip(FACTORS, self.factors, strict=True)),
-        }
-        fields = {"t": self.t, "shares": self.restricts[: self.padding.size], "coarse": coarse.b}
-        return DOWN.bind(coarse.rows.beside(self.rows, (*self.factors, 1)), **fields, **numbers)
+        fx, fy = self.factors
+        rows = coarse.rows.beside(self.rows, (*self.factors, 1))
+        return DOWN.bind(rows, self.fields, shares=self.restricts[: self.padding.size], coarse=coarse.b, fx=fx, fy=fy)
 
     def correcting(self, coarse: LineLevel, *, add: bool = True) -> Bound:
         """Return what adds the coarse correction, or takes it."""
         rows = self.rows.beside(coarse.rows, (-self.factors[0], -self.factors[1], -1))
-        return UP.bind(rows, coarse=coarse.x, d=self.d, x=self.x, shares=self.shares, size=self.padding.size, add=add)
+        return UP.bind(rows, self.fields, coarse=coarse.x, shares=self.shares, add=add)
 
 
 class LineHierarchy:
@@ -168,8 +189,7 @@ class LineHierarchy:
 
     def _fill(self, free: wp.array[Any], shift: wp.array[Any] | None, weight: wp.array[Any] | None) -> None:
         finest = self.finest
-        given: dict[str, Any] = {"free": free, "shift": shift, "weight": weight, "made": finest.d, "weights": finest.weights}
-        FILL.bind(finest.rows, stencil=self._source, **given, size=finest.padding.size).launch()
+        FILL.bind(finest.rows, finest.fields, stencil=self._source, free=free, shift=shift, weight=weight, made=finest.d).launch()
 
     @cached_property
     def _building(self) -> Program:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, no_type_check
 
@@ -78,7 +79,29 @@ if TYPE_CHECKING:
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]
 ROUNDED = 1e-10  # of the terms of a sum whose weights were computed
-FACES, UNIFORM = dict.fromkeys(("face_x", "face_y", "face_z"), "F"), dict.fromkeys(("cx", "cy", "cz"), wp.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class FaceCoefficients:
+    """Coefficients of the lower faces of cells, which join these.
+
+    Attributes:
+        face_x: along x, a stored field; empty: `cx` everywhere.
+        face_y: along y; empty: `cy`.
+        face_z: along z; empty: `cz`.
+        cx: the same along x for all faces.
+        cy: likewise along y.
+        cz: likewise along z.
+    """
+
+    face_x: wp.array[Any]
+    face_y: wp.array[Any]
+    face_z: wp.array[Any]
+    cx: float
+    cy: float
+    cz: float
+
+
 KERNELS = KernelFile(Path(__file__).parent / "headers/components.h")
 SINGLETONS = KERNELS["components.singletons"]
 UNITE = KERNELS["components.unite"]
@@ -299,11 +322,10 @@ class ComponentFinder:
                 )
             scratch = self._own
         parent, grounded = scratch[0].view(wp.int32), scratch[1]
-        cells, coefficients = A.cells_around.flatten(), dict(zip(UNIFORM, A.uniform, strict=True))
-        given = coefficients | {name: face.flatten() for name, face in zip(FACES, A.faces, strict=True)}
+        cells, faces = A.cells_around.flatten(), FaceCoefficients(*(face.flatten() for face in A.faces), *A.uniform)
         SINGLETONS.bind(rows, parent=parent, grounded=grounded).launch(launch)
-        UNITE.bind(rows, cells=joined.flatten(), parent=parent, **given).launch(launch)
-        GROUND.bind(rows, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded, **given).launch(launch)
+        UNITE.bind(rows, faces, cells=joined.flatten(), parent=parent).launch(launch)
+        GROUND.bind(rows, faces, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded).launch(launch)
         COUNT.bind(rows, cells=cells, parent=parent, grounded=grounded, count=self._count.array).launch(launch)
         return parent, grounded
 

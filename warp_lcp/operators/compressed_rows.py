@@ -20,6 +20,21 @@ def matrix_rows(a_type: Any) -> Any:
     return make_struct(f"MatrixRows_{a_type.__name__}", members)
 
 
+@dataclass(frozen=True, slots=True)
+class RowEntries:
+    """Entries of a sparse matrix by rows, as kernels take them.
+
+    Attributes:
+        ptr: first entry of each row and the end, int32, shape (n + 1,).
+        col: columns of the entries, int32.
+        a: values of the entries, float32 or float64.
+    """
+
+    ptr: wp.array[Any]
+    col: wp.array[Any]
+    a: wp.array[Any]
+
+
 @dataclass(frozen=True, eq=False)
 class CompressedRows:
     """Compressed sparse rows of a matrix.

@@ -129,8 +129,8 @@ class DenseOperator(Pickled):
 
     def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
         """Sweep x once in row order, forward or backward, projected onto the bounds."""
-        given = {"b": b, "lower": lower, "upper": upper, "x": x, "omega": omega, "forward": forward}
-        RELAX.bind(Rows.flat(x.size, self.device, serial=True), a=self.matrix.flatten(), **given).launch()
+        rows, matrix = Rows.flat(x.size, self.device, serial=True), self.matrix.flatten()
+        RELAX.bind(rows, a=matrix, b=b, lower=lower, upper=upper, x=x, omega=omega, forward=forward).launch()
 
     def _product(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool) -> wp.array[Any]:
         if tuple(x.shape) != self.shape:

@@ -284,8 +284,10 @@ class GridOperator(Pickled):
     def _search(self) -> Bound:
         """Find the spans of `cells`; the arrays are always these."""
         rows = Rows.of(self.layout.padding, self.device, whole=True)
-        found = {"spans": self._spans.flatten(), "reach": self._reach.flatten(), "chunks": self._chunks.flatten()}
-        return FIND_SPANS.bind(rows, cells=self.cells.flatten(), **found, chunk_count=len(self._chunks), size=self.layout.size)
+        return FIND_SPANS.bind(
+            rows, cells=self.cells.flatten(), spans=self._spans.flatten(), reach=self._reach.flatten(),
+            chunks=self._chunks.flatten(), chunk_count=len(self._chunks), size=self.layout.size,
+        )  # fmt: skip
 
     def _wrap_cells(self) -> None:
         """Fill ghost cells of periodic axes in `cells_around`."""

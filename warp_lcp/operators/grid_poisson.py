@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,27 @@ __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
 Face = Any  # a number or an array
 AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True)
+class StoredFaces:
+    """Coefficients of the lower faces of cells.
+
+    Attributes:
+        fx: along x, a stored field; None: `nx` everywhere.
+        fy: along y; None: `ny`.
+        fz: along z; None: `nz`.
+        nx: the same along x for all faces.
+        ny: likewise along y.
+        nz: likewise along z.
+    """
+
+    fx: wp.array[Any] | None
+    fy: wp.array[Any] | None
+    fz: wp.array[Any] | None
+    nx: float
+    ny: float
+    nz: float
 
 
 class GridPoisson(GridOperator):
@@ -95,17 +117,22 @@ class GridPoisson(GridOperator):
         s, arrays = self.stencil, {name: shape for name, shape in self._given.items() if shape}
         for field in (multiplier, x):
             s.wrap(field)
-        fields: dict[str, Any] = {"cells": self.cells_around.flatten(), "multiplier": multiplier, "x": x}
+        cells = self.cells_around.flatten()
         found: dict[str, Any] = {}
         if len(arrays) < len(self._given):
             totals = Sums(Rows.of(self.layout.padding, self.device), 4)
-            values = totals.of(FACE_GRADIENT, **fields | dict.fromkeys(FACE_GRADIENT.writes)).tolist()
+            values = totals.of(
+                FACE_GRADIENT, cells=cells, multiplier=multiplier, x=x, face_x=None, face_y=None, face_z=None, shift=None
+            ).tolist()
             found = dict(zip(FACE_GRADIENT.writes, values, strict=True))
         if arrays:
             rows = Rows.of(self.layout.padding, self.device, more=1)
             written = {name: self.layout.zeros(wp.float64) if name in arrays else None for name in FACE_GRADIENT.writes}
             partials = wp.empty(4 * rows.places, dtype=wp.float64, device=self.device)
-            FACE_GRADIENT.bind(rows, **fields, **written, out=partials).launch()
+            face_x, face_y, face_z, shift = (written[name] for name in ("face_x", "face_y", "face_z", "shift"))
+            FACE_GRADIENT.bind(
+                rows, cells=cells, multiplier=multiplier, x=x, face_x=face_x, face_y=face_y, face_z=face_z, shift=shift, out=partials
+            ).launch()
             found |= {name: self._coefficient_field(name, written[name], shape) for name, shape in arrays.items()}
         return {name: found.get(name) if name in self._given else None for name in FACE_GRADIENT.writes}
 
@@ -216,16 +243,17 @@ class GridPoisson(GridOperator):
         """Compute diagonal and weights, on rows that are in use or have been."""
         s, padding, reach = self.stencil, self.layout.padding, self._rows_in_reach
         self._wrap_cells()
-        around = {"cells": self.cells_around.flatten()}
+        cells = self.cells_around.flatten()
         if self._counts_faces:
-            axes: dict[str, Any] = {f"around_{a}": c > 0 for a, c in zip(AXES, self.uniform, strict=True)}
-            COUNT_FACES.bind(reach, **around, diagonal=s.d, **axes).launch()
+            x, y, z = (c > 0 for c in self.uniform)
+            COUNT_FACES.bind(reach, cells=cells, diagonal=s.d, around_x=x, around_y=y, around_z=z).launch()
             return
-        faces: dict[str, Any] = {}
-        for axis, field, number in zip(AXES, self.faces, self.uniform, strict=True):
-            faces |= {f"f{axis}": field.flatten() if field.size else None, f"n{axis}": number, f"FIELD_{axis.upper()}": field.size > 0}
+        faces = StoredFaces(*(f.flatten() if f.size else None for f in self.faces), *self.uniform)
+        x, y, z = (f.size > 0 for f in self.faces)
         shift = self.shift.flatten() if self.shift.size else None
-        DIAGONAL.bind(reach, **around, **faces, shift=shift, SHIFTED=self.shift.size > 0, diagonal=s.d).launch()
+        DIAGONAL.bind(
+            reach, faces, cells=cells, shift=shift, diagonal=s.d, FIELD_X=x, FIELD_Y=y, FIELD_Z=z, SHIFTED=self.shift.size > 0
+        ).launch()
         if s.weights is not None:
-            weights = dict(zip(("wx", "wy", "wz"), s.weights, strict=True))
-            WEIGHTS.bind(Rows.of(padding, self.device, more=1), **around, **faces, **weights).launch()
+            rows, (wx, wy, wz) = Rows.of(padding, self.device, more=1), s.weights
+            WEIGHTS.bind(rows, faces, cells=cells, wx=wx, wy=wy, wz=wz, FIELD_X=x, FIELD_Y=y, FIELD_Z=z).launch()

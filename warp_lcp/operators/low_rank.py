@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,25 @@ def weigh_kernel(weights: wp.array2d(dtype=wp.float64), c: wp.array(dtype=wp.flo
     for j in range(weights.shape[1]):
         s += weights[i, j] * c[j]
     out[i] = s
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnEntries:
+    """Rows of low-rank columns U that are not 0, as kernels take them.
+
+    Attributes:
+        entry_rows: row of each entry, int32, ascending.
+        blocks: block of columns of each entry, int32.
+        values: the entry's values, `width` of them.
+        count: of the entries, int32, shape (1,).
+        width: columns of a block.
+    """
+
+    entry_rows: wp.array[Any]
+    blocks: wp.array[Any]
+    values: wp.array[Any]
+    count: wp.array[Any]
+    width: int
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/dense.h")
@@ -102,7 +122,7 @@ class BlockColumns:
     ) -> wp.array[Any]:  # fmt: skip
         """Write U'x to `sums`, and return that; x is a flat stored field, taken for 0 where `mask` is; `fused` as of `scatter`."""
         out = self.sums if self._reduction is None else self._reduction.partials
-        GATHER.bind(self._all, **self.entry_fields, rank=self.rank, x=x, mask=mask, out=out, FUSED=fused).launch(launch)
+        GATHER.bind(self._all, self.entry_fields, rank=self.rank, x=x, mask=mask, out=out, FUSED=fused).launch(launch)
         if self._reduction is not None:
             self._reduction.add_up(0, columns=self.rank, launch=launch)
         if self.across is not None:
@@ -117,17 +137,18 @@ class BlockColumns:
 
         `fused`: products are rounded with the sums that they are added to.
         """
-        given = {"factors": factors, "mask": mask, "base": base, "result": out, "sign": sign, "FUSED": fused}
-        SCATTER.bind(self._each, **self.entry_fields, **given).launch(launch)
+        SCATTER.bind(self._each, self.entry_fields, factors=factors, mask=mask, base=base, result=out, sign=sign, FUSED=fused).launch(
+            launch
+        )
 
     def add_diagonal(self, weights: wp.array[Any], out: wp.array[Any]) -> None:
         """out += the diagonal of U W U', W of shape (rank * rank,)."""
-        DIAGONAL.bind(self._each, **self.entry_fields, rank=self.rank, weights=weights, result=out).launch()
+        DIAGONAL.bind(self._each, self.entry_fields, rank=self.rank, weights=weights, result=out).launch()
 
     @property
-    def entry_fields(self) -> dict[str, Any]:
-        """What passes over the entries take."""
-        return {"entry_rows": self.rows, "blocks": self.blocks, "values": self.values, "count": self.count, "width": self.width}
+    def entry_fields(self) -> ColumnEntries:
+        """The entries, as kernels take them."""
+        return ColumnEntries(self.rows, self.blocks, self.values, self.count, self.width)
 
 
 class LowRankOperator(Pickled):

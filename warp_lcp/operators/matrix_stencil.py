@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators.compressed_rows import CompressedRows
+from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import StoredStencil
 from warp_lcp.problem.protocol import FLUID
@@ -87,16 +87,14 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
         middle[offsets[column - row]] += value
     kept = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
     where, d = Rows.of(padding, device), padding.zeros(wp.float64, device)
-    given: dict[str, Any] = {
-        "ptr": rows.indptr,
-        "col": rows.indices,
-        "a": rows.values,
-        "middle": wp.array(middle, device=device),
-        "made": d,
-    }
-    given |= {"nx": nx, "ny": ny, "nz": nz, "full": full, "kept": kept, "size": padding.size}
-    sums = Sums(where, 4)
-    wrong, centers, differ, positive = sums.of(RECOGNIZE, **given, weights=None)
+    sums, entries, on_device = Sums(where, 4), RowEntries(rows.indptr, rows.indices, rows.values), wp.array(middle, device=device)
+
+    def recognize(block: wp.array[Any] | None) -> np.ndarray:
+        return sums.of(
+            RECOGNIZE, entries, middle=on_device, made=d, nx=nx, ny=ny, nz=nz, full=full, kept=kept, size=padding.size, weights=block
+        )
+
+    wrong, centers, differ, positive = recognize(None)
     if wrong:
         return None
     places = [o for o in range(27) if kept >> o & 1]
@@ -104,7 +102,7 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
     weights: tuple[Any, ...] = tuple(-middle[o] for o in places)
     if differ:
         block = zeros(len(places) * padding.size, wp.float64, device)
-        sums.of(RECOGNIZE, **given, weights=block)
+        recognize(block)
         weights = tuple(block[i * padding.size : (i + 1) * padding.size] for i in range(len(places)))
     sizes = [float(np.abs(w.numpy()).sum()) / A.unknowns if differ else abs(w) for w in weights]
     strength = tuple(sum(s for s, o in zip(sizes, neighbors, strict=True) if o[axis]) / (1 if A.symmetric else 2) for axis in range(3))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, no_type_check
@@ -10,7 +11,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.operators.compressed_rows import CompressedRows
+from warp_lcp.operators.compressed_rows import CompressedRows, RowEntries
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.renumbering import Renumbering, renumbering
 from warp_lcp.problem.lcp import as_operator
@@ -45,6 +46,35 @@ RELAX = KERNELS["sparse.relax"]
 SURVEY = KERNELS["sparse.survey"]
 BLOCKS, FILL = (6, 5, 4, 3, 2), 1.2  # sizes of nodes' blocks, and the most entries that these may have in units of A's
 GATHER = KERNELS["sparse.gather"]
+
+
+@dataclass(frozen=True, slots=True)
+class MatrixSweep:
+    """A sweep over rows of a sparse matrix, each unknown projected onto its bounds.
+
+    Attributes:
+        ptr: first entry of each row and the end, int32, shape (n + 1,).
+        col: columns of the entries, int32.
+        a: values of the entries.
+        d: diagonal, shape (n,).
+        b: right-hand side.
+        lower: bounds.
+        upper: bounds.
+        x: iterate, moved in place.
+        omega: relaxation factor.
+        forward: whether rows are taken in ascending order.
+    """
+
+    ptr: wp.array[Any]
+    col: wp.array[Any]
+    a: wp.array[Any]
+    d: wp.array[Any]
+    b: Any
+    lower: Any
+    upper: Any
+    x: Any
+    omega: float
+    forward: bool
 
 
 class SparseOperator(Pickled):
@@ -175,7 +205,7 @@ class SparseOperator(Pickled):
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
         """Evaluate out = A x, or A x + plus; launches kernels only."""
-        PRODUCT.bind(Rows.flat(x.size, self.device), **self._rows, x=x, plus=plus, y=out).launch(launch)
+        PRODUCT.bind(Rows.flat(x.size, self.device), self._rows, x=x, plus=plus, y=out).launch(launch)
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, shape (n,).
@@ -263,15 +293,15 @@ class SparseOperator(Pickled):
             colored: color by color, all rows of a color at once, instead of row by row by one thread; on CUDA if None.
             launch: launches or records.
         """
-        given = {**self._rows, "d": self._diagonal, "b": b, "lower": lower, "upper": upper, "x": x, "omega": omega, "forward": forward}
+        sweep = MatrixSweep(self.indptr, self.indices, self.values, self._diagonal, b, lower, upper, x, omega, forward)
         if not (self.device.is_cuda if colored is None else colored):
-            RELAX.bind(Rows.flat(x.size, self.device, serial=True), **given, list=None, first=0).launch(launch)
+            RELAX.bind(Rows.flat(x.size, self.device, serial=True), sweep, list=None, first=0).launch(launch)
             return
         rows, starts = self.colors
         colors = range(len(starts) - 1)
         for c in colors if forward else reversed(colors):
             here = Rows.flat(starts[c + 1] - starts[c], self.device)
-            RELAX.bind(here, **given, list=rows, first=starts[c]).launch(launch)
+            RELAX.bind(here, sweep, list=rows, first=starts[c]).launch(launch)
 
     @cached_property
     def colors(self) -> tuple[wp.array[Any], list[int]]:
@@ -314,8 +344,8 @@ class SparseOperator(Pickled):
         return parts[0], parts[1], parts[2]
 
     @property
-    def _rows(self) -> dict[str, Any]:
-        return {"ptr": self.indptr, "col": self.indices, "a": self.values}
+    def _rows(self) -> RowEntries:
+        return RowEntries(self.indptr, self.indices, self.values)
 
     def _matrix_of(self, values: np.ndarray) -> scipy.sparse.csr_array:
         return scipy.sparse.csr_array((values.astype(np.float64), self._indices, self._indptr), shape=self.shape * 2)

@@ -145,9 +145,8 @@ class Stencil(GridOperator):
 
         def of(offset: Offset, shape: tuple[int, ...]) -> Any:
             part = self.layout.zeros(wp.float64) if shape else None
-            steps = (0 if axis in self._around_itself else step for axis, step in enumerate(offset))
-            place = dict(zip(("step", "row", "plane"), steps, strict=True))
-            total = Sums(rows, 1).of(GRADIENT, cells=cells, multiplier=multiplier, x=x, part=part, **place)
+            step, row, plane = (0 if axis in self._around_itself else step for axis, step in enumerate(offset))
+            total = Sums(rows, 1).of(GRADIENT, cells=cells, multiplier=multiplier, x=x, part=part, step=step, row=row, plane=plane)
             return total.item() if part is None else part.reshape(shape) if part.size == math.prod(shape) else self.layout.unload(part)
 
         shapes = {o: self.shape if isinstance(f, wp.Function) else tuple(np.shape(f)) for o, f in self._given.items()}
@@ -257,8 +256,10 @@ class Stencil(GridOperator):
         self._wrap_cells()
         self._find_signs()
         shift = self.shift.flatten() if self.shift.size else None
-        given = {"cells": self.cells_around.flatten(), "center": self._center, "shift": shift, "number": self._number}
-        DIAGONAL.bind(self._rows_in_reach, stencil=s, **given, made=s.d).launch()
+        DIAGONAL.bind(
+            self._rows_in_reach, stencil=s, cells=self.cells_around.flatten(), center=self._center, shift=shift,
+            number=self._number, made=s.d,
+        ).launch()  # fmt: skip
         d, fluid = s.d.numpy(), self.cells.numpy().ravel() == FLUID
         if not (d[fluid] > 0).all():
             where = tuple(map(int, np.argwhere((fluid & (d <= 0)).reshape(self.layout.stored_shape))[0] - 1))[-len(self.shape) :]

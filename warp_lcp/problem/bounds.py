@@ -115,8 +115,8 @@ class Bounds:
             self._memory = self.layout.zeros(wp.uint8)
             self._others = Sums(Rows.of_fields(self.layout))
         least, most = (0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True))
-        given = {"lower": self.fields[0], "upper": self.fields[1], "least": least, "most": most, "code": self._memory}
-        self._others.launch(ENCODE, launch=launch, **given)
+        lower, upper = self.fields
+        self._others.launch(ENCODE, launch=launch, lower=lower, upper=upper, least=least, most=most, code=self._memory)
 
     @property
     def stays(self) -> bool:
@@ -134,8 +134,8 @@ class Bounds:
             return self.fields[side]
         field = wp.full(self.layout.size, self.values[side], dtype=wp.float64, device=self.device)
         if self.code.size and not self.in_place:
-            given: dict[str, Any] = {"bit": BITS[side], "value": self.values[side], "infinite": INFINITE[side]}
-            DECODE.bind(Rows.flat(self.layout.size, self.device), code=self.code, field=field, **given).launch()
+            rows, value = Rows.flat(self.layout.size, self.device), self.values[side]
+            DECODE.bind(rows, code=self.code, field=field, bit=BITS[side], value=value, infinite=INFINITE[side]).launch()
         return field
 
     def host(self, side: int) -> np.ndarray:

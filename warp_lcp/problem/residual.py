@@ -68,8 +68,8 @@ class NaturalResidual:
         p = self.problem
         p.bounds.follow(x)
         self.affine(x)
-        fields = {"x": x, "y": self.y, "d": self.diagonal, "unknown": p.unknown, "unit": self.unit}
-        self.norm, self.current = float(np.sqrt(self._sums.of(NATURAL, bounds=p.bounds.operands, **fields)[0])), True
+        square = self._sums.of(NATURAL, bounds=p.bounds.operands, x=x, y=self.y, d=self.diagonal, unknown=p.unknown, unit=self.unit)[0]
+        self.norm, self.current = float(np.sqrt(square)), True
         return self.norm
 
     def affine(self, x: wp.array[Any]) -> None:
@@ -118,8 +118,8 @@ class NaturalResidual:
         """
         p, sizes = self.problem, self.row_sizes
         zero_if_empty = self.diagonal if sizes is None else sizes  # of grids, only an empty row has a zero diagonal
-        fields = {"d": zero_if_empty, "b": p.b, "unknown": p.unknown, "x": x}
-        SETTLE_ISOLATED.bind(Rows.of_fields(p.layout), bounds=p.bounds.operands, **fields).launch()
+        rows, bounds = Rows.of_fields(p.layout), p.bounds.operands
+        SETTLE_ISOLATED.bind(rows, bounds=bounds, d=zero_if_empty, b=p.b, unknown=p.unknown, x=x).launch()
         self.current = False
 
     def unattainable(self) -> float:

@@ -8,8 +8,8 @@ import ctypes
 import functools
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from operator import index
+from dataclasses import dataclass, field, fields, is_dataclass
+from operator import attrgetter, index
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -142,22 +142,31 @@ class RowPass:
         out = {"out": wp.float64} if self.found else {}
         return {**self.reads, **self.writes, **self.other, **self.by_row, **self.whole, **self.box, **out}
 
-    def bind(self, rows: Rows, *, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> "Bound":
+    def bind(self, rows: Rows, *structs: Any, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> "Bound":
         """Check and take what a launch needs.
 
         Args:
             rows: which rows.
+            structs: dataclasses whose members have the names of arguments; the kernel takes those that it declares.
             stencil: a `warp_lcp.operators.padded_stencil.PaddedStencil`, or a `Known` product in place of one.
             bounds: operands of a `warp_lcp.problem.bounds.Bounds`.
-            given: arrays, numbers, and constants that are not as usual, by name.
+            given: arrays, numbers, and constants that are not as usual, by name; they override members of structs.
 
         Raises:
-            TypeError: one is missing, unknown, or of the wrong type.
+            TypeError: an argument is missing, unknown, or of the wrong type; two structs have it; a struct is no dataclass.
             ValueError: an array has the wrong length, lies on another device, or its elements do not lie side by side.
         """
+        return self.bind_arguments(rows, structs, given, stencil, bounds)
+
+    def bind_arguments(
+        self, rows: Rows, structs: tuple[Any, ...], given: dict[str, Any], stencil: Any = None, bounds: list[Any] | None = None
+    ) -> "Bound":
+        """Bind as `bind` does, for functions that hand on the structs and keywords of their callers; `given` changes."""
         if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
             verb = {True: "needs", False: "takes no"}
             raise TypeError(f"{self.label}: {verb[self.stencil is not None]} stencil, {verb[self.bounds]} bounds")
+        if structs:
+            given = self._with_members(structs, given)
         if self.box:
             given |= rows.place
             constants = tuple(self.constants.values())
@@ -168,7 +177,8 @@ class RowPass:
                 raise TypeError(f"{self.label}: {', '.join(self.constants)} are integers where given: {error}") from None
         if given.keys() != self._wanted:
             missing, unknown = sorted(self._wanted - given.keys()), sorted(given.keys() - self._wanted)
-            raise TypeError(f"{self.label}: missing {missing}, unknown {unknown}")
+            searched = f" in {', '.join(type(s).__name__ for s in structs)}" if structs and missing else ""
+            raise TypeError(f"{self.label}: missing {missing}{searched}, unknown {unknown}")
         types = [getattr(given[n], "dtype", None) for n in self.arrays]
         kind, weights, stored = NUMBERS, None, ()
         if bounds:
@@ -191,6 +201,31 @@ class RowPass:
             made = self._forms[key] = _form(self, letters, numbers, shape, kind)
         self._check_memory(rows, given)
         return Bound(made, rows, made.fill(stencil, bounds, given))
+
+    def _with_members(self, structs: tuple[Any, ...], given: dict[str, Any]) -> dict[str, Any]:
+        """Return the members of structs that are arguments, and what is given."""
+        kinds = tuple([type(s) for s in structs])
+        plan = self._members.get(kinds)
+        if plan is None:
+            plan = self._members[kinds] = self._plan(kinds)
+        names, getters = plan
+        values = [value for s, get in zip(structs, getters, strict=True) if get is not None for value in get(s)]
+        return {**dict(zip(names, values, strict=True)), **given}
+
+    def _plan(self, kinds: tuple[type, ...]) -> tuple[tuple[str, ...], tuple[Any, ...]]:
+        """Return the arguments that structs of these classes have, and for each class what gets them, or None."""
+        if others := [kind.__name__ for kind in kinds if not is_dataclass(kind)]:
+            raise TypeError(f"{self.label}: {others[0]} is not a dataclass")
+        shares = [[f.name for f in fields(kind) if f.name in self._wanted] for kind in kinds]
+        names = tuple(name for share in shares for name in share)
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise TypeError(f"{self.label}: {', '.join(kind.__name__ for kind in kinds)}: two of them have {twice}")
+        return names, tuple(_getter(share) for share in shares)
+
+    @functools.cached_property
+    def _members(self) -> dict[tuple[type, ...], Any]:
+        """Plans of `_with_members` by the classes of structs."""
+        return {}
 
     @functools.cached_property
     def _wanted(self) -> frozenset[str]:
@@ -257,6 +292,13 @@ class RowPass:
             k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # else a list
             if not self.listed and (rows.ends[0] > k or rows.ends[1] > j or rows.ends[2] > i):
                 raise ValueError(f"{self.label}: fields have the shape {shape}, the box ends at {rows.ends}")
+
+
+def _getter(names: list[str]) -> Any:
+    """Return a function from a struct to its members of these names; None if there are none."""
+    if len(names) == 1:
+        return lambda s, name=names[0]: (getattr(s, name),)
+    return attrgetter(*names) if names else None
 
 
 @functools.cache

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, no_type_check
+from typing import TYPE_CHECKING, Any, Protocol, no_type_check
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,9 @@ from warp_lcp.rows.native import HEADERS, text
 from warp_lcp.rows.program import Launch, Task, copy
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.team import Operation
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
@@ -140,8 +143,8 @@ class Reduction:
         """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
         device = self.partials.device
         if device.is_cpu:  # Warp's tiles are not for several threads at a time
-            given: dict[str, Any] = {"partials": self.partials, "count": self.threads, "scalars": self.scalars, "slot": slot}
-            ADD_UP.bind(Rows.flat(columns, device), **given).launch(launch)
+            rows = Rows.flat(columns, device)
+            ADD_UP.bind(rows, partials=self.partials, count=self.threads, scalars=self.scalars, slot=slot).launch(launch)
         else:
             fold(add_up_kernel, self.partials, self.threads, columns, self.scalars, slot, self._folded, launch)
         if self._across is not None:
@@ -167,14 +170,19 @@ class Sums(Reduction):
         self.rows, self.reading = rows, Reading(rows.device, max(columns, slots))
         super().__init__(rows.size, rows.device, self.reading.array, columns=columns, threads=rows.places, across=across)
 
-    def of(self, declared: RowPass, slot: int = 0, **given: Any) -> np.ndarray:
-        """Launch a pass; return its sums, which are in `scalars` from a slot on."""
-        self.launch(declared, slot, **given)
+    def of(self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, **given: Any) -> np.ndarray:
+        """Launch a pass, bound as by `RowPass.bind`; return its sums, which are in `scalars` from a slot on."""
+        self._launch(declared, structs, given, slot, wp.launch)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
 
-    def launch(self, declared: RowPass, slot: int = 0, *, launch: Launch = wp.launch, **given: Any) -> None:
+    def launch(self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, launch: Launch = wp.launch, **given: Any) -> None:
         """Launch a pass, whose sums `reading` will have from a slot on, or record it."""
-        declared.bind(self.rows, **given, out=self.partials).launch(launch)
+        self._launch(declared, structs, given, slot, launch)
+
+    def _launch(self, declared: RowPass, structs: tuple[DataclassInstance, ...], given: dict[str, Any], slot: int, launch: Launch) -> None:
+        stencil, bounds = given.pop("stencil", None), given.pop("bounds", None)
+        given["out"] = self.partials
+        declared.bind_arguments(self.rows, structs, given, stencil, bounds).launch(launch)
         self.add_up(slot, columns=len(declared.sums), launch=launch)
         self.reading.changed()
 
@@ -200,12 +208,20 @@ class Tally:
         """What is found, a number a column, where it is on a GPU; None on the CPU."""
         return None if self._reading is None else self._reading.array
 
-    def take(self, rows: Rows, **given: Any) -> None:
-        """Launch the pass over rows; what it finds replaces what was found."""
+    def take(self, rows: Rows, *structs: DataclassInstance, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> None:
+        """Launch the pass, bound as by `RowPass.bind`, over rows; what it finds replaces what was found."""
+        self.launch(rows, structs, given, stencil, bounds)
+
+    def launch(
+        self, rows: Rows, structs: tuple[DataclassInstance, ...], given: dict[str, Any], stencil: Any = None,
+        bounds: list[Any] | None = None,
+    ) -> None:  # fmt: skip
+        """Do what `take` does, with arguments as of `RowPass.bind_arguments`."""
         self._places, device = rows.places, rows.device
         if self._partials.size < self._columns * self._places:
             self._partials = wp.empty(self._columns * self._places, dtype=wp.float64, device=device)
-        self._declared.bind(rows, **given, out=self._partials).launch()
+        given["out"] = self._partials
+        self._declared.bind_arguments(rows, structs, given, stencil, bounds).launch()
         if self._reading is None:
             return
         sums, largest = len(self._declared.sums), len(self._declared.largest)

@@ -65,6 +65,29 @@ class AcceleratedProjectedGradient(Settings):
         return Step("gradient")
 
 
+@dataclass(frozen=True, slots=True)
+class MomentumFields:
+    """Stored fields that both kernels of a step take.
+
+    Attributes:
+        x: iterate.
+        x_old: the iterate before.
+        y: A x + b.
+        z: the extrapolated iterate.
+        y_z: A z + b.
+        d: scale of each unknown.
+        unknown: 1 where there is one.
+    """
+
+    x: wp.array[Any]
+    x_old: wp.array[Any]
+    y: wp.array[Any]
+    z: wp.array[Any]
+    y_z: wp.array[Any]
+    d: wp.array[Any]
+    unknown: wp.array[Any]
+
+
 class AcceleratedWorkspace(IterateMemory):
     """Memory of the method.
 
@@ -97,13 +120,14 @@ class AcceleratedWorkspace(IterateMemory):
         p, beta = self.problem, self._beta(x) if self._momentum > 0 else 0.0
         if self._momentum == 0:
             self._momentum = 1.0
-        fields = {**self._fields(x), "y_old": self._y_old, "beta": beta, "lipschitz": self.lipschitz}
-        EXTRAPOLATE.bind(self._sums.rows, bounds=p.bounds.operands, **fields).launch()
+        EXTRAPOLATE.bind(
+            self._sums.rows, self._momenta(x), bounds=p.bounds.operands, y_old=self._y_old, beta=beta, lipschitz=self.lipschitz
+        ).launch()
         self.round_iterate()
 
     def _beta(self, x: wp.array[Any]) -> float:
         """Look at the last step, correct L, return the share of it that goes on."""
-        curvature, metric, turned, size = self._sums.of(PROGRESS, **self._fields(x))
+        curvature, metric, turned, size = self._sums.of(PROGRESS, self._momenta(x))
         exceeded = metric > NOISE * size and curvature > self.lipschitz * metric
         if exceeded:
             rejected = curvature > FAR * self.lipschitz * metric
@@ -118,7 +142,6 @@ class AcceleratedWorkspace(IterateMemory):
         self._momentum = (1 + math.sqrt(1 + 4 * t * t)) / 2
         return (t - 1) / self._momentum
 
-    def _fields(self, x: wp.array[Any]) -> dict[str, Any]:
-        """Return what both passes take."""
-        fields = {"x": x, "x_old": self._x_old, "y": self.residual.y, "z": self._z, "y_z": self._y_z, "d": self._d}
-        return fields | {"unknown": self.problem.unknown}
+    def _momenta(self, x: wp.array[Any]) -> MomentumFields:
+        """Return what both kernels take."""
+        return MomentumFields(x, self._x_old, self.residual.y, self._z, self._y_z, self._d, self.problem.unknown)

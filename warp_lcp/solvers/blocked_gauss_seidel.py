@@ -153,6 +153,33 @@ class BlockWorkspace(SweepWorkspace):
             wp.launch(self._kernel, threads, [*self._operands, self._starts[c], each, forward, x], device=x.device)
 
 
+@dataclass(frozen=True, slots=True)
+class LineMemory:
+    """Memory and sizes of solves of lines of cells.
+
+    Attributes:
+        c: multiples of the elimination, a stored field.
+        q: its right-hand side.
+        z: solution of a line's system.
+        s: states of the unknowns, uint8.
+        s1: elements from plane to plane.
+        s2: elements from row to row.
+        cells: of a line.
+        most: changes of a line's active set.
+        omega: relaxation factor.
+    """
+
+    c: wp.array[Any]
+    q: wp.array[Any]
+    z: wp.array[Any]
+    s: wp.array[Any]
+    s1: int
+    s2: int
+    cells: int
+    most: int
+    omega: float
+
+
 class LineWorkspace(SweepWorkspace):
     """Memory of sweeps over a grid's lines, those of one color of a checkerboard after those of the other.
 
@@ -178,9 +205,9 @@ class LineWorkspace(SweepWorkspace):
         strides, counts = (1, padding.row, padding.plane), tuple(reversed(padding.counts))
         a, b = (other for other in (2, 1, 0) if other != axis.value)
         self._lines = Rows.strided(padding.size, problem.device, (sum(strides), strides[a], strides[b]), (counts[a], counts[b], 1))
-        zeros, numbers = problem.layout.zeros, {"AXIS": axis.value, "cells": counts[axis.value], "most": CHANGES, "omega": settings.omega}
-        memory = {name: zeros(f64) for name in ("c", "q", "z")} | {"s": zeros(wp.uint8)}
-        self._given: dict[str, Any] = memory | numbers | {"s1": padding.plane, "s2": padding.row}
+        zeros, self._axis = problem.layout.zeros, axis.value
+        c, q, z = (zeros(f64) for _ in range(3))
+        self._memory = LineMemory(c, q, z, zeros(wp.uint8), padding.plane, padding.row, counts[axis.value], CHANGES, settings.omega)
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Solve the lines of one color, then those of the other."""
@@ -190,4 +217,6 @@ class LineWorkspace(SweepWorkspace):
         colors = 4 if stencil.pattern is not None and self._lines.single.planes > 1 else 2
         for color in range(colors) if forward else reversed(range(colors)):
             stencil.wrap(x)
-            SOLVE_LINE.bind(self._lines, stencil=stencil, x=x, b=p.b, l=p.lower, u=p.upper, color=color, **self._given).launch()
+            SOLVE_LINE.bind(
+                self._lines, self._memory, stencil=stencil, x=x, b=p.b, l=p.lower, u=p.upper, color=color, AXIS=self._axis
+            ).launch()

@@ -75,8 +75,8 @@ class GridConjugateGradient:
         sums.add_up(int(engine.ZAZ), columns=4, launch=program.launch)
         program.launch(engine.plan_step_kernel, 1, [self._scalars], device=device)
         direct = DIRECT.bind(s.rows, z=finest.x, q=self._p, scalars=self._scalars)
-        fields = {"q": self._p, "x": self.x, "r": r, "scalars": self._scalars, "weighted": weighted, "out": sums.partials}
-        ADVANCE.launch(direct, STEP_ALONG.bind(s.rows, stencil=s, **fields), launch=program.launch)
+        step = STEP_ALONG.bind(s.rows, stencil=s, q=self._p, x=self.x, r=r, scalars=self._scalars, weighted=weighted, out=sums.partials)
+        ADVANCE.launch(direct, step, launch=program.launch)
         sums.add_up(int(SQUARE), launch=program.launch)
         program.launch(end_grid_kernel, 1, [self._scalars, self._going], device=device)
 

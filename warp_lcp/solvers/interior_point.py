@@ -21,7 +21,7 @@ from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
-from warp_lcp.rows import KernelFile, Known, RowPass, Wave
+from warp_lcp.rows import KernelFile, Known, Wave
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
@@ -124,6 +124,69 @@ class InteriorPoint(Settings):
         if not work.begun:
             work.begin(x)
         return work.path_step(x)
+
+
+@dataclass(frozen=True, slots=True)
+class ComplementaryPairs:
+    """Distances of x to its bounds and their multipliers, stored float64 fields: w s = v t = mu on the central path.
+
+    Attributes:
+        w: x - l; infinite without a lower bound.
+        v: u - x; infinite without an upper bound.
+        s: multiplier of the lower bound.
+        t: multiplier of the upper bound.
+    """
+
+    w: wp.array[Any]
+    v: wp.array[Any]
+    s: wp.array[Any]
+    t: wp.array[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class PathDirection:
+    """A direction along the central path: ds and dt follow from that of x.
+
+    Attributes:
+        a: the predictor's direction of x.
+        e: the solution of the linear system.
+        scale: of both.
+        second: factor of the second-order terms dw ds and dv dt.
+        joined: 1 if the predictor's direction is part of the corrector's, else 0.
+        tau: target of the products w s and v t.
+    """
+
+    a: wp.array[Any]
+    e: wp.array[Any]
+    scale: float
+    second: float
+    joined: float
+    tau: float
+
+
+@dataclass(frozen=True, slots=True)
+class PathSystem:
+    """The linear system of a step: A + D with D = s / w + t / v.
+
+    Attributes:
+        x: iterate, a stored field.
+        b: of the problem.
+        unknown: 1 where there is an unknown.
+        free: which unknowns move, uint8.
+        D: diagonal that is added (written).
+        r: right-hand side (written).
+        scale: of the right-hand side.
+        tau: target of the products w s and v t.
+    """
+
+    x: wp.array[Any]
+    b: wp.array[Any]
+    unknown: wp.array[Any]
+    free: wp.array[Any]
+    D: wp.array[Any]
+    r: wp.array[Any]
+    scale: float
+    tau: float
 
 
 class InteriorPointWorkspace(IterateMemory):
@@ -241,7 +304,10 @@ class InteriorPointWorkspace(IterateMemory):
         self.size = max(self.residual.norm, 1e-300)
         tau = 0.0 if s.mehrotra else self.mu / self.steps
         second = 0.0
-        self._launch(CONDENSE, **self._condensing(x, self._D, tau))
+        self._sums.of(
+            CONDENSE, self._pairs, self._condensing(x, self._D, tau), stencil=self._stencil, bounds=self.problem.bounds.operands,
+            UPPER=self._upper, FUSED=False,
+        )  # fmt: skip
         self.system.restrict(self.free, self._D if self.problem.bounded else None)
         self._project()
         iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
@@ -284,35 +350,41 @@ class InteriorPointWorkspace(IterateMemory):
         return self.mu * min(1.0, max(0.0, after / self.mu)) ** 3
 
     @property
-    def _pairs(self) -> dict[str, wp.array[Any]]:
-        return {"w": self._w, "v": self._v, "s": self._s, "t": self._t}
+    def _pairs(self) -> ComplementaryPairs:
+        return ComplementaryPairs(self._w, self._v, self._s, self._t)
 
-    def _launch(self, declared: RowPass, **given: Any) -> np.ndarray:
-        """Launch a pass over the fields; return what it sums."""
-        fused = self._fused and declared in (RATIOS, CENTER)
-        return (self._grid_sums if fused else self._sums).of(declared, **given, UPPER=self._upper, FUSED=fused)
+    @property
+    def _pass_sums(self) -> Sums:
+        """Sums of the kernels that run over a grid's rows where passes are fused."""
+        return self._grid_sums if self._fused else self._sums
 
-    def _direction(self, second: float, tau: float) -> dict[str, Any]:
-        """What ds and dt are computed from."""
+    def _direction(self, second: float, tau: float) -> PathDirection:
         joined = 1.0 if self._carries else 0.0
-        return {**self._pairs, "a": self._predicted, "e": self.system.e, "scale": self.size, "second": second, "joined": joined, "tau": tau}
+        return PathDirection(self._predicted, self.system.e, self.size, second, joined, tau)
 
-    def _condensing(self, x: wp.array[Any], D: wp.array[Any], tau: float) -> dict[str, Any]:
-        p, r = self.problem, self.residual
-        operator = p.A.stencil if self._fused else Known(r.diagonal, r.unit, r.y)  # type: ignore[attr-defined]
-        fields = {"x": x, "b": p.b, "unknown": p.unknown, "free": self.free, **self._pairs, "D": D, "r": self.system.r}
-        return {"stencil": operator, "bounds": p.bounds.operands, **fields, "scale": 1 / self.size, "tau": tau}
+    @property
+    def _stencil(self) -> Any:
+        r = self.residual
+        return self.problem.A.stencil if self._fused else Known(r.diagonal, r.unit, r.y)  # type: ignore[attr-defined]
 
-    def _moving(self, x: wp.array[Any], second: float, tau: float, length: float) -> dict[str, Any]:
-        return {"bounds": self.problem.bounds.operands, **self._direction(second, tau), "x": x, "length": length}
+    def _condensing(self, x: wp.array[Any], D: wp.array[Any], tau: float) -> PathSystem:
+        p = self.problem
+        return PathSystem(x, p.b, p.unknown, self.free, D, self.system.r, 1 / self.size, tau)
 
     def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
         """Move, unless the length is 0, and set the residual's norm and the next system there."""
-        sums, rows, form = self._grid_sums, self._grid_sums.rows, dict[str, Any](UPPER=self._upper, FUSED=True)
-        move = self._moving(x, 1.0, tau, length)
+        sums, rows, bounds, upper = self._grid_sums, self._grid_sums.rows, self.problem.bounds.operands, self._upper
+        direction, moving = self._direction(1.0, tau), None
         self.size = max(self.residual.norm, 1e-300)
-        moving = MOVE.bind(rows, **move, **form, out=sums.partials[2 * rows.places :]) if length else None
-        condensing = CONDENSE.bind(rows, **self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0), **form, out=sums.partials)
+        if length:
+            moving = MOVE.bind(
+                rows, self._pairs, direction, bounds=bounds, x=x, length=length, out=sums.partials[2 * rows.places :], UPPER=upper,
+                FUSED=True,
+            )  # fmt: skip
+        system = self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0)
+        condensing = CONDENSE.bind(
+            rows, self._pairs, system, stencil=self._stencil, bounds=bounds, out=sums.partials, UPPER=upper, FUSED=True
+        )
         ADVANCE.launch(moving, condensing)
         sums.add_up(0, columns=3)
         self.residual.norm, self.residual.current = self._norm(0), True
@@ -326,28 +398,39 @@ class InteriorPointWorkspace(IterateMemory):
     def _ratios(self, second: float, tau: float) -> tuple[float, float]:
         """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
         self._longest.zero_()
-        products = float(self._launch(RATIOS, **self._direction(second, tau), longest=self._longest)[0])
+        found = self._pass_sums.of(
+            RATIOS, self._pairs, self._direction(second, tau), longest=self._longest, UPPER=self._upper, FUSED=self._fused
+        )
+        products = float(found[0])
         return float(self._longest.numpy()[0]), products
 
-    def _correct(self, tau: float, **fields: wp.array[Any] | None) -> None:
+    def _correct(self, tau: float, *, y: wp.array[Any] | None, D: wp.array[Any] | None) -> None:
         """Write the corrector's right-hand side."""
-        common = {"e": self.system.e, "free": self.free, "a": self._predicted, "r": self.system.r}
-        self._launch(CENTER, **self._pairs, **common, **fields, scale=self.size, tau=tau, carried=self._carries)
+        self._pass_sums.of(
+            CENTER, self._pairs, e=self.system.e, free=self.free, a=self._predicted, r=self.system.r, y=y, D=D, scale=self.size,
+            tau=tau, carried=self._carries, UPPER=self._upper, FUSED=self._fused,
+        )  # fmt: skip
 
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
         """Take the step, and remember mu."""
-        self.mu = float(self._launch(MOVE, **self._moving(x, second, tau, length))[0]) / max(self.count, 1)
+        found = self._sums.of(
+            MOVE, self._pairs, self._direction(second, tau), bounds=self.problem.bounds.operands, x=x, length=length,
+            UPPER=self._upper, FUSED=False,
+        )  # fmt: skip
+        self.mu = float(found[0]) / max(self.count, 1)
         self._finish_move(x)
 
     def _inside(self, x: wp.array[Any], width: float) -> None:
         """Set w and v to at least width / d, and x accordingly."""
         p, r = self.problem, self.residual
-        fields = {"x": x, "w": self._w, "v": self._v, "unknown": p.unknown, "free": self.free, "d": r.diagonal}
-        INSIDE.bind(self._sums.rows, bounds=p.bounds.operands, **fields, unit=r.unit, width=width, UPPER=self._upper, FUSED=False).launch()
+        INSIDE.bind(
+            self._sums.rows, self._pairs, bounds=p.bounds.operands, x=x, unknown=p.unknown, free=self.free, d=r.diagonal,
+            unit=r.unit, width=width, UPPER=self._upper, FUSED=False,
+        ).launch()  # fmt: skip
 
     def _multipliers(self, least: float) -> tuple[float, float]:
         """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
-        total, count = self._launch(MULTIPLIERS, y=self.residual.y, **self._pairs, least=least)
+        total, count = self._sums.of(MULTIPLIERS, self._pairs, y=self.residual.y, least=least, UPPER=self._upper, FUSED=False)
         return float(total), float(count)
 
     def _solve(self, eta: float) -> int:

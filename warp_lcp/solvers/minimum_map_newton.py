@@ -232,8 +232,10 @@ class NewtonWorkspace(IterateMemory):
                 return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
         self.norms = [*self.norms, residual.norm][-(self.settings.memory if self.settings.safeguard else 1) :]
         size = residual.norm
-        fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "scale": 1 / size}
-        moved, active, shifted, square = self._sums.of(CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, **fields)
+        moved, active, shifted, square = self._sums.of(
+            CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, x=x, unknown=p.unknown, free=self.free, g=self.system.r,
+            scale=1 / size,
+        )  # fmt: skip
         self._shrinks, self._active = self._monotone and active < self._active, float(active)
         if self.coarse is not None and self.coarse.is_due(float(moved)):
             return self._coarse_step(x, int(active))
@@ -242,8 +244,7 @@ class NewtonWorkspace(IterateMemory):
             self.stale = False
         if shifted:  # held unknowns have moved to their bounds
             residual.affine(x)
-            given = {"y": residual.y, "free": self.free, "g": self.system.r, "scale": 1 / size}
-            square = self._sums.of(ON_FREE, **given)[0]
+            square = self._sums.of(ON_FREE, y=residual.y, free=self.free, g=self.system.r, scale=1 / size)[0]
         if square == 0:
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)

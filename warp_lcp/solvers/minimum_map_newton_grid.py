@@ -51,9 +51,11 @@ class MinimumMapResidual(AssessedResidual):
         s.wrap(x)
         if s.ghosts is not None:
             self._away.fill_(1)  # which rows beside a cut have moved, others know
-        fields = {"x": x, "b": p.b, "free": finest.stencil.d, "g": finest.b, "away": self._away, "scalars": self.scalars}
         _, around_y, around_z = s.periodic
-        engine.RIGHT_SIDE.bind(s.rows, stencil=s, around_y=around_y, around_z=around_z, **fields).launch(wp.launch)
+        engine.RIGHT_SIDE.bind(
+            s.rows, stencil=s, around_y=around_y, around_z=around_z, x=x, b=p.b, free=finest.stencil.d, g=finest.b, away=self._away,
+            scalars=self.scalars,
+        ).launch(wp.launch)  # fmt: skip
         self._away.zero_()
 
 

@@ -154,14 +154,15 @@ class SplitResidual(NaturalResidual):
         p = self.problem
         if 0 < self.norm < math.inf:
             self.size = self.norm
-        fields = {"x": x, "b": p.b, "unknown": p.unknown, "free": self.free, "g": self._r, "step": self._chopped_step}
-        fields |= {"bounds": p.bounds.operands, "inverse": 1 / self.size, "slack": self._slack}
+        kernel, stencil = (SPLIT_KNOWN, self.known) if self._stencil is None else (SPLIT, self._stencil)
         if self._stencil is None:
             self.affine(x)
-            found = self._split.of(SPLIT_KNOWN, stencil=self.known, **fields)
         else:
             self._stencil.wrap(x)
-            found = self._split.of(SPLIT, stencil=self._stencil, **fields)
+        found = self._split.of(
+            kernel, stencil=stencil, bounds=p.bounds.operands, x=x, b=p.b, unknown=p.unknown, free=self.free, g=self._r,
+            step=self._chopped_step, inverse=1 / self.size, slack=self._slack,
+        )  # fmt: skip
         square, self.chopped, self.reduced, self.release, moved, active, self.energy = (float(v) for v in found)
         self.norm, self.current, self.active, self.moved = float(np.sqrt(square)), True, int(active), self.moved or moved > 0
         return self.norm
@@ -253,9 +254,11 @@ class MPRGPWorkspace(IterateMemory):
             wp.copy(self._p, direction)  # where a step ends the residual writes another chopped step, and it may be taken again
             return self._projected_step(self._p, residual.release, curvature)
         factor, target, p = residual.release / curvature, self._target(), self.problem
-        fields = {"x": self.x, "step": direction, "q": self._q, "to": target, "free": residual.free, "g": self.preconditioner.r}
-        numbers, stencil = {"part": factor, "length": factor * residual.size}, p.A.stencil  # type: ignore[attr-defined]
-        RELEASE.bind(residual.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers).launch()
+        stencil = p.A.stencil  # type: ignore[attr-defined]
+        RELEASE.bind(
+            residual.rows, stencil=stencil, bounds=p.bounds.operands, x=self.x, step=direction, q=self._q, to=target,
+            free=residual.free, g=self.preconditioner.r, part=factor, length=factor * residual.size,
+        ).launch()  # fmt: skip
         self._settle(target)
         residual.moved = True
         return True

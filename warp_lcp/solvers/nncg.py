@@ -98,10 +98,10 @@ class NNCGWorkspace(SweepWorkspace):
 
     def advance(self, x: wp.array[Any]) -> None:
         """Move x, which a sweep has just moved, along p, and turn p."""
-        p, sums, fields = self.problem, self._sums, {"x": x, "g": self.g, "unknown": self.problem.unknown}
-        sums.of(TAKEN, **fields)
+        p, sums, unknown = self.problem, self._sums, self.problem.unknown
+        sums.of(TAKEN, x=x, g=self.g, unknown=unknown)
         bounds = p.bounds.operands if p.bounds.affine is None else self._constant
-        CARRY_ON.bind(sums.rows, bounds=bounds, **fields, along=self.p, squares=sums.scalars).launch()
+        CARRY_ON.bind(sums.rows, bounds=bounds, x=x, g=self.g, unknown=unknown, along=self.p, squares=sums.scalars).launch()
         if p.bounds.affine is not None:
             p.bounds.follow(x)
             WITHIN.bind(sums.rows, bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=True).launch()

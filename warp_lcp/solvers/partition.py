@@ -163,12 +163,12 @@ class GridBlock:
 
     def couple(self) -> None:
         """Write what A x + b leaves of b when the block's own part is taken out."""
-        whole, of_block = self._whole, {"member": self._member, "kept": False}
+        whole, member = self._whole, self._member
         whole.bounds.follow(self._x)
         whole.apply_plus(self._x, whole.b, self._y)
-        SELECT.bind(rows_of(self._x), x=self._x, less=None, target=self._guess, **of_block).launch()
+        SELECT.bind(rows_of(self._x), x=self._x, less=None, target=self._guess, member=member, kept=False).launch()
         self.problem.A.apply(self._guess, self._z)
-        SELECT.bind(rows_of(self._x), x=self._y, less=self._z, target=self._b, **of_block).launch()
+        SELECT.bind(rows_of(self._x), x=self._y, less=self._z, target=self._b, member=member, kept=False).launch()
 
     def guess(self) -> wp.array[Any]:
         """Return x_B as `couple` found it."""

@@ -175,8 +175,9 @@ class PenaltyWorkspace(IterateMemory):
         the solution of the linear solve has not, which knows no sizes below its tolerance.
         """
         p, r = self.problem, self.residual
-        fields = {"x": x, "y": r.y, "d": r.diagonal, "unknown": p.unknown, "side": self.side, "shift": self._shift}
-        fields |= {"free": self._free, "inside": self._inside, "rho": self.rho, "unit": r.unit, "first": first, "keep": keep}
-        moved, active, square = self._sums.of(SORT, bounds=p.bounds.operands, **fields)
+        moved, active, square = self._sums.of(
+            SORT, bounds=p.bounds.operands, x=x, y=r.y, d=r.diagonal, unknown=p.unknown, side=self.side, shift=self._shift,
+            free=self._free, inside=self._inside, rho=self.rho, unit=r.unit, first=first, keep=keep,
+        )  # fmt: skip
         self._moved, self._excess = float(moved), math.sqrt(float(square)) / self.rho
         return int(active)

@@ -77,8 +77,8 @@ def projected_cycle(
         system.restrict(free)
     ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
     sums.scalars[int(SIZE) : int(SIZE) + 1].fill_(size)
-    gaps = {"lo": finest.lower, "hi": finest.upper, "scalars": sums.scalars}
-    GAPS.bind(rows, bounds=problem.bounds.operands, x=x, unknown=problem.unknown, **gaps).launch()
+    bounds, lo, hi = problem.bounds.operands, finest.lower, finest.upper
+    GAPS.bind(rows, bounds=bounds, x=x, unknown=problem.unknown, lo=lo, hi=hi, scalars=sums.scalars).launch()
     system.monotone_cycle()
 
 

@@ -58,8 +58,7 @@ def projected_move(
     guarded: bool = True,
 ) -> None:  # fmt: skip
     """Set `to` = clip(x + length along, l, u) where the direction is not 0; see `active_set.h`."""
-    fields = {"x": x, "z": z, "along": along, "to": to, "kept": kept}
-    STEP.bind(rows, bounds=bounds, beta=beta, step=length, guarded=guarded, **fields).launch()
+    STEP.bind(rows, bounds=bounds, x=x, z=z, along=along, to=to, kept=kept, beta=beta, step=length, guarded=guarded).launch()
 
 
 class PrincipalSystem(Protocol):
@@ -136,8 +135,8 @@ class GridSystem(GuardedSystem):
             self.hierarchy.hold(source.d, free)
             self.hierarchy.rebuild_changed()
         else:
-            given = {"d": source.d, "unit": source.unit, "diagonal": target, "weight": self._weight}
-            SHIFT.bind(rows_of(target), free=free, shift=shift, **given).launch()
+            rows, weight = rows_of(target), self._weight
+            SHIFT.bind(rows, free=free, shift=shift, d=source.d, unit=source.unit, diagonal=target, weight=weight).launch()
             self.hierarchy.rebuild()
 
     @property
@@ -217,8 +216,8 @@ class CoupledGridSystem(KrylovSystem):
         self._free = free
         self._grid.restrict(free, shift)
         if self._weight is not None:
-            given = {"d": self._own, "unit": 1.0, "diagonal": self._extra, "weight": self._weight}
-            SHIFT.bind(rows_of(self.r), free=free, shift=shift, **given).launch()
+            rows, weight = rows_of(self.r), self._weight
+            SHIFT.bind(rows, free=free, shift=shift, d=self._own, unit=1.0, diagonal=self._extra, weight=weight).launch()
         wp.copy(self._extra, self.r)
         self._correction.renew(begins=self._begins)
         wp.copy(self.r, self._extra)
@@ -343,8 +342,8 @@ class DiagonalSystem(KrylovSystem):
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Remember the free set and the shift, and shift the diagonal."""
         self._free, self._shift = free, shift
-        given = {"d": self._own, "unit": 1.0, "diagonal": self._diagonal, "weight": self._inverse}
-        SHIFT.bind(rows_of(self.r), free=free, shift=shift, **given).launch()
+        rows, weight = rows_of(self.r), self._inverse
+        SHIFT.bind(rows, free=free, shift=shift, d=self._own, unit=1.0, diagonal=self._diagonal, weight=weight).launch()
 
     def apply(self) -> None:
         """Precondition: z = r / d."""

@@ -127,7 +127,7 @@ class LowRankCorrection:
         """
         low, finest, W = self._low, self._hierarchy.finest, self._low.weights.numpy()
         one = Rows.flat(1, low.device)
-        SQUARES.bind(one, **self._columns.entry_fields, rank=low.rank, d=finest.stencil.d, squares=self._squares).launch()
+        SQUARES.bind(one, self._columns.entry_fields, rank=low.rank, d=finest.stencil.d, squares=self._squares).launch()
         found, width, across = self._squares.numpy().copy(), self._columns.width, low.layout.across
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
@@ -181,10 +181,10 @@ class LowRankCorrection:
         self._slot_columns = strong
         self._dots, finest = None, self._hierarchy.finest
         if strong:
-            rows, given = finest.stencil.rows, {"Z": self._Z, "slots": len(strong), "size": n}
+            rows, slots = finest.stencil.rows, len(strong)
             self._dots = Reduction(n, low.device, self._sums, columns=len(strong), threads=rows.places, across=low.layout.across)
-            self._multiply = DOTS.bind(rows, r=finest.b, out=self._dots.partials, **given)
-            self._subtract = SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, **given)
+            self._multiply = DOTS.bind(rows, r=finest.b, out=self._dots.partials, Z=self._Z, slots=slots, size=n)
+            self._subtract = SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, Z=self._Z, slots=slots, size=n)
         for q in kept:
             wp.copy(self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n)
         self._seen[[q for q in range(low.rank) if q not in kept]] = 0.0

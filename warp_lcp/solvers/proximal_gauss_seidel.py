@@ -84,6 +84,33 @@ class ProximalGaussSeidel(Settings):
         return Step("sweep", self.check_every, iterations=self.check_every)
 
 
+@dataclass(frozen=True, slots=True)
+class ContactFields:
+    """Contacts in the order of their colors, and their impulses.
+
+    Attributes:
+        J: rows of both bodies of each contact, shape (k dim 2 q,).
+        b: relative velocity without impulses, shape (k dim,).
+        e: compliance of each row, shape (k dim,).
+        laws: mu, both r-factors and the residual's scale of each contact, shape (4 k,).
+        contact: number of each contact in the problem, int32, shape (k,).
+        one: first body of each contact, int32, shape (k,).
+        other: second body of each contact, int32, shape (k,).
+        w: J'r of each body, shape ((bodies + 1) q,).
+        r: impulses as the problem numbers contacts, shape (k dim,).
+    """
+
+    J: wp.array[Any]
+    b: wp.array[Any]
+    e: wp.array[Any]
+    laws: wp.array[Any]
+    contact: wp.array[Any]
+    one: wp.array[Any]
+    other: wp.array[Any]
+    w: wp.array[Any]
+    r: wp.array[Any]
+
+
 class ContactWorkspace:
     """Impulses and what bodies make of them, with contacts in the order of their colors.
 
@@ -114,25 +141,25 @@ class ContactWorkspace:
         every = self._rows(0, k)
         self._squares = Reduction(k, device, self._state, threads=max(every.places, 1))
         self._gather = self._gathering()
-        self._left = self._passes.residual.bind(every, **self._fields, out=self._squares.partials)
+        self._left = self._passes.residual.bind(every, self._fields, out=self._squares.partials)
         self._program = Program(device)
         for count in range(method.check_every):
             self._record(count % 2)
         self._look(self._program.launch)
 
-    def _contacts(self) -> dict[str, wp.array[Any]]:
-        """Return the contacts as passes see them, color by color; laws: mu, both r-factors and the residual's scale of each."""
+    def _contacts(self) -> ContactFields:
+        """Return the contacts as kernels see them, color by color."""
         p, order = self.problem, self.order
         k, dim, _ = p.one.shape
         J, diagonal = np.concatenate([p.one[order], p.other[order]], axis=2), p.diagonal[order]
         own = J[:, 1:] @ J[:, 1:].swapaxes(1, 2) + p.yields[order][:, 1:, None] * np.eye(dim - 1)
         largest = np.linalg.eigvalsh(own)[:, -1] if dim > 1 else np.ones(k)
         laws = np.column_stack([p.friction[order], 1.0 / diagonal[:, 0], 1.0 / largest, diagonal.mean(axis=1)])
-        reals = {"J": J, "b": p.b[order], "e": p.yields[order], "laws": laws}
-        places = {"contact": order, "one": p.first[order], "other": p.second[order]}
-        made = {name: wp.array(np.ascontiguousarray(values).ravel(), dtype=f64, device=p.device) for name, values in reals.items()}
-        made |= {name: wp.array(values.astype(np.int32), dtype=i32, device=p.device) for name, values in places.items()}
-        return {**made, "w": self._w, "r": self.x.flatten()}
+        return ContactFields(
+            *(wp.array(np.ascontiguousarray(v).ravel(), dtype=f64, device=p.device) for v in (J, p.b[order], p.yields[order], laws)),
+            *(wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in (order, p.first[order], p.second[order])),
+            self._w, self.x.flatten(),
+        )  # fmt: skip
 
     def _gathering(self) -> Any:
         """Return the pass that finds w = J'r body by body."""
@@ -140,9 +167,8 @@ class ContactWorkspace:
         both = np.stack([p.first[self.order], p.second[self.order]], axis=1).ravel()
         sides = np.argsort(both, kind="stable")[: np.count_nonzero(both < p.bodies)]
         starts = np.searchsorted(both[sides], np.arange(p.bodies + 1))
-        lists = {name: wp.array(v.astype(np.int32), dtype=i32, device=p.device) for name, v in (("starts", starts), ("sides", sides))}
-        shared = {name: fields[name] for name in ("contact", "J", "r", "w")}
-        return self._passes.gather.bind(self._rows(0, p.bodies), **lists, **shared)
+        first, listed = (wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in (starts, sides))
+        return self._passes.gather.bind(self._rows(0, p.bodies), fields, starts=first, sides=listed)
 
     def _rows(self, begin: int, end: int) -> Rows:
         """Return the contacts, or bodies, begin <= s < end."""
@@ -154,11 +180,11 @@ class ContactWorkspace:
         """Record a sweep, after a move along the last direction; `now` and 1 - now: which squared change is the last and which before."""
         launch, fields, state = self._program.launch, self._fields, self._state
         if self.method.accelerate:
-            CARRY.bind(rows_of(self._g), g=self._g, r=fields["r"], way=self._way, state=state, now=now).launch(launch)
+            CARRY.bind(rows_of(self._g), g=self._g, r=fields.r, way=self._way, state=state, now=now).launch(launch)
             FOLLOW.bind(rows_of(self._w), w=self._w, before=self._before, way=self._turn, state=state, now=now).launch(launch)
         for begin, end in zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True):
-            given = {**fields, "g": self._g, "state": state, "bodies": self.problem.bodies}
-            self._passes.sweep.bind(self._rows(begin, end), **given).launch(launch)
+            rows, bodies = self._rows(begin, end), self.problem.bodies
+            self._passes.sweep.bind(rows, fields, g=self._g, state=state, bodies=bodies).launch(launch)
         if self.method.accelerate:
             self._changes.dot(self._g, self._g, 1 - now, launch=launch)
 

@@ -157,8 +157,8 @@ class SubspaceWorkspace(SweepWorkspace):
             for old, bound in zip(self._old_bounds, (p.lower, p.upper), strict=True):
                 wp.copy(old, bound)
             p.bounds.follow(x)
-            old = dict(zip(("old_lower", "old_upper"), self._old_bounds, strict=True))
-            FOLLOW.bind(self._sums.rows, bounds=p.bounds.operands, x=x, **old).launch()
+            old_lower, old_upper = self._old_bounds
+            FOLLOW.bind(self._sums.rows, bounds=p.bounds.operands, x=x, old_lower=old_lower, old_upper=old_upper).launch()
         self._finish_move(x)
 
     def _energy(self, x: wp.array[Any]) -> float:
