@@ -61,6 +61,8 @@ class WindowTally:
         """Say that a recorded `take` has run."""
         if self._tally is None:
             self._reading.changed()
+        else:
+            self._tally.changed()
 
     def on_device(self) -> Any:
         """Return what is found, a number a column, where it is on a GPU; None on the CPU."""
