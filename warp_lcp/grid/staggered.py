@@ -21,8 +21,8 @@ from warp_lcp.grid.particle_loops import GridPlacement
 from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
 from warp_lcp.rows.layout import grain
-from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
-from warp_lcp.rows.program import Launch, clear, launch_ranges
+from warp_lcp.rows.memory import DeviceRows, RowsMemory, Scalar, Slot, larger
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch_ranges
 from warp_lcp.settings import renamed_names
 
 if typing.TYPE_CHECKING:
@@ -254,6 +254,12 @@ class _RangeMemory:
         self.range, self.tasks = _native(CellRange())(), ctypes.c_int64()
         self.first = 0, ctypes.addressof(self.range), ctypes.sizeof(self.range)
         self.sized = ctypes.addressof(self.tasks)
+        self.extent = self.room = (1, 1, 1)  # threads of a launch on CUDA: now, and at most so far
+
+    def take_dim(self, cells: typing.Any, dim: tuple[int, int, int]) -> None:
+        """Take a CellRange over on CUDA, with the threads that share it."""
+        self.take(cells, dim[0] * dim[1] * dim[2])
+        self.extent, self.room = dim, larger(self.room, dim)
 
     def take(self, cells: typing.Any, tasks: int) -> None:
         """Take a CellRange over."""
@@ -285,11 +291,13 @@ class ActiveWindow(Window):
     pieces: Scalar
     hulls: Slot
     _rows: tuple[RowsMemory, RowsMemory]  # of passes, of passes that sum
+    _sums: dict[int, DeviceRows]  # of passes that sum over columns of so many planes, on CUDA
     _ranges: tuple[_RangeMemory, _RangeMemory]  # of kernels for cells, for rows
     _now: Window
 
     def __init__(self, window: Window) -> None:
-        memory = {"_rows": (RowsMemory(), RowsMemory()), "_ranges": (_RangeMemory(), _RangeMemory()), "hulls": Slot()}
+        rows = DeviceRows if window.device.is_cuda else RowsMemory
+        memory = {"_rows": (rows(), rows()), "_sums": {}, "_ranges": (_RangeMemory(), _RangeMemory()), "hulls": Slot()}
         numbers = {"first": (Scalar(), Scalar()), "sizes": (Scalar(), Scalar()), "pieces": Scalar()}
         for name, value in {"device": window.device, **memory, **numbers, "_now": None}.items():
             object.__setattr__(self, name, value)  # which a dataclass that is frozen does not allow otherwise
@@ -312,6 +320,8 @@ class ActiveWindow(Window):
         if before is not None and before == window and before.near is None and window.near is None:
             return
         if self.device.is_cuda:
+            if LaunchGraph.on_device:
+                self._move_on_device(window)
             return
         (k, j, i), planes, rows, end = window.low, *window.rows, window.high[2]
         self.pieces.value = 0
@@ -330,6 +340,27 @@ class ActiveWindow(Window):
             of_cells.take(_in_part(pieces), len(pieces))
         self.hulls.point_to(window._hulls)
         self.pieces.value = len(window._hulls)
+
+    def _move_on_device(self, window: Window) -> None:
+        for memory, rows in zip(self._rows, (window._shared, window._whole), strict=True):
+            memory.take(rows.single, window.low)
+        for planes, memory in self._sums.items():
+            memory.take(window.rows_of_sums(planes).summed, window.low)
+        whole = window._cells(max(window.high[2] - window.low[2], 1))
+        for of_cells, cells in zip(self._ranges, (window.cells, whole), strict=True):
+            of_cells.take_dim(cells, (*window.rows, cells.chunks))
+
+    def rows_of_sums(self, planes: int) -> Rows:
+        """Return the rows of a pass that sums."""
+        if not self.device.is_cuda:
+            return super().rows_of_sums(planes)
+        rows = self._now.rows_of_sums(planes)
+        if planes not in self._sums:
+            memory = self._sums[planes] = DeviceRows()
+            layers, rows_, chunks = self._ranges[0].room
+            memory.room = -(-layers // planes), rows_, chunks
+            memory.take(rows.summed, self.low)
+        return replace(rows, memory=self._sums[planes])
 
     @property
     def hull_pieces(self) -> typing.Any:
@@ -358,8 +389,9 @@ class ActiveWindow(Window):
             dim, cost = (1, 1, cells.chunks), self._now._visited // max(cells.chunks, 1)
         ordered = getattr(kernel, "ordered", False)
         launch_ranges(
-            kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered, first=memory.first, sized=memory.sized
-        )
+            kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered,
+            first=memory.first, sized=memory.sized, extent=memory,
+        )  # fmt: skip
 
 
 class DirtyRegion:

@@ -62,6 +62,8 @@ class WindowTally:
         """Say that a recorded `take` has run."""
         if self._tally is None:
             self._reading.changed()
+        else:
+            self._tally.changed()
 
     def on_device(self) -> Any:
         """Return what is found, a number a column, where kernels find it."""

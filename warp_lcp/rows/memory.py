@@ -132,3 +132,31 @@ class RowsMemory:
         ctypes.memmove(ctypes.addressof(self.layout), ctypes.addressof(layout.__ctype__()), LAYOUT_BYTES)
         self.place[:] = list(place)
         self.tasks.value = -(-layout.planes // max(layout.slab, 1)) * layout.rows * layout.chunks
+
+
+class DeviceRows(RowsMemory):
+    """Rows that change between runs, on CUDA: with the launch dimensions that they take, and those that a graph is captured with.
+
+    Attributes:
+        extent: threads of a launch (slabs, rows, chunks) now.
+        room: those of a captured launch: the largest that have been asked for, those beyond the rows return at once.
+        places: number of threads, of which each has a place for its sums.
+    """
+
+    __slots__ = ("extent", "places", "room", "spare")
+
+    def __init__(self, spare: float = 1.0) -> None:
+        super().__init__()
+        self.extent, self.room, self.places, self.spare = (1, 1, 1), (1, 1, 1), Scalar(), spare
+
+    def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
+        """Take rows over."""
+        super().take(layout, place)
+        self.extent = -(-layout.planes // max(layout.slab, 1)), layout.rows, layout.chunks
+        self.room = larger(self.room, self.extent, self.spare)
+        self.places.value = self.tasks.value
+
+
+def larger(room: tuple[int, ...], extent: tuple[int, ...], spare: float = 1.0) -> tuple[int, ...]:
+    """Return launch dimensions that hold others, too: where they must grow, by a factor more."""
+    return tuple(r if r >= e else int(spare * e) for r, e in zip(room, extent, strict=True))

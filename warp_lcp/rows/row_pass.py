@@ -18,7 +18,7 @@ import warp as wp
 from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
 from warp_lcp.rows.native import HEADERS, sections, shared, text
-from warp_lcp.rows.program import Launch, is_recording, perform
+from warp_lcp.rows.program import Launch, device_program, is_recording, perform
 from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, memory_of, ranges, team
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
@@ -465,7 +465,9 @@ class Bound(NamedTuple):
 
     def launch(self, launch: Launch | None = None) -> None:
         """Launch the pass, or record it."""
-        if self.rows.device.is_cuda or team() is None:
+        if self.rows.device.is_cuda and (program := device_program(launch)) is not None:
+            program.record_pass(self)
+        elif self.rows.device.is_cuda or team() is None:
             (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
         elif (made := self.operation()) is not None:
             perform(made, launch)
@@ -478,7 +480,7 @@ class Bound(NamedTuple):
         cost, sized = max(self.layout.grain * self.rows.weight, 1), self.rows.memory.sized if recorded else 0
         return ranges(self.stage(), cost, ordered=self.form.declared.ordered, sized=sized)
 
-    def _patches(self) -> list[Patch]:
+    def patches(self) -> list[Patch]:
         """Return what a recorded launch reads from memory: rows, numbers, and arrays that others replace."""
         d, native, patches = self.form.declared, type(self.fields.__ctype__()), []
         if self.rows.memory is not None:
@@ -498,7 +500,7 @@ class Bound(NamedTuple):
         values = bytes(L.__ctype__()) + bytes(self.fields.__ctype__())
         memory = memory_of(ctypes.c_char, len(values)).from_buffer_copy(values)
         entry = self.form.entry(L, self.fields)
-        patches = self._patches() if is_recording() else ()
+        patches = self.patches() if is_recording() else ()
         return Stage(entry, memory, self, L.rows * L.chunks, threads(L)[0], lag, max(L.fz, 1), L.n1, patches)
 
 
