@@ -381,6 +381,8 @@ def _identity(argument: Any) -> Hashable:
         return (argument.ptr, argument.shape) if slot is None else slot.address
     if isinstance(argument, (list, tuple)):
         return tuple(map(_identity, argument))
+    if isinstance(argument, dict):
+        return tuple((name, _identity(value)) for name, value in argument.items())
     return getattr(argument, "identity", argument)
 
 
