@@ -156,9 +156,12 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
     heard: list[Heard] = []
     bind = RowPass.bind
 
-    def listening(declared: RowPass, rows: Rows, *, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> Bound:
-        bound = bind(declared, rows, stencil=stencil, bounds=bounds, **given)
-        fields = {name: value for name, value in given.items() if isinstance(value, wp.array)}
+    def listening(
+        declared: RowPass, rows: Rows, *structs: Any, stencil: Any = None, bounds: list[Any] | None = None, **given: Any
+    ) -> Bound:
+        bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **given)
+        taken = {name: getattr(bound.fields, name) for name in declared.arrays}
+        fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
         if stencil is not None:
             fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}
         fields |= {name: value for name, value in zip(("lower", "", "upper", "", "code"), bounds or (), strict=False) if name}

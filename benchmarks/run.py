@@ -17,8 +17,8 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
 from warp_lcp.benchmarks.harness.timing import Figure, Options, timed
-from warp_lcp.material import particle_simulation
 from warp_lcp.material.boundary import WholeCells
+from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
@@ -30,10 +30,10 @@ PARTICLE_STEPS = 12
 WALL_TIME = 0.6  # [s] simulated of the scene in which solves with and without walls are compared: the splash lies in it
 WHOLE = "domain.solids=voxel"  # solids fill whole cells, as they do by themselves at the suite's own resolutions
 STAGES: dict[str, tuple[ModuleType | type, str]] = {
-    "to grid": (particle_simulation, "particles_to_faces"),
-    "to particles": (particle_simulation, "faces_to_particles"),
+    "to grid": (ParticleSimulation, "particles_to_grid"),
+    "to particles": (ParticleSimulation, "grid_to_particles"),
     "advection": (WholeCells, "advect"),
-    "extrapolation": (WholeCells, "extrapolate_velocity"),
+    "extrapolation": (ParticleSimulation, "extrapolate_velocity"),
     "solve": (wl, "solve"),
 }
 
