@@ -137,8 +137,10 @@ class ContactProblem:
         indices = np.concatenate([self.first[order], self.second[order], starts]).astype(np.int32)
         residual, rounds = np.zeros((2, len(starts) - 1))
         islands = Rows.entries(len(residual), wp.get_device("cpu"))
-        given = {"reals": _warp(reals), "indices": _warp(indices), "residual": _warp(residual), "rounds": _warp(rounds)}
-        NNCG.bind(islands, q=q, dim=rows, contacts=k, rtol=stopping.rtol, most=stopping.max_iterations, **given).launch()
+        NNCG.bind(
+            islands, reals=_warp(reals), indices=_warp(indices), residual=_warp(residual), rounds=_warp(rounds), q=q, dim=rows,
+            contacts=k, rtol=stopping.rtol, most=stopping.max_iterations,
+        ).launch()  # fmt: skip
         x = reals[:size].reshape(k, rows)
         for island in np.flatnonzero(residual > unsolved):
             mine = slice(starts[island], starts[island + 1])
