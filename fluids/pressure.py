@@ -16,6 +16,7 @@ import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
+from warp_lcp.grid.advection import FaceVelocity
 from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.grid.transfer import TINY_WEIGHT
@@ -30,7 +31,6 @@ from warp_lcp.rows.vectors import convert
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
 THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
-FACES = tuple(f"{what}_{axis}" for what in ("open", "solid") for axis in "xyz")
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h", CONSTANTS)
 COUNT = KERNELS["fluids.pressure.count_fluid"]
 
@@ -85,6 +85,33 @@ class Projection:
         Recomputed from the projected velocities.
         """
         return self._found[1]
+
+
+@dataclass(frozen=True, slots=True)
+class LiquidBoundary:
+    """Cells of the liquid, its surface, and the walls around it, as the kernels of the pressure take them.
+
+    Attributes:
+        kind: int8 of AIR, FLUID, SOLID.
+        phi: level set of the surface [cells], float32; None: the surface lies at the faces of FLUID cells.
+        planes: nodes along z that a tent function spans: 1 in 2-D, 2 in 3-D.
+        open_x: open fractions of the faces along x, float32; None: walls are whole cells.
+        open_y: likewise along y.
+        open_z: likewise along z; None in 2-D.
+        solid_x: velocity of solids along x on the faces [m/s], float32; None: they rest.
+        solid_y: likewise along y.
+        solid_z: likewise along z; None in 2-D.
+    """
+
+    kind: wp.array
+    phi: wp.array | None
+    planes: int
+    open_x: wp.array | None
+    open_y: wp.array | None
+    open_z: wp.array | None
+    solid_x: wp.array | None
+    solid_y: wp.array | None
+    solid_z: wp.array | None
 
 
 class PressureProjection:
@@ -193,9 +220,11 @@ class PressureProjection:
 
     def _launch_preparation(self, velocity: Sequence[wp.array]) -> None:
         """Launch the set-up of b, the lower bound, the first guess and the shift of the diagonal."""
-        problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
-        numbers: dict[str, Any] = {"ratio": self._ratio_cell, "adhesion": self._adhesion, "jump": self.jump}
-        self._cells.run(self._passes.prepare, **self._liquid(velocity), **problem, **numbers)
+        self._cells.run(
+            self._passes.prepare, self._faces, FaceVelocity.of(velocity), touch=self.boundary.touch, previous=self.pressure,
+            b=self._b, lower=self._lower, start=self._start, shift=self._shift, ratio=self._ratio_cell, adhesion=self._adhesion,
+            jump=self.jump,
+        )  # fmt: skip
 
     def _look(self, window: Window | None) -> None:
         """Solve for the cells of a window, and undo what is left of the last one."""
@@ -230,14 +259,10 @@ class PressureProjection:
         if self.coupling is not None:
             self.coupling.take(self._unknown)
 
-    def _faces(self) -> dict[str, Any]:
-        """Return what passes take of cells, solids and surface."""
-        faces = zip(FACES, [*three(self.boundary.open), *three(self.boundary.velocity)], strict=True)
-        return {"kind": self.kind, "phi": self._phi, "planes": self.grid.planes, **dict(faces)}
-
-    def _liquid(self, velocity: Sequence[wp.array]) -> dict[str, Any]:
-        """Return what passes take of velocities and walls, and what `_faces` has."""
-        return dict(zip("uvw", three(velocity), strict=True)) | {"touch": self.boundary.touch} | self._faces()
+    @property
+    def _faces(self) -> LiquidBoundary:
+        b = self.boundary
+        return LiquidBoundary(self.kind, self._phi, self.grid.planes, *three(b.open), *three(b.velocity))
 
     def solve(self, speed: float) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
@@ -316,11 +341,13 @@ class PressureProjection:
         self._accept(x)
         for axis, field in enumerate(velocity):
             window.clear(self.known[axis])
-            faces = self._faces() | {"x": self.pressure, "field": field, "known": self.known[axis]}
-            window.run(self._passes.subtract_gradient, axis=axis, **faces)
+            known = self.known[axis]
+            window.run(self._passes.subtract_gradient, self._faces, x=self.pressure, field=field, known=known, axis=axis)
         self._support(velocity, window)
-        given = {"x": self.pressure, "contact": self.contact, "threshold": self._threshold}
-        self._contacts.take(self._cells, **self._liquid(velocity), **given)
+        self._contacts.take(
+            self._cells, self._faces, FaceVelocity.of(velocity), touch=self.boundary.touch, x=self.pressure, contact=self.contact,
+            threshold=self._threshold,
+        )  # fmt: skip
 
     def counted(self) -> int:
         """Return the number of unknowns of the prepared problem."""
@@ -372,8 +399,10 @@ class PressureProjection:
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface; its faces become known after the projected ones."""
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
-            faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight, "jump": self.jump}
-            window.run(self._passes.support, axis=axis, limit=self._limit, **faces)
+            window.run(
+                self._passes.support, self._faces, x=self.pressure, field=field, known=known, weight=weight, jump=self.jump,
+                axis=axis, limit=self._limit,
+            )  # fmt: skip
 
     def _accept(self, x: wp.array) -> None:
         """Take the solution of the problem, and show its cells."""

@@ -22,6 +22,7 @@ interpolation 23 %. A distance is interpolated linearly, which is exact where it
 
 import functools
 import typing
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -114,7 +115,7 @@ class FaceVelocity:
     w: wp.array | None
 
     @classmethod
-    def of(cls, components: list[wp.array]) -> "FaceVelocity":
+    def of(cls, components: Sequence[wp.array]) -> "FaceVelocity":
         """Return the velocity of two or three components."""
         u, v, w = [*components, None][:3]
         return cls(u, v, w)

@@ -322,7 +322,8 @@ class ComponentFinder:
                 )
             scratch = self._own
         parent, grounded = scratch[0].view(wp.int32), scratch[1]
-        cells, faces = A.cells_around.flatten(), FaceCoefficients(*(face.flatten() for face in A.faces), *A.uniform)
+        cells, (x, y, z) = A.cells_around.flatten(), (face.flatten() for face in A.faces)
+        faces = FaceCoefficients(x, y, z, *A.uniform)
         SINGLETONS.bind(rows, parent=parent, grounded=grounded).launch(launch)
         UNITE.bind(rows, faces, cells=joined.flatten(), parent=parent).launch(launch)
         GROUND.bind(rows, faces, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded).launch(launch)

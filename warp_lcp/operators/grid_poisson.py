@@ -248,7 +248,8 @@ class GridPoisson(GridOperator):
             x, y, z = (c > 0 for c in self.uniform)
             COUNT_FACES.bind(reach, cells=cells, diagonal=s.d, around_x=x, around_y=y, around_z=z).launch()
             return
-        faces = StoredFaces(*(f.flatten() if f.size else None for f in self.faces), *self.uniform)
+        fx, fy, fz = (f.flatten() if f.size else None for f in self.faces)
+        faces = StoredFaces(fx, fy, fz, *self.uniform)
         x, y, z = (f.size > 0 for f in self.faces)
         shift = self.shift.flatten() if self.shift.size else None
         DIAGONAL.bind(

@@ -9,6 +9,7 @@ the type of corrections, the others over flat fields.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
@@ -69,6 +70,76 @@ MapName = Literal[tuple(map(str, MapForm))]
 KinkName = Literal[tuple(map(str, Kink))]
 
 
+@dataclass(frozen=True, slots=True)
+class MapFields:
+    """Stored fields that the values f of a map are computed from.
+
+    Attributes:
+        x: iterate.
+        y: A x + b.
+        d: diagonal of A in units of `unit`.
+        unknown: 1 where there is an unknown.
+        unit: of d.
+    """
+
+    x: wp.array[Any]
+    y: wp.array[Any]
+    d: wp.array[Any]
+    unknown: wp.array[Any]
+    unit: float
+
+
+@dataclass(frozen=True, slots=True)
+class MapNumbers:
+    """Numbers of a map.
+
+    Attributes:
+        share: of the Fischer-Burmeister function in the penalized one.
+        over: one over the size of b an unknown.
+        kinks: distance to a kink below which an element of its subdifferential is chosen.
+        seed: of random elements.
+    """
+
+    share: float
+    over: float
+    kinks: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class MapSystem:
+    """Newton's system divided by q: (A + D) dx = r.
+
+    Attributes:
+        D: diagonal that is added, a stored field (written).
+        r: right-hand side (written).
+        free: which unknowns move, uint8 (written); None: the kernel has none.
+        scale: of the right-hand side.
+        least: of q.
+        drop: whether elements at kinks are 0.
+    """
+
+    D: wp.array[Any]
+    r: wp.array[Any]
+    free: wp.array[Any] | None
+    scale: float
+    least: float
+    drop: bool
+
+
+@dataclass(frozen=True, slots=True)
+class MapWeights:
+    """Parts of the merit's gradient f'J, stored float64 fields.
+
+    Attributes:
+        by_x: derivative by x with y fixed (written).
+        by_y: derivative by y (written).
+    """
+
+    by_x: wp.array[Any]
+    by_y: wp.array[Any]
+
+
 class NonsmoothMap:
     """f, the merit f.f / 2 and its gradient, at the point where a residual was evaluated last.
 
@@ -92,8 +163,8 @@ class NonsmoothMap:
         self.problem, self.residual, self.map = problem, residual, map
         layout, self._share = problem.layout, share if map is MapForm.PENALIZED else 1.0
         natural, self._random = map is MapForm.NATURAL, kink is Kink.RANDOM
-        self._form = {"NATURAL": natural, "UPPER": problem.bounds.may_bind[1], "PENALIZED": self._share < 1}
-        self._form["RANDOM"] = self._random and not natural
+        self._natural, self._upper, self._penalized = natural, problem.bounds.may_bind[1], self._share < 1
+        self._draws = self._random and not natural
         self._sums, self.norm = Sums(Rows.flat(layout.size, problem.device), 2), 0.0
         self._by_rows: Sums | None = None  # made when first asked for, as is this one and the last gradient, the product, the weights
         self._gradients: list[wp.array[Any]] = []
@@ -104,7 +175,7 @@ class NonsmoothMap:
         """Take the scale of b as it is now."""
         count = max(int(np.count_nonzero(self.problem.unknown.numpy() == 1)), 1)
         scale = self.residual.norm_of_b() / np.sqrt(count) or 1.0
-        self._numbers = {"share": self._share, "over": float(1 / scale), "kinks": float(KINK * scale), "seed": 0}
+        self._numbers = MapNumbers(self._share, float(1 / scale), float(KINK * scale), 0)
 
     def merit(self, x: wp.array[Any]) -> float:
         """Return f.f / 2 at x, where the residual was evaluated."""
@@ -112,7 +183,10 @@ class NonsmoothMap:
 
     def values(self, x: wp.array[Any], out: wp.array[Any]) -> None:
         """Write f to a stored field."""
-        VALUES.bind(self._sums.rows, **self._given(x), values=out).launch()
+        VALUES.bind(
+            self._sums.rows, self._numbers, self._fields(x), values=out, bounds=self.problem.bounds.operands, NATURAL=self._natural,
+            UPPER=self._upper, PENALIZED=self._penalized, RANDOM=self._draws,
+        ).launch()  # fmt: skip
 
     def condense(self, x: wp.array[Any], shift: wp.array[Any], r: wp.array[Any], free: wp.array[Any], scale: float, turn: int) -> float:
         """Write Newton's system divided by q: (A + D) dx = -f / q with D = d p / q, q at least 1e-6; return the merit.
@@ -125,11 +199,12 @@ class NonsmoothMap:
             scale: of the right-hand side.
             turn: number of the step, so that random elements differ from step to step.
         """
-        return self._half_sum(CONDENSE, x, D=shift, r=r, free=free, **self._condensing(scale, turn))
+        return self._half_sum(CONDENSE, x, self._system(shift, r, free, scale, turn))
 
-    def _condensing(self, scale: float, turn: int) -> dict[str, Any]:
-        self._numbers["seed"] = turn * self.problem.layout.size  # other random elements than in the last step
-        return {"scale": scale, "least": LEAST_Q, "drop": self._drops}
+    def _system(self, D: wp.array[Any], r: wp.array[Any], free: wp.array[Any] | None, scale: float, turn: int) -> MapSystem:
+        seed = turn * self.problem.layout.size  # other random elements than in the last step
+        self._numbers = replace(self._numbers, seed=seed)
+        return MapSystem(D, r, free, scale, LEAST_Q, self._drops)
 
     def step(self, x: wp.array[Any], e: wp.array[Any], length: float, finest: Level, scale: float, turn: int) -> float:
         """Move x by length e, set the residual's norm, and condense the next system there, for one CPU thread and no periodic axes.
@@ -149,9 +224,11 @@ class NonsmoothMap:
         if self._by_rows is None:
             self._by_rows = Sums(stencil.rows, 3)
         moving = MOVE.bind(stencil.rows, e=e, x=x, step=length) if length else None
-        fields = {"x": x, "b": p.b, "unknown": p.unknown, "D": finest.stencil.d, "r": finest.b, "out": self._by_rows.partials}
-        numbers = self._condensing(scale, turn) | self._numbers | self._form
-        condensing = CONDENSE_AT_ROWS.bind(stencil.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers)
+        system = self._system(finest.stencil.d, finest.b, None, scale, turn)
+        condensing = CONDENSE_AT_ROWS.bind(
+            stencil.rows, self._numbers, system, stencil=stencil, bounds=p.bounds.operands, x=x, b=p.b, unknown=p.unknown,
+            out=self._by_rows.partials, NATURAL=self._natural, UPPER=self._upper, PENALIZED=self._penalized, RANDOM=self._draws,
+        )  # fmt: skip
         STEP.launch(moving, condensing)
         self._by_rows.add_up(0, columns=3)
         square, merit, weighted = self._by_rows.scalars.numpy()
@@ -169,11 +246,11 @@ class NonsmoothMap:
             self._gradients = [p.layout.zeros(wp.float64) for _ in range(4)]
         last, new, product, weights = self._gradients
         self._gradients = [new, last, product, weights]
-        self._half_sum(WEIGHTED, x, by_x=new, by_y=weights)
+        self._half_sum(WEIGHTED, x, MapWeights(new, weights))
         shape = (p.layout.size,) if isinstance(p.layout, PaddedLayout) else p.layout.stored_shape  # grids take stored fields flat
         p.A.apply_transpose(weights.reshape(shape), product.reshape(shape))
-        r, fields = self.residual, {"gradient": new, "product": product, "last": last, "unknown": p.unknown}
-        square, inner = self._sums.of(GRADIENT, **fields, d=r.diagonal, unit=r.unit)
+        r = self.residual
+        square, inner = self._sums.of(GRADIENT, gradient=new, product=product, last=last, unknown=p.unknown, d=r.diagonal, unit=r.unit)
         return float(square), float(inner)
 
     @property
@@ -188,7 +265,7 @@ class NonsmoothMap:
         convert(e, along)
         shape = (layout.size,) if isinstance(layout, PaddedLayout) else layout.stored_shape  # grids take stored fields flat
         p.A.apply(along.reshape(shape), product.reshape(shape))
-        self._half_sum(WEIGHTED, x, by_x=by_x, by_y=by_y)
+        self._half_sum(WEIGHTED, x, MapWeights(by_x, by_y))
         for slot, (weights, moved) in enumerate(((by_x, along), (by_y, product))):
             self._sums.dot(weights, moved, slot)
         return float(self._sums.scalars.numpy()[:2].sum())
@@ -212,14 +289,16 @@ class NonsmoothMap:
     def advance(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], *, projected: bool) -> None:
         """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""
         p = self.problem
-        fields = {"base": base, "e": e, "unknown": p.unknown, "x": x}
-        ADVANCE.bind(self._sums.rows, bounds=p.bounds.operands, **fields, scale=scale, projected=projected).launch()
+        rows, bounds = self._sums.rows, p.bounds.operands
+        ADVANCE.bind(rows, bounds=bounds, base=base, e=e, unknown=p.unknown, x=x, scale=scale, projected=projected).launch()
 
-    def _half_sum(self, declared: RowPass, x: wp.array[Any], **given: Any) -> float:
-        return 0.5 * float(self._sums.of(declared, **self._given(x), **given)[0])
+    def _half_sum(self, declared: RowPass, x: wp.array[Any], *more: MapSystem | MapWeights) -> float:
+        sums = self._sums.of(
+            declared, self._numbers, self._fields(x), *more, bounds=self.problem.bounds.operands, NATURAL=self._natural,
+            UPPER=self._upper, PENALIZED=self._penalized, RANDOM=self._draws,
+        )  # fmt: skip
+        return 0.5 * float(sums[0])
 
-    def _given(self, x: wp.array[Any]) -> dict[str, Any]:
-        """Return what passes over the values of a map take."""
-        p, r = self.problem, self.residual
-        fields = {"x": x, "y": r.y, "d": r.diagonal, "unknown": p.unknown, "unit": r.unit}
-        return {"bounds": p.bounds.operands, **fields, **self._numbers, **self._form}
+    def _fields(self, x: wp.array[Any]) -> MapFields:
+        r = self.residual
+        return MapFields(x, r.y, r.diagonal, self.problem.unknown, r.unit)
