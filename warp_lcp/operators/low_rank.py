@@ -14,6 +14,7 @@ from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.protocol import layout_of
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
+from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Across, Reduction, add_across
 
@@ -231,8 +232,9 @@ class LowRankOperator(Pickled):
         if weights is not None:
             W = self._checked_weights(weights)
             self.symmetric = _is_symmetric(W)
-            self.weights.assign(W)
-            self._transposed.assign(np.ascontiguousarray(W.T))
+            self._weights.host[:], self._turned.host[:] = W, W.T
+            self._weights.send()
+            self._turned.send()
         self.version += 1
 
     def stored_like(self, A: Any) -> LowRankOperator:
@@ -306,7 +308,11 @@ class LowRankOperator(Pickled):
         self.shape, self.device, self.dtype, self.rank, self.version = layout.shape, layout.device, columns.dtype, columns.rank, 0
         W = self._checked_weights(weights)
         self.symmetric = _is_symmetric(W)
-        self.weights, self._transposed = (wp.array(V.copy(), dtype=wp.float64, device=self.device) for V in (W, W.T))
+        self._weights, self._turned = (HostArray(W.shape, wp.float64, self.device) for _ in range(2))
+        self.weights, self._transposed = self._weights.array, self._turned.array
+        self._weights.host[:], self._turned.host[:] = W, W.T
+        self._weights.send()
+        self._turned.send()
         self._weighed = wp.zeros(self.rank, dtype=wp.float64, device=self.device)
 
     def _checked_weights(self, weights: Any) -> np.ndarray:

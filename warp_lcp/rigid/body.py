@@ -17,6 +17,7 @@ MOST_ROUNDS = 60  # of the fixed point; a step turns a body by far less than a r
 STATE, VALUES = 20, 26  # numbers of a body's state, and with the impulses given
 POSITION, ROTATION, MOMENTUM, SPINNING = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 18)  # where in the state
 ANGLE, TIME, GIVEN = 18, 19, slice(20, 26)
+UNIT, EPSILON = np.eye(3), float(np.finfo(np.float64).eps)
 CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)  # v @ CROSS: entries of the matrix of v x
 AXES = [0, 1, 2]
 PLANAR = [0, 1, 5]  # vx, vy, wz among the six
@@ -407,7 +408,8 @@ def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.nda
         dt: time [s], or one for each, shape (n,).
     """
     R, L = values[:, ROTATION].reshape(-1, 3, 3), values[:, SPINNING]
-    inverse, each = np.broadcast_to(inverse_inertia, R.shape), np.broadcast_to(dt, len(R))
+    inverse = inverse_inertia if np.shape(inverse_inertia) == R.shape else np.broadcast_to(inverse_inertia, R.shape)
+    each = np.asarray(dt) if np.ndim(dt) else np.full(len(R), dt)
     time = each[:, None]
     half, left = 0.5 * time * spins(R, inverse, L), np.arange(len(R))
     for _ in range(MOST_ROUNDS):
@@ -435,7 +437,7 @@ def orthonormal(rotation: np.ndarray) -> np.ndarray:
 
     R (3 - R'R) / 2 is Newton's step to the polar factor of R (Newton-Schulz): |R'R - 1| = d becomes 3/4 d^2, which is below rounding.
     """
-    return np.asarray(0.5 * rotation @ (3.0 * np.eye(3) - rotation.swapaxes(-1, -2) @ rotation))
+    return np.asarray(0.5 * rotation @ (3.0 * UNIT - rotation.swapaxes(-1, -2) @ rotation))
 
 
 def rotation_by(vector: np.ndarray) -> np.ndarray:
@@ -446,8 +448,15 @@ def rotation_by(vector: np.ndarray) -> np.ndarray:
     With K x = v x x that is 1 + sin(a) / a K + (sin(a/2) / (a/2))^2 K^2 / 2, a = |v|.
     """
     angle = np.sqrt(np.square(vector).sum(axis=-1))[..., None, None] / np.pi
-    K = cross_matrix(vector)  # np.sinc(x) = sin(pi x) / (pi x)
-    return np.asarray(np.eye(3) + np.sinc(angle) * K + (0.5 * np.sinc(0.5 * angle) ** 2 * K) @ K)
+    K = cross_matrix(vector)
+    return np.asarray(UNIT + _sinc(angle) * K + (0.5 * _sinc(0.5 * angle) ** 2 * K) @ K)
+
+
+def _sinc(x: np.ndarray) -> np.ndarray:
+    """Return sin(pi x) / (pi x), as `np.sinc`, whose look at the type takes as long as the sine."""
+    y = np.pi * x
+    y = np.where(y, y, EPSILON)
+    return np.asarray(np.sin(y) / y)
 
 
 def cross_matrix(vector: np.ndarray) -> np.ndarray:

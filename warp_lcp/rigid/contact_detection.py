@@ -54,8 +54,11 @@ class ContactPoints:
     @classmethod
     def joined(cls, several: Sequence[ContactPoints]) -> ContactPoints:
         """Return the points of several pairs as one."""
-        none = cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-        return cls(*(np.concatenate([getattr(points, name) for points in (none, *several)]) for name in ("point", "normal", "gap")))
+        some = [points for points in several if len(points.gap)]
+        if len(some) < 2:
+            point, normal, gap = (some[0].point, some[0].normal, some[0].gap) if some else (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+            return cls(np.ascontiguousarray(point), np.ascontiguousarray(normal), gap)
+        return cls(*(np.concatenate([getattr(points, name) for points in some]) for name in ("point", "normal", "gap")))
 
 
 class Place(NamedTuple):
@@ -261,8 +264,11 @@ class FoundContacts:
     @classmethod
     def joined(cls, several: Sequence[FoundContacts]) -> FoundContacts:
         """Return several as one."""
-        first, second, obstacle = (np.concatenate([getattr(f, name) for f in several]) for name in ("first", "second", "obstacle"))
-        return cls(first, second, obstacle, ContactPoints.joined([found.points for found in several]))
+        some = [found for found in several if len(found.first)]
+        if len(some) < 2:
+            return some[0] if some else several[0]
+        first, second, obstacle = (np.concatenate([getattr(f, name) for f in some]) for name in ("first", "second", "obstacle"))
+        return cls(first, second, obstacle, ContactPoints.joined([found.points for found in some]))
 
 
 class ContactDetection:

@@ -84,18 +84,20 @@ class SweepWorkspace(threading.local):
             stopping: the tolerance and the most iterations.
         """
         contacts, dim, q = shape
-        filled, numbers, self._islands = sum(f.size for f in fields), sum(map(len, indices)), len(indices[-1]) - 1
-        self._reserve(filled + work, numbers, self._islands)
+        filled, numbers, islands = sum(f.size for f in fields), sum(map(len, indices)), len(indices[-1]) - 1
+        self._reserve(filled + work, numbers, islands)
         np.concatenate([np.ravel(field) for field in fields], out=self._reals[:filled])
         self._reals[filled : filled + work] = 0.0
         np.concatenate(indices, out=self._indices[:numbers], casting="same_kind")
         self._q.value, self._dim.value, self._contacts.value = q, dim, contacts
         self._rtol.value, self._most.value = stopping.rtol, stopping.max_iterations
-        self._residual[: self._islands] = self._rounds[: self._islands] = 0.0
-        self._rows.take(Rows.entries(self._islands, self._device).single)
+        self._residual[:islands] = self._rounds[:islands] = 0.0
+        if islands != self._islands:
+            self._islands = islands
+            self._rows.take(Rows.entries(islands, self._device).single)
         self._graph.run()
         x = self._reals[: contacts * dim].reshape(contacts, dim)
-        return x.copy(), self._residual[: self._islands].copy(), self._rounds[: self._islands].copy()
+        return x.copy(), self._residual[:islands].copy(), self._rounds[:islands].copy()
 
     def _launch(self) -> None:
         rows = replace(Rows.entries(self._islands, self._device), memory=self._rows)
@@ -155,7 +157,8 @@ class ContactProblem:
         if pairs.any():
             group = _components(self.first[pairs].tolist(), self.second[pairs].tolist(), self.bodies)[group]
         order = np.argsort(group, kind="stable")
-        starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+        group = group[order]
+        starts = np.flatnonzero(np.concatenate([group[:1] >= 0, group[1:] != group[:-1]]))  # where a group begins
         return order, np.append(starts, len(order))
 
     def part(self, contacts: np.ndarray) -> ContactProblem:

@@ -12,7 +12,7 @@ class HostArray:
     """An array filled by the host and read by kernels: one memory on the CPU, two on a GPU.
 
     Args:
-        count: elements.
+        count: elements, or the shape.
         dtype: of them, a Warp type or struct.
         device: where kernels read them.
 
@@ -21,7 +21,7 @@ class HostArray:
         array: what kernels take, up to date after `send`.
     """
 
-    def __init__(self, count: int, dtype: Any, device: wp.Device) -> None:
+    def __init__(self, count: int | tuple[int, ...], dtype: Any, device: wp.Device) -> None:
         self.array: wp.array[Any] = wp.zeros(count, dtype=dtype, device=device)
         self._shared = wp.get_device(device).is_cpu
         self.host: Any = self.array.numpy() if self._shared else np.zeros_like(self.array.numpy())
