@@ -22,6 +22,7 @@ from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.rows.fields import Array
+from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import convert
 
 SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squares that float64 holds
@@ -185,9 +186,9 @@ class IterateMemory:
         if self._best is not None:
             self.problem.layout.copy(self.x, self._best)
 
-    def round_iterate(self) -> None:
+    def round_iterate(self, *, launch: Launch = wp.launch) -> None:
         """Round x to its precision."""
-        self._round(self.x)
+        self._round(self.x, launch=launch)
 
     def _finish_move(self, x: wp.array[Any]) -> None:
         """Choose the constants that a move of x left open on floating components, and round."""
@@ -195,10 +196,10 @@ class IterateMemory:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
 
-    def _round(self, x: wp.array[Any]) -> None:
+    def _round(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         if self._rounded is not None:
-            convert(x, self._rounded)
-            convert(self._rounded, x)
+            convert(x, self._rounded, launch=launch)
+            convert(self._rounded, x, launch=launch)
 
 
 @runtime_checkable

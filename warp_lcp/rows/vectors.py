@@ -297,9 +297,9 @@ def rows_of(field: wp.array[Any]) -> Rows:
     return Rows.flat(field.size, field.device)
 
 
-def convert(a: wp.array[Any], b: wp.array[Any]) -> None:
-    """b = a, between float types."""
+def convert(a: wp.array[Any], b: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    """b = a, between float types; types that differ may be recorded by `launch`."""
     if a.dtype is b.dtype:
         copy(b, a)
     else:
-        CONVERT.bind(rows_of(a), a=a, b=b).launch()
+        CONVERT.bind(rows_of(a), a=a, b=b).launch(launch)

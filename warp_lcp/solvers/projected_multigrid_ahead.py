@@ -12,6 +12,7 @@ import warp as wp
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem.solve import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Rows
 from warp_lcp.rows.program import Conditional, Launch, Program, loops_on_device
@@ -54,7 +55,7 @@ class RunAhead:
     @staticmethod
     def suits(work: MultigridWorkspace) -> bool:
         """Return whether the device can do without its host: where loops run on it, on a grid in one process."""
-        plain = type(work.hierarchy) is Hierarchy and isinstance(work.problem.A, GridPoisson) and work.exact
+        plain = type(work.hierarchy) is Hierarchy and isinstance(work.problem.A, GridPoisson)
         return plain and work.problem.layout.across is None and loops_on_device(work.A.device)
 
     def steps(self, tolerance: float, left: int) -> bool:
@@ -127,6 +128,8 @@ class RunAhead:
         if id(step) not in self._loops:
             loop = self._loops[id(step)] = Program(work.A.device)
             loop.record(Conditional(self._stale, rebuild))
+            if work.precision is Precision.SINGLE:  # rounding cannot be taken back: x, the best iterate, is stored before each step
+                CONVERT.bind(Rows.of_fields(work.problem.layout), a=work.x, b=work.best()).launch(loop.launch)
             loop.extend(step)
             memory = [work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
             loop.launch(kernels.judge_kernel, 1, memory, device=work.A.device)
@@ -175,6 +178,7 @@ class Beginning:
         p, device = work.problem, work.A.device
         p.bounds.encode(launch)
         r.project(x, keep=False, launch=launch)
+        work.round_iterate(launch=launch)
         r.launch_square_of_b(launch)
         launch(kernels.take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
         r.classify = False
@@ -191,6 +195,7 @@ class Beginning:
         else:
             CONVERT.bind(Rows.of_fields(p.layout), a=self._guess, b=x).launch(launch)
         r.project(x, keep=True, launch=launch)
+        work.round_iterate(launch=launch)
         r.classify = True
         r.assess(x, launch=launch)
         if work.scratch is not None:

@@ -225,7 +225,10 @@ class MultigridWorkspace(IterateMemory):
     def _leave(self) -> None:
         """Store the best iterate before x leaves it behind: it was x, or one step ago."""
         if not self._stored and self._past == (1 if self.exact else 0):
-            self._keep_stored(by_undoing=self.exact)
+            if self._ahead is not None and self._ahead.rows and not self.exact:
+                self._stored = True  # the device has stored it, and x has gone on
+            else:
+                self._keep_stored(by_undoing=self.exact)
         self._past += 1
 
     def _store(self) -> None:
@@ -235,13 +238,17 @@ class MultigridWorkspace(IterateMemory):
 
     def _keep_stored(self, *, by_undoing: bool) -> None:
         """Store x, or where its last step began."""
+        if by_undoing:
+            self._undo(self.best())
+        else:
+            self.problem.layout.copy(self.best(), self.x)
+        self._stored = True
+
+    def best(self) -> wp.array[Any]:
+        """Return the memory of the best iterate, made at the first call."""
         if self._best is None:
             self._best = self.problem.layout.zeros(wp.float64)
-        if by_undoing:
-            self._undo(self._best)
-        else:
-            self.problem.layout.copy(self._best, self.x)
-        self._stored = True
+        return self._best
 
     def _undo(self, out: wp.array[Any]) -> None:
         """Write where the last step began."""
@@ -343,12 +350,14 @@ class MultigridWorkspace(IterateMemory):
         self._allowed -= 1
         if not self._has_run_ahead():
             self._rebuild()
-            if self.exact:
+            if self.floating is None:
                 self.step_program().run()
             else:
                 self._cycle()
                 self._measure()
-                self._advance(settle=True)
+                self.residual.update(self.x, self._p)
+                self._finish_move(self.x)
+                self.residual.assess(self.x)
             self.residual.read()
         if self.floating is not None:
             self._project()
@@ -359,7 +368,10 @@ class MultigridWorkspace(IterateMemory):
     def _has_run_ahead(self) -> bool:
         """Let the device take a step, and those that follow it; return whether it has, and take over what came of one."""
         ahead, left = self._ahead, min(self._allowed + 1, FIRST - self._pace.taken)
-        if ahead is None or not self.exact or not (ahead.rows or (left > 0 and ahead.steps(self._tolerance, left))):
+        if ahead is None or self.floating is not None:
+            return False
+        starts = left > 0 and (self._rounded is None or self._past == 1)  # from the best iterate, where steps cannot be taken back
+        if not (ahead.rows or (starts and ahead.steps(self._tolerance, left))):
             return False
         self.residual.stale = False
         self.residual.take(ahead.rows.popleft())
@@ -385,7 +397,7 @@ class MultigridWorkspace(IterateMemory):
             program, before = Program(self.A.device), self.residual.classify
             self._programs[key], self.residual.classify = program, True
             self._correct(program)
-            self.residual.advance(self.x, self._p, launch=program.launch)
+            self._advance(launch=program.launch)
             self.residual.classify = before
         return program
 
@@ -433,14 +445,14 @@ class MultigridWorkspace(IterateMemory):
         self.residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
 
-    def _advance(self, *, settle: bool = False) -> None:
+    def _advance(self, *, launch: Launch = wp.launch) -> None:
         """Take the planned step and evaluate the residual there."""
         if self.exact:
-            self.residual.advance(self.x, self._p)
+            self.residual.advance(self.x, self._p, launch=launch)
             return
-        self.residual.update(self.x, self._p)
-        (self._finish_move if settle else self._round)(self.x)
-        self.residual.assess(self.x)
+        self.residual.update(self.x, self._p, launch=launch)
+        self._round(self.x, launch=launch)
+        self.residual.assess(self.x, launch=launch)
 
     def _rebuild(self) -> None:
         if self.residual.stale:
