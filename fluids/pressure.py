@@ -89,7 +89,7 @@ class Projection:
 
 @dataclass(frozen=True, slots=True)
 class LiquidBoundary:
-    """Cells of the liquid, its surface, and the walls around it, as the kernels of the pressure take them.
+    """Cells of the liquid, its surface and the walls, for the pressure's kernels.
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID.

@@ -62,7 +62,10 @@ class JointPart:
 
 
 class SweepWorkspace(threading.local):
-    """Arrays of the NNCG kernel, with room for larger problems than the last, and its recorded launch; one a thread."""
+    """Arrays of the NNCG kernel and its recorded launch, one a thread.
+
+    There is room for larger problems than the last.
+    """
 
     def __init__(self) -> None:
         self._room = (0, 0, 0)
@@ -101,17 +104,20 @@ class SweepWorkspace(threading.local):
 
     def _launch(self) -> None:
         rows = replace(Rows.entries(self._islands, self._device), memory=self._rows)
-        numbers = {"q": self._q, "dim": self._dim, "contacts": self._contacts, "rtol": self._rtol, "most": self._most}
-        NNCG.bind(rows, **numbers, **self._arrays).launch()
+        reals, indices, residual, rounds = self._arrays
+        NNCG.bind(
+            rows, reals=reals, indices=indices, residual=residual, rounds=rounds, q=self._q, dim=self._dim, contacts=self._contacts,
+            rtol=self._rtol, most=self._most,
+        ).launch()  # fmt: skip
 
     def _reserve(self, *sizes: int) -> None:
         if all(size <= room for size, room in zip(sizes, self._room, strict=True)):
             return
-        self._room = reals, indices, islands = tuple(max(2 * size, room) for size, room in zip(sizes, self._room, strict=True))
+        reals, indices, islands = (max(2 * size, room) for size, room in zip(sizes, self._room, strict=True))
+        self._room = reals, indices, islands
         self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
         self._residual, self._rounds = np.zeros(islands), np.zeros(islands)
-        named = {"reals": self._reals, "indices": self._indices, "residual": self._residual, "rounds": self._rounds}
-        self._arrays = {name: _warp(values) for name, values in named.items()}
+        self._arrays = [_warp(values) for values in (self._reals, self._indices, self._residual, self._rounds)]
         self._graph.forget()
 
 

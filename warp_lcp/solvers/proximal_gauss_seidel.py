@@ -155,11 +155,11 @@ class ContactWorkspace:
         own = J[:, 1:] @ J[:, 1:].swapaxes(1, 2) + p.yields[order][:, 1:, None] * np.eye(dim - 1)
         largest = np.linalg.eigvalsh(own)[:, -1] if dim > 1 else np.ones(k)
         laws = np.column_stack([p.friction[order], 1.0 / diagonal[:, 0], 1.0 / largest, diagonal.mean(axis=1)])
-        return ContactFields(
-            *(wp.array(np.ascontiguousarray(v).ravel(), dtype=f64, device=p.device) for v in (J, p.b[order], p.yields[order], laws)),
-            *(wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in (order, p.first[order], p.second[order])),
-            self._w, self.x.flatten(),
-        )  # fmt: skip
+        reals = J, p.b[order], p.yields[order], laws
+        rows, b, e, laws_ = (wp.array(np.ascontiguousarray(v).ravel(), dtype=f64, device=p.device) for v in reals)
+        numbers = order, p.first[order], p.second[order]
+        contact, one, other = (wp.array(v.astype(np.int32), dtype=i32, device=p.device) for v in numbers)
+        return ContactFields(rows, b, e, laws_, contact, one, other, self._w, self.x.flatten())
 
     def _gathering(self) -> Any:
         """Return the pass that finds w = J'r body by body."""
