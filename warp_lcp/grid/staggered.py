@@ -255,7 +255,7 @@ class _RangeMemory:
         self.first = 0, ctypes.addressof(self.range), ctypes.sizeof(self.range)
         self.sized = ctypes.addressof(self.tasks)
         self.extent: tuple[int, ...] = (1, 1, 1)  # threads of a launch on CUDA: now, and at most so far
-        self.room = self.extent
+        self.room: tuple[int, ...] = self.extent
 
     def take_dim(self, cells: typing.Any, dim: tuple[int, int, int]) -> None:
         """Take a CellRange over on CUDA, with the threads that share it."""

@@ -149,7 +149,7 @@ class DeviceRows(RowsMemory):
         super().__init__()
         self.places, self.spare = Scalar(), spare
         self.extent: tuple[int, ...] = (1, 1, 1)
-        self.room = self.extent
+        self.room: tuple[int, ...] = self.extent
 
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Take rows over."""
