@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
 import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids import coupling_kernels as kernels
 from warp_lcp.fluids.forces import walls_of
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rows.host_array import HostArray
+from warp_lcp.rows.program import LaunchGraph, clear, launch
 
 SPARE = 1.5  # room for entries, times those there are when there is none left
 
@@ -57,11 +58,16 @@ class BodyCoupling:
         S.walls, S.bodies = walls_of(grid, boundary), len(bodies.bodies)
         S.low, S.rows, S.row = wp.vec3i(*low.tolist()), int((high - low)[1]), int((high - low)[2])
         S.body = wp.array(body, dtype=wp.int32, device=grid.device)
-        S.center = wp.zeros(len(bodies.bodies), dtype=wp.vec3d, device=grid.device)
+        self._center = HostArray(len(bodies.bodies), wp.vec3d, grid.device)
+        S.center = self._center.array
         self._solids = S
         rows = grid.shape[0] * grid.shape[1]
         self._counts, self._offsets = (wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2))
         self._low: wl.LowRankOperator | None = None
+        self._beside, self._enclosing = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
+        self._counting = LaunchGraph(grid.device, self._launch_count)
+        self._entering = LaunchGraph(grid.device, self._launch_entries)
+        self._holding = LaunchGraph(grid.device, self._launch_enclosed)
 
     def join(self, A: wl.GridPoisson) -> wl.SumOperator:
         """Return the operator A + rho dx^d U M^-1 U' of liquid and bodies.
@@ -77,30 +83,48 @@ class BodyCoupling:
         Args:
             kind: int8 of AIR, FLUID, SOLID.
         """
-        grid, S = self.grid, self._solids
-        S.center.assign(np.array([body.position for body in self.bodies.bodies]))
+        self._center.host[:] = self.bodies.bodies.position
+        self._center.send()
         block = self.boundary.cut.moving_block()
-        window = None if block is None else grid.window(*block).common(self._solved)
-        self._counts.zero_()
-        total = 0
-        if window is not None:
-            window.launch_rows(kernels.enter_kernel, [S, kind, self._counts, None, None, None, None])
-            wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
-            total = int(self._offsets.numpy()[-1]) + int(self._counts.numpy()[-1])
-        if total > self.columns.capacity:
-            self.columns.reserve(round(SPARE * total))
-        if total and window is not None:
-            entries = [self.columns.rows, self.columns.blocks, self.columns.values]
-            window.launch_rows(kernels.enter_kernel, [S, kind, self._counts, self._offsets, *entries])
-        self.columns.count.fill_(total)
+        window = None if block is None else self.grid.window(*block).common(self._solved)
+        if window is None:
+            self.columns.count.zero_()
+        else:
+            self._beside.move_to(window)
+            self._enter(kind)
         if self._low is not None:
             self._low.update(self._weights())
+
+    def _enter(self, kind: wp.array) -> None:
+        """Write the entries of U for the cells of the window."""
+        columns = self.columns
+        self._counting.run(kind)
+        total = int(columns.count.numpy()[0])
+        if total > columns.capacity:
+            columns.reserve(round(SPARE * total))
+            columns.count.fill_(total)
+            self._entering.forget()
+        if total:
+            self._entering.run(kind)
+
+    def _launch_count(self, kind: wp.array) -> None:
+        """Count the entries of each row of cells, and add them up."""
+        clear(self._counts)
+        self._beside.launch_rows(kernels.enter_kernel, [self._solids, kind, self._counts, None, None, None, None])
+        first, device = 0, self.grid.device  # whose offset is 0
+        if device.is_cuda:
+            wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
+            first = len(self._counts) - 1
+        launch(kernels.offsets_kernel, 1, [first, self._counts, self._offsets, self.columns.count], device=device)
+
+    def _launch_entries(self, kind: wp.array) -> None:
+        entries = [self.columns.rows, self.columns.blocks, self.columns.values]
+        self._beside.launch_rows(kernels.enter_kernel, [self._solids, kind, self._counts, self._offsets, *entries])
 
     def push(self, x: wp.array) -> None:
         """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""
         sums = self.columns.gather(x.flatten()).numpy()
-        for body, impulse in zip(self.bodies.bodies, self._scale * sums.reshape(-1, self.width), strict=True):
-            body.apply_impulse(impulse)
+        self.bodies.bodies.apply_impulses(self._scale * sums.reshape(-1, self.width))
 
     def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Move particles buried by a body with it.
@@ -114,11 +138,17 @@ class BodyCoupling:
         block = self.boundary.cut.moving_block()
         if block is None:
             return
-        window, boundary = self.grid.window(*block, grow=1), self.boundary
-        for fields in zip(boundary.open, boundary.velocity, known, velocity, strict=True):
-            window.launch(kernels.enclosed_kernel, list(fields))
+        self._enclosing.move_to(self.grid.window(*block, grow=1))
+        self._holding.run(velocity, known)
+
+    def _launch_enclosed(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+        for fields in zip(self.boundary.open, self.boundary.velocity, known, velocity, strict=True):
+            self._enclosing.launch(kernels.enclosed_kernel, list(fields))
 
     def _weights(self) -> np.ndarray:
         """Return rho dx^d M^-1 of all bodies, block diagonal."""
-        inverses = [body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies]
-        return self._share * self._scale * np.asarray(scipy.linalg.block_diag(*inverses))
+        inverses = self.bodies.bodies.inverse_masses(self.grid.dimension)
+        n = np.arange(len(inverses))
+        blocks = np.zeros((len(n), self.width, len(n), self.width))
+        blocks[n, :, n] = self._share * self._scale * inverses
+        return blocks.reshape(len(n) * self.width, -1)

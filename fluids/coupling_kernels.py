@@ -118,6 +118,16 @@ def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _
     counts[row] = e - begin
 
 
+@wp.kernel(enable_backward=False, module="fluids.coupling")
+def offsets_kernel(first: int, counts: _I32, offsets: _I32, total: _I32):
+    """Add up counts exclusively from row `first` on, whose offset is known, and their total; one thread."""
+    before = offsets[first]
+    for row in range(first, counts.shape[0]):
+        offsets[row] = before
+        before += counts[row]
+    total[0] = before
+
+
 @cell_kernel("fluids.coupling")
 def enclosed_kernel(k, j, i, open: F32, solid: F32, known: I8, velocity: F32):
     """Give closed faces that nothing has reached the velocity of the solid there [m/s]."""

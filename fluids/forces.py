@@ -148,8 +148,8 @@ class SolidForces:
     @staticmethod
     def push(bodies: RigidBodies, impulses: np.ndarray) -> None:
         """Give rigid bodies impulses that they have not got otherwise, of the shape of `impulses`."""
-        for number, body in zip(bodies.numbers, bodies.bodies, strict=True):
-            body.apply_impulse(impulses[number] if bodies.dimension == 3 else impulses[number][PLANAR])
+        six = impulses[bodies.numbers]
+        bodies.bodies.apply_impulses(six if bodies.dimension == 3 else six[:, PLANAR])
 
     def row(self, kick_dt: float) -> Row:
         """Return forces and torques of the step, in which forces acted for `kick_dt` [s]."""

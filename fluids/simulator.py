@@ -100,7 +100,7 @@ class LiquidSimulation(ParticleSimulation):
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
         self.surface = self._surface()
-        self._surface_graph = LaunchGraph(grid.device, self._launch_surface, at_once=self.shared or self.band is not None)
+        self._surface_graph = LaunchGraph(grid.device, self._launch_surface, at_once=self.shared)
         self.tension = self._tension()
         self.projection = self._pressure()
         self.probes = self._probes()
@@ -315,9 +315,8 @@ class LiquidSimulation(ParticleSimulation):
         The pressure first finds which walls hold: viscosity acts on the velocity that it leaves. Then all of it acts anew, together with
         what viscosity has changed, so that it balances viscous stresses too and the walls that let go do so by the sum of both.
         """
-        projection, before = self.projection, viscosity.before
-        for saved, field in zip(before, self.velocity, strict=True):
-            wp.copy(saved, field)
+        projection = self.projection
+        viscosity.keep(self.velocity)
         momenta = [] if self.bodies is None else [body.momenta() for body in self.bodies.bodies]
         if self._project(window, dt, speed).result is None:
             return {}

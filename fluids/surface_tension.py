@@ -14,10 +14,12 @@ from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.level_set import REACH as REACH_OF_PHI
 from warp_lcp.grid.level_set_kernels import BINOMIAL
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, clear
 
 PASSES, MOST_PASSES = 8, 16  # binomial passes of a filter: particles' noise asks for the fewest, the cost and thin liquid for the most
 CALM = 0.2  # of the grid's capillary rate, at which gradients of the velocity near the surface decay
@@ -72,6 +74,12 @@ class SurfaceTension:
         self._energy = WindowTally(self._passes.energy, grid)
         self._blocked, self._counted = grid.field(wp.int8), grid.domain
         self._capacity, self._lean = boundary.capacity, grid.field()
+        self._scale, self._factor = Scalar(), Scalar()  # kick_dt sigma / (rho dx^2); by which gradients are multiplied
+        self._measured: ActiveWindow | None = None  # cells whose energy has been measured; None: none have liquid
+        self._cells = ActiveWindow(grid.domain)
+        self._pushing = LaunchGraph(grid.device, self._push, at_once=boundary.moves)  # lists of wall cells are made anew
+        self._calming = LaunchGraph(grid.device, self._calm)
+        self._measuring = LaunchGraph(grid.device, lambda kind: self._energy.take(self._cells, **self._faces(kind), **self._shares))
         self._find_walls()
 
     def longest_step(self) -> float:
@@ -95,39 +103,49 @@ class SurfaceTension:
             kind: int8 of AIR, FLUID, SOLID, as `phi` marks them.
             kick_dt: how long forces act [s].
         """
-        grid, planes = self.grid, self.grid.planes
         if self.boundary.moves:
             self._find_walls()
-        passes = self._passes_for(kick_dt)
-        self._lean.fill_(self._cosine)
-        bend = self._curvature(window, passes)
+        self._passes_done = passes = self._passes_for(kick_dt)
+        self._once, self._twice, self._bend = self._roles(passes)
+        self._shares = {"once": self._once, "twice": self._twice, "planes": self.grid.planes, **_profile(passes)}
+        self._scale.value = kick_dt * self.coefficient / (self.density * self.grid.spacing**2)
+        if self._cosine != 0.0:  # the last step has left those of its surface
+            self._lean.fill_(self._cosine)
+        self._pushing.run(velocity, window, kind, passes, variant=(passes, window.near is None))
+
+    def _roles(self, passes: int) -> tuple[wp.array, wp.array, wp.array]:
+        """Return the fields of the shares after so many passes and after twice as many, and that of the curvature."""
+        once = self._fields[1:][passes % 2]
+        twice = [field for field in self._fields if field is not once][passes % 2]
+        (bend,) = (field for field in self._fields if field is not once and field is not twice)
+        return once, twice, bend
+
+    def _push(self, velocity: Sequence[wp.array], window: Window, kind: wp.array, passes: int) -> None:
+        """Launch what `act` does."""
+        grid, planes, bend = self.grid, self.grid.planes, self._bend
+        self._find_curvature(window, passes)
         if self._cosine != 0.0:  # how the surface goes on into walls depends on its curvature
             found = [self._shares[name] for name in ("linear", "cubic", "once", "twice")]
             inputs = [*self._walls, self._raised, planes, 1.0 / (grid.dimension - 1), self._cosine, *found, bend, self._lean.flatten()]
             launch_list(kernels.lean_kernel, len(self._walls[0]), inputs, device=grid.device)
             self._join(self._lean)
-            bend = self._curvature(window, passes)
-        scale = kick_dt * self.coefficient / (self.density * grid.spacing**2)
-        window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=scale)
+            self._find_curvature(window, passes)
+        window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=self._scale)
         self._join(self.jump)
         for axis, field in enumerate(velocity):
             window.run(self._passes.push, **self._faces(kind), planes=planes, jump=self.jump, field=field, axis=axis)
 
-    def _curvature(self, window: Window, passes: int) -> wp.array:
-        """Return the curvature [1/cells] in cells near the surface, and continued into walls: its nearest point may lie in one."""
+    def _find_curvature(self, window: Window, passes: int) -> None:
+        """Find the curvature [1/cells] in cells near the surface, and continued into walls: its nearest point may lie in one."""
         first, *free = self._fields
-        for field in self._fields:  # passes look beyond the window, where an earlier step may have left something
-            field.zero_()
+        clear(*self._fields)  # passes look beyond the window, where an earlier step may have left something
         capacity = self._capacity if self._cosine != 0.0 else None
         window.launch(kernels.share_kernel, [self._phi, self._blocked, capacity, self._cosine, first])
         once = self._smoothed(window, first, free, passes, 0)
-        twice = self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
-        self._shares = {"once": once, "twice": twice, "planes": self.grid.planes, **_profile(passes)}
-        (bend,) = (field for field in self._fields if field is not once and field is not twice)
-        window.run(kernels.CURVATURE, **self._shares, bend=bend, limit=self._most)
-        self._join(bend)
-        self._continue(bend, 0, 0.0)
-        return bend
+        self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
+        window.run(kernels.CURVATURE, **self._shares, bend=self._bend, limit=self._most)
+        self._join(self._bend)
+        self._continue(self._bend, 0, 0.0)
 
     def calm(self, particles: Particles, dt: float) -> None:
         """Take from particles near the surface what ripples shorter than the filter leave in their gradients: nothing pulls these back.
@@ -138,18 +156,24 @@ class SurfaceTension:
             particles: the liquid (updated: gradients, and their numbers, as a narrow band may have added and taken some).
             dt: time step [s].
         """
-        factor = math.exp(-CALM * dt * math.sqrt(self.coefficient / (self.density * self.grid.spacing**3)))
+        self._factor.value = math.exp(-CALM * dt * math.sqrt(self.coefficient / (self.density * self.grid.spacing**3)))
+        self._calming.run(particles)
+
+    def _calm(self, particles: Particles) -> None:
+        """Launch what `calm` does."""
         particles.number()
         for gradient in particles.affine:
-            listed = [factor, -0.99 * REACH_OF_PHI, particles.key, self._phi.flatten(), gradient]
-            wp.launch(kernels.calm_kernel, particles.count, listed, device=self.grid.device)
+            listed = [self._factor, -0.99 * REACH_OF_PHI, particles.key, self._phi.flatten(), gradient]
+            launch_list(kernels.calm_kernel, particles.count, listed, device=self.grid.device)
 
     def measure(self, window: Window, kind: wp.array) -> None:
         """Find the energy, for `energy` to tell."""
         box = window.common(self._counted)
-        self._measured = box is not None
+        self._measured = None if box is None else self._cells
         if box is not None:
-            self._energy.take(box, **self._faces(kind), **self._shares)
+            self._cells.move_to(box)
+            self._measuring.run(kind, variant=(self._passes_done, box.near is None))
+            self._energy.changed()
 
     def energy(self) -> float:
         """Return the energy of surface and wet walls when it was last measured [J; J/m in 2-D]: sigma (area - cos(angle) wet area)."""
@@ -158,7 +182,7 @@ class SurfaceTension:
 
     def _areas(self) -> list[float]:
         """Return the areas of surface and wet walls, in faces of cells."""
-        return self._energy.read() if self._measured else [0.0, 0.0]
+        return self._energy.read() if self._measured is not None else [0.0, 0.0]
 
     def _faces(self, kind: wp.array) -> dict[str, Any]:
         open_faces = {f"open_{axis}": field for axis, field in zip("xyz", [*self.boundary.open, None, None, None], strict=False)}

@@ -268,9 +268,8 @@ def continue_kernel(
         flat[cells[i]] = value
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
-def calm_kernel(factor: float, deepest: float, key: wp.array(dtype=wp.int32), phi: FLOATS, gradient: POINTS):
+@list_kernel(MODULE)
+def calm_kernel(i, factor: float, deepest: float, key: INTS, phi: FLOATS, gradient: POINTS):
     """Weaken a velocity's gradient in particles whose cell is near the surface."""
-    particle = wp.tid()
-    if phi[key[particle]] > deepest:
-        gradient[particle] = factor * gradient[particle]
+    if phi[key[i]] > deepest:
+        gradient[i] = factor * gradient[i]

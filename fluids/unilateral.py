@@ -17,6 +17,8 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import clear
 
 
 class UnilateralPressure(PressureProjection):
@@ -80,7 +82,7 @@ class UnilateralPressure(PressureProjection):
         setting.planes = grid.planes
         setting.density, setting.capacity = level_set.density, boundary.capacity
         setting.cells, setting.base = self._unknown, boundary.base
-        self._setting = setting
+        self._setting, self._rate, self._settling = setting, Scalar(), Scalar()
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float, window: Window | None = None) -> bool:
         """Set up the problem of all cells that are not SOLID; return if there are any.
@@ -88,12 +90,10 @@ class UnilateralPressure(PressureProjection):
         Arguments as in the base class.
         """
         self._begin(kick_dt)
-        self._setting.rate = wp.float64(self.grid.spacing / dt)
-        self._setting.settling = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
-        least = SHIFT if self.boundary.open else 0.0
-        fields = [self.pressure, self._ratio, least, self._b, self._start, self._shift]
-        self.grid.domain.launch(kernels.prepare_kernel, [self._at(velocity), self.kind, *fields])
-        self._count.take(self._cells, kind=self._unknown)
+        self._rate.value, self._ratio_cell.value = self.grid.spacing / dt, self._ratio
+        self._settling.value = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
+        self._preparation.run(velocity)
+        self._count.changed()
         unknowns = self.counted()
         if unknowns and self._problem is None:
             self._make_problem()
@@ -101,21 +101,32 @@ class UnilateralPressure(PressureProjection):
             self._update()
         return unknowns > 0
 
+    def _launch_preparation(self, velocity: Sequence[wp.array]) -> None:
+        """Launch the set-up of the problem, and count its unknowns."""
+        least, numbers = SHIFT if self.boundary.open else 0.0, [self._rate, self._settling]
+        fields = [self.pressure, self._ratio_cell, least, self._b, self._start, self._shift]
+        self.grid.domain.launch(kernels.prepare_kernel, [self._at(velocity), *numbers, self.kind, *fields])
+        self._count.take(self._cells, kind=self._unknown)
+
     def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
         """Apply a solution: update velocities, mark valid faces and wall contact.
 
         Arguments as in the base class.
         """
-        self._accept(result.x)
         self._last = self._kick
+        self._projection.run(velocity, window, result.x, variant=(result.x.ptr, window.near is None))
+        return Projection(result, self.counted(), self._found)
+
+    def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
+        """Launch the projection, and what finds the contact of wall cells."""
+        self._accept(x)
         for axis, field in enumerate(velocity):
-            self.known[axis].zero_()
+            clear(self.known[axis])
             open_ = self.boundary.open[axis] if self.boundary.open else None
             inputs = [self._setting, axis, self.pressure, open_, self._weights[axis], field, self.known[axis]]
             window.launch(kernels.push_kernel, inputs)
-        inputs = [self._at(velocity), self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
+        inputs = [self._at(velocity), self._rate, self._settling, self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
         self._cells.launch_rows(kernels.contact_kernel, inputs)
-        return Projection(result, self.counted(), self._found)
 
     def _found(self) -> tuple[float, float]:
         rows = self._cells.rows_of(self._sums)

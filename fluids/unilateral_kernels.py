@@ -22,8 +22,6 @@ class UnilateralSetting:
     """What is the same for all cells of a step, and the fields that say where liquid is."""
 
     planes: int
-    rate: wp.float64  # dx / dt [m/s]
-    settling: float  # speed at which a full cell comes to the density at rest [m/s], of what it is off by
     density: F32
     capacity: F32
     cells: I8  # FLUID: an unknown
@@ -85,8 +83,11 @@ def passing(s: UnilateralSetting, u: F32, open: F32, solid: F32, k: int, j: int,
 
 
 @wp.func
-def slack(s: UnilateralSetting, k: int, j: int, i: int):
-    """Return y of a cell: what it may still take, what it is off the density at rest, and what flows out of it [m/s]."""
+def slack(s: UnilateralSetting, rate: wp.float64, settling: float, k: int, j: int, i: int):
+    """Return y of a cell: what it may still take, what it is off the density at rest, and what flows out of it [m/s].
+
+    The rate is dx / dt [m/s], and settling the speed at which a full cell comes to the density at rest [m/s], of what it is off by.
+    """
     left = passing(s, s.u, s.open_x, s.solid_x, k, j, i, k, j, i - 1)
     right = passing(s, s.u, s.open_x, s.solid_x, k, j, i + 1, k, j, i)
     low = passing(s, s.v, s.open_y, s.solid_y, k, j, i, k, j - 1, i)
@@ -100,20 +101,23 @@ def slack(s: UnilateralSetting, k: int, j: int, i: int):
         inward += wp.max(back, zero) - wp.min(front, zero)
         y += front - back
     capacity = s.capacity[k, j, i]
-    y += wp.max(s.rate, inward) * wp.float64(wp.max(capacity - s.density[k, j, i] / FULL, 0.0))
+    y += wp.max(rate, inward) * wp.float64(wp.max(capacity - s.density[k, j, i] / FULL, 0.0))
     if capacity >= LEAST_SHARE:
-        y += wp.float64(s.settling * wp.clamp(capacity - s.density[k, j, i], FULL - 1.0, 1.0 - FULL))
+        y += wp.float64(settling * wp.clamp(capacity - s.density[k, j, i], FULL - 1.0, 1.0 - FULL))
     return y
 
 
 @cell_kernel("fluids.unilateral")
-def prepare_kernel(k, j, i, s: UnilateralSetting, kind: I8, last: F64, ratio: wp.float64, least: float, b: F64, start: F64, shift: F32):
+def prepare_kernel(
+    k, j, i, s: UnilateralSetting, rate: wp.float64, settling: float, kind: I8, last: F64, ratio: wp.float64, least: float, b: F64,
+    start: F64, shift: F32,
+):  # fmt: skip
     """Mark the unknowns; fill right-hand side, first guess and what the open sides add to the diagonal."""
     unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
     value = wp.float64(0.0)
     guess = wp.float64(0.0)
     if unknown:
-        value = slack(s, k, j, i)
+        value = slack(s, rate, settling, k, j, i)
         guess = wp.max(last[k, j, i] * ratio, wp.float64(0.0))
     s.cells[k, j, i] = wp.where(unknown, _FLUID, _SOLID)
     b[k, j, i] = value
@@ -159,7 +163,9 @@ def push_kernel(k, j, i, s: UnilateralSetting, axis: int, x: F64, open: F32, wei
 
 
 @cell_kernel("fluids.unilateral")
-def contact_kernel(k, j, first, end, s: UnilateralSetting, kind: I8, touch: U8, x: F64, contact: U8, sums: F64):
+def contact_kernel(
+    k, j, first, end, s: UnilateralSetting, rate: wp.float64, settling: float, kind: I8, touch: U8, x: F64, contact: U8, sums: F64
+):
     """Find the wall cells that hold liquid and those that let go, [0] their number in a row, and [1] the largest |y| of full cells."""
     released = int(0)
     worst = wp.float64(0.0)
@@ -175,7 +181,7 @@ def contact_kernel(k, j, first, end, s: UnilateralSetting, kind: I8, touch: U8, 
                     released += 1
         contact[k, j, i] = wp.uint8(state)
         if full:
-            y = slack(s, k, j, i)
+            y = slack(s, rate, settling, k, j, i)
             worst = wp.max(worst, wp.abs(y))
     sums[k, j, 0] = wp.float64(released)
     sums[k, j, 1] = worst

@@ -37,7 +37,7 @@ from warp_lcp.fluids.viscosity_bodies import BodyDrag, WallPull
 from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
-from warp_lcp.grid.staggered import DirtyRegion, StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
@@ -45,7 +45,8 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy
 from warp_lcp.rows.vectors import Across
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a force, relative to the diagonal times the speed
@@ -152,6 +153,10 @@ class Viscosity:
             DirtyRegion(grid.everywhere),
             [WindowTally(self._passes.force, grid, grid.domain) for _ in range(grid.dimension)],
         )
+        self._box, self._above = ActiveWindow(grid.everywhere), ActiveWindow(grid.everywhere)
+        self._unknowns, self._tau = ActiveWindow(self._inner), Scalar()
+        launches = (self._keep, self._set_up, self._residual, self._take_solution, self._cover, self._keep_change, self._undo)
+        self._graphs = {function.__name__: LaunchGraph(grid.device, function) for function in launches}
 
     def solve(
         self, velocity: Sequence[wp.array], window: Window, kind: wp.array, contact: wp.array, dt: float, speed: float, *, last: bool = True
@@ -168,17 +173,19 @@ class Viscosity:
             last: whether no other solve of the step follows; faces in walls take their velocity in the last one.
         """
         box, inner = self._boxes(window)
-        self._change.zero_()
         if inner is None:
+            self._change.zero_()
             return ViscousResult(0, 0.0, SolveStatus.CONVERGED, 0.0, 0.0)
         tau = self._viscosity / self._density * dt / self.grid.spacing**2
-        self._set_up(box, kind, contact, tau)
+        self._begin(box, inner, tau)
+        self._graphs["_set_up"].run(kind, contact, variant=self._placed)
+        self._placed = True
         given = {"u": velocity, "kind": kind, "contact": contact}
         if self._bodies is not None:
             self._bodies.take(self._fine, self._walls_of_faces, {"kind": kind, "contact": contact}, velocity)
             if self._bodies.moved:  # a recorded iteration knows where they lay
                 self._solver = self._krylov()
-        first, lost, driven, stiff = self._force(inner, given, changed=False)
+        first, lost, driven, stiff = self._force(given, changed=False)
         norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
         while norm > least and iterations < self.max_iterations:
             before = norm
@@ -189,15 +196,12 @@ class Viscosity:
             )
             done, _ = self._solver.solve(max_iterations=self.max_iterations - iterations, **goal)
             iterations += done
-            for u, total, more in zip(velocity, self.change, self.multigrid.components(self._solver.x), strict=True):
-                inner.run(self._passes.add, u=u, total=total, more=more)
-            self._share(velocity)
-            norm, lost, driven, _ = self._force(inner, given, changed=True)
+            self._graphs["_take_solution"].run(velocity, self._solver.x, variant=self._solver.x.ptr)
+            norm, lost, driven, _ = self._force(given, changed=True)
             if not norm < 0.5 * before:  # what float32 can tell
                 break
-        for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True) if last else ()):
-            covered = {"hold": self._fine.hold[axis], "h": self._slip[axis], "own": own, "kind": kind, "base": self.boundary.base}
-            inner.run(self._passes.cover, total=total, u=u, axis=axis, **covered)
+        if last:
+            self._graphs["_cover"].run(velocity, kind)
         self._share(self.change)
         energy = self._density * self.grid.cell_volume
         residual = norm / first if first > 0.0 else 0.0
@@ -208,6 +212,27 @@ class Viscosity:
         else:
             status = SolveStatus.MAX_ITERATIONS if iterations >= self.max_iterations else SolveStatus.STAGNATED
         return ViscousResult(iterations, residual, status, energy * (lost + driven), energy * driven)
+
+    def _begin(self, box: Window, inner: Window, tau: float) -> None:
+        """Have launches work in a box, and on the unknowns of its `inner` cells."""
+        self._tau.value = tau
+        self._box.move_to(box)
+        # edges and faces on the upper ends of the domain, too; below the first cell there is nothing
+        self._above.move_to(Window.of([max(low, 1) for low in box.low], box.high, box.device))
+        self._unknowns.move_to(inner)
+        self.multigrid.move_to(box)
+
+    def _take_solution(self, velocity: Sequence[wp.array], x: wp.array) -> None:
+        """Add the solution of conjugate gradients to the velocity and its change."""
+        for u, total, more in zip(velocity, self.change, self.multigrid.components(x), strict=True):
+            self._unknowns.run(self._passes.add, u=u, total=total, more=more)
+        self._share(velocity)
+
+    def _cover(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
+        """Give faces in walls their velocity."""
+        for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True)):
+            covered = {"hold": self._fine.hold[axis], "h": self._slip[axis], "own": own, "kind": kind, "base": self.boundary.base}
+            self._unknowns.run(self._passes.cover, total=total, u=u, axis=axis, **covered)
 
     def _multigrid(self) -> VectorMultigrid:
         return VectorMultigrid(self.grid)
@@ -264,18 +289,33 @@ class Viscosity:
         if self._bodies is not None:
             self._bodies.subtract(p, q, launch)
 
+    def keep(self, velocity: Sequence[wp.array]) -> None:
+        """Copy a velocity to `before`."""
+        self._graphs["_keep"].run(velocity)
+
     def keep_change(self) -> None:
         """Add the last solve's change to `before`: another solve of the same step follows, from the velocity that this one has made."""
-        for kept, more in zip(self.before, self.change, strict=True):
-            self.grid.everywhere.run(self._passes.sum, u=kept, kept=kept, more=more)
+        self._graphs["_keep_change"].run()
 
     def undo(self, velocity: Sequence[wp.array]) -> None:
         """Make a velocity what `before` keeps, but for the last step's change."""
+        self._graphs["_undo"].run(velocity)
+
+    def _keep(self, velocity: Sequence[wp.array]) -> None:
+        for kept, u in zip(self.before, velocity, strict=True):
+            copy(kept, u)
+
+    def _keep_change(self) -> None:
+        for kept, more in zip(self.before, self.change, strict=True):
+            self.grid.everywhere.run(self._passes.sum, u=kept, kept=kept, more=more)
+
+    def _undo(self, velocity: Sequence[wp.array]) -> None:
         for u, kept, more in zip(velocity, self.before, self.change, strict=True):
             self.grid.everywhere.run(self._passes.sum, u=u, kept=kept, more=more)
 
-    def _set_up(self, box: Window, kind: wp.array, contact: wp.array, tau: float) -> None:
-        """Find the equations of a step."""
+    def _set_up(self, kind: wp.array, contact: wp.array) -> None:
+        """Find the equations of a step, whose change is 0 yet."""
+        clear(self._change)
         fine, boundary, passes, planes = self._fine, self.boundary, self._passes, self.grid.planes
         slip, distance, where = self._slip, self._distance, {"kind": kind, "contact": contact}
         edges: dict[str, Any] = {"xy": fine.edges[0, 1], "xz": fine.edges.get((0, 2)), "yz": fine.edges.get((1, 2))}
@@ -285,24 +325,20 @@ class Viscosity:
             nodes, walls = boundary.cut.distance, [*boundary.cut.wall]
         elif isinstance(boundary, WholeCells):
             index = boundary.solids.index
-        near = box if self._placed else self.grid.everywhere
+        near = self._box if self._placed else self.grid.everywhere
         for axis in range(self.grid.dimension if self._walls_change or not self._placed else 0):
             solids = {"nodes": nodes, "wall": walls[axis], "kind": kind, "index": index, "slip": self._slips, "walls": self._walls}
             near.run(passes.distance, out=distance[axis], hold=slip[axis], axis=axis, planes=planes, **solids)
-        self._placed = True
         fields = zip("vdh", (fine.volume, distance, slip), strict=True)
         faces: dict[str, Any] = {f"{letter}{axis}": field for letter, of in fields for axis, field in zip("xyz", [*of, None], strict=False)}
         thick = dict(zip(("mx", "my", "mz"), [*self.relative, *[None] * 3], strict=False))
-        # edges and faces on the upper ends of the domain, too; below the first cell there is nothing
-        above = Window.of([max(low, 1) for low in box.low], box.high, box.device)
-        above.run(
-            passes.weights, cell=fine.cell, mixed=fine.mixed, phi=self._phi, planes=planes, scale=tau, **edges, **faces, **thick, **where
-        )
+        given: dict[str, Any] = {"cell": fine.cell, "mixed": fine.mixed, "phi": self._phi, "planes": planes, "scale": self._tau}
+        self._above.run(passes.weights, **given, **edges, **faces, **thick, **where)
         for axis in range(self.grid.dimension):
             given = {"diagonal": fine.diagonal[axis], "drag": fine.drag[axis], "held": fine.hold[axis], "volume": fine.volume[axis]}
             given |= {"d": distance[axis], "h": slip[axis], "cell": fine.cell, "axis": axis, "planes": planes}
-            above.run(passes.diagonal, **given, **fine.across(axis), **where)
-        self.multigrid.set_up(box)
+            self._above.run(passes.diagonal, **given, **fine.across(axis), **where)
+        self.multigrid.set_up()
 
     def _motion(self, axis: int) -> dict[str, Any]:
         """Return how solids that cut cells move, and whose a component's faces are."""
@@ -317,9 +353,23 @@ class Viscosity:
         """Velocities of solids on the faces of each component."""
         return [*self.boundary.velocity] or [None] * self.grid.dimension
 
-    def _force(self, inner: Window, given: dict[str, Any], *, changed: bool) -> list[float]:
+    def _force(self, given: dict[str, Any], *, changed: bool) -> list[float]:
         """Write the residual; return its norm, the energy lost by the force, what walls give, and the diagonal's norm."""
-        fine, found, solids = self._fine, np.zeros(4), self._solids
+        self._graphs["_residual"].run(given, changed, variant=changed)
+        found = np.zeros(4)
+        for sums in self._sums:
+            sums.changed()
+            found += sums.read()
+        if self._bodies is not None:
+            self._bodies.answer(self.multigrid.r, self._change)
+            found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
+        if self._across is not None:
+            found = self._across.sum(found)
+        return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]
+
+    def _residual(self, given: dict[str, Any], changed: bool) -> None:
+        """Launch the passes that write the residual, and what they sum."""
+        fine, solids = self._fine, self._solids
         residual, velocity, distance = self.multigrid.components(self.multigrid.r), given["u"], self._distance
         for axis in range(self.grid.dimension):
             of = {"u": velocity[axis], "d": distance[axis], "h": self._slip[axis], "own": solids[axis]}
@@ -333,14 +383,7 @@ class Viscosity:
                 "base": self.boundary.base,
                 "dx": self.grid.spacing,
             } | self._motion(axis)
-            self._sums[axis].take(inner, **of, **fine.across(axis), **where)
-            found += self._sums[axis].read()
-        if self._bodies is not None:
-            self._bodies.answer(self.multigrid.r, self._change)
-            found[0] = float(np.square(self.multigrid.r.numpy(), dtype=np.float64).sum())
-        if self._across is not None:
-            found = self._across.sum(found)
-        return [float(np.sqrt(found[0])), float(found[1]), float(found[2]), float(np.sqrt(found[3]))]
+            self._sums[axis].take(self._unknowns, **of, **fine.across(axis), **where)
 
 
 def _numbers(array: wp.array) -> wp.array:

@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.fluids.viscosity_passes import SHIFT, viscous_passes
-from warp_lcp.grid.staggered import CLEAR, StaggeredGrid, Window
+from warp_lcp.grid.staggered import CLEAR, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch, Program
 
@@ -131,8 +131,14 @@ class VectorLevel:
         for field in self.x:
             self.grid.domain.run(CLEAR[wp.float32], launch=launch, field=field)
 
-    def average(self, fine: VectorLevel, window: Window) -> None:
-        """Take the means of a finer level, of which there is something in a window of this one."""
+    def average(self, fine: VectorLevel, window: Window, inner: Window) -> None:
+        """Take the means of a finer level.
+
+        Args:
+            fine: the finer level.
+            window: cells of this one that take something of it.
+            inner: those of the domain among them.
+        """
         planes, axes = self.grid.planes, range(self.dimension)
 
         def mean(out: wp.array, of: wp.array, faces: int, scale: float) -> None:
@@ -147,9 +153,6 @@ class VectorLevel:
             mean(self.drag[axis], fine.drag[axis], 1 << axis, WALL)
             window.run(self.passes.close, out=self.hold[axis], fine=fine.hold[axis], axis=axis, planes=planes, **self.shift)
         self.share(self.equations)
-        inner = window.common(self.grid.domain)
-        if inner is None:
-            return
         for axis in axes:
             given = {"h": self.hold[axis], "volume": self.volume[axis], "drag": self.drag[axis], "cell": self.cell}
             given["there"] = self.there[axis]
@@ -194,6 +197,9 @@ class VectorMultigrid:
         self.grid, size = grid, grid.dimension * grid.size
         self.r, self.z = (zeros(size, wp.float32, grid.device, small_pages=grid.sparse) for _ in range(2))
         self.levels: Sequence[VectorLevel] = self._levels()
+        self._boxes = [ActiveWindow(level.grid.everywhere) for level in self.levels]  # of the cells whose equations are made
+        self._inner = [ActiveWindow(level.grid.domain) for level in self.levels]  # those of the domain among them
+        self._window: Window | None = None  # of the last `move_to`
         self.program = Program(grid.device)
         self._cycle(0, self.program.launch)
 
@@ -219,19 +225,27 @@ class VectorMultigrid:
         """Write q = A p."""
         self.levels[0].product(self.components(p), self.components(q), launch)
 
-    def set_up(self, window: Window) -> None:
-        """Make the coarse levels from the finest, of which something may differ from what it was in a window."""
-        fine, box = self.levels[0], window
-        inner = box.common(fine.grid.domain)
+    def move_to(self, window: Window) -> None:
+        """Have `set_up` make the equations of a window, which has cells of the domain: elsewhere they are what they were."""
+        if window == self._window:
+            return
+        self._window = window
+        for number, level in enumerate(self.levels):
+            window = level.halved(window) if number else window
+            inner = window.common(level.grid.domain)
+            assert inner is not None, "a window of cells of the domain"
+            self._boxes[number].move_to(window)
+            self._inner[number].move_to(inner)
+
+    def set_up(self) -> None:
+        """Make the coarse levels from the finest, in the cells of `move_to`."""
+        fine = self.levels[0]
         fine.share(fine.equations)
-        if inner is not None:
-            fine.find_spans(inner)
-        for coarse in self.levels[1:]:
-            box = coarse.halved(box)
-            coarse.average(fine, box)
-            if inner is not None:
-                fine.normalize(coarse, inner)
-            fine, inner = coarse, box.common(coarse.grid.domain)
+        fine.find_spans(self._inner[0])
+        for number, coarse in enumerate(self.levels[1:], start=1):
+            coarse.average(fine, self._boxes[number], self._inner[number])
+            fine.normalize(coarse, self._inner[number - 1])
+            fine = coarse
 
     def _cycle(self, number: int, launch: Launch) -> None:
         level = self.levels[number]

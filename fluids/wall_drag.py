@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,6 +13,8 @@ from warp_lcp.fluids.pressure import PressureProjection, three
 from warp_lcp.fluids.wall_drag_kernels import Drag, drag_kernel
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, clear, copy
 
 
 class WallDrag:
@@ -49,7 +52,8 @@ class WallDrag:
             still = np.zeros((len(coefficients), 3))
             D.shift = wp.array(still if boundary.wall_velocity is None else boundary.wall_velocity, dtype=wp.vec3, device=grid.device)
             D.turn = wp.zeros(len(coefficients), dtype=wp.mat33, device=grid.device)
-        self._drag = D
+        self._drag, self._dt = D, Scalar()
+        self._slowing = LaunchGraph(grid.device, self._slow_down)
 
     def act(
         self, sums: WallSums, window: Window, velocity: Sequence[wp.array], projection: PressureProjection, phi: wp.array | None, dt: float,
@@ -69,18 +73,32 @@ class WallDrag:
         Returns:
             The energy that faces lose [J; J/m in 2-D], and the impulses on each solid, as of `WallSums.take`; None: nobody asks.
         """
+        self._dt.value = dt
+        if references is None:
+            self._slowing.run(sums, window, velocity, projection, phi, variant=window.near is None)
+            return float(self._losses.numpy().sum()), None
+        impulses = np.zeros((sums.solids, 6))
+        for given in self._given(sums, velocity, projection, phi, apply=False):
+            impulses += sums.take(drag_kernel, window, references, given)
+        return float(self._losses.numpy().sum()), impulses
+
+    def _slow_down(
+        self, sums: WallSums, window: Window, velocity: Sequence[wp.array], projection: PressureProjection, phi: wp.array | None
+    ) -> None:
+        """Launch the drag, whose impulses nobody asks for."""
+        for given in self._given(sums, velocity, projection, phi, apply=True):
+            sums.launch(drag_kernel, window, given)
+
+    def _given(
+        self, sums: WallSums, velocity: Sequence[wp.array], projection: PressureProjection, phi: wp.array | None, *, apply: bool
+    ) -> list[list[Any]]:
+        """Keep the velocity as it was, and return what the kernel takes for each component."""
         D = self._drag
         for before, field in zip(self._before, velocity, strict=True):
-            wp.copy(before, field)
+            copy(before, field)
         D.walls, D.kind, D.contact, D.phi = sums.walls, projection.kind, projection.contact, phi
         D.u, D.v, D.w = three(self._before)
         D.known_u, D.known_v, D.known_w = three(projection.known)
-        self._losses.zero_()
-        impulses = None if references is None else np.zeros((sums.solids, 6))
-        for axis, (field, known) in enumerate(zip(velocity, projection.known, strict=True)):
-            given = [D, axis, dt, self._mass, int(references is None), field, known, self._losses]
-            if references is None or impulses is None:
-                sums.launch(drag_kernel, window, given)
-            else:
-                impulses += sums.take(drag_kernel, window, references, given)
-        return float(self._losses.numpy().sum()), impulses
+        clear(self._losses)
+        faces = enumerate(zip(velocity, projection.known, strict=True))
+        return [[D, axis, self._dt, self._mass, int(apply), field, known, self._losses] for axis, (field, known) in faces]

@@ -26,7 +26,7 @@ from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.yield_set import F64, I32, U8, xyz
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import Rows
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch
 
 if typing.TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity, Walls
@@ -151,7 +151,7 @@ class SandBodies:
     def forget(self, stress: Mapping[str, wp.array]) -> None:
         """Remove stresses where only the edge of a body is near."""
         if len(self._unowned):
-            wp.launch(forget_kernel, len(self._unowned), [self._unowned, *(s.flatten() for s in stress.values())], device=self.grid.device)
+            launch(forget_kernel, len(self._unowned), [self._unowned, *(s.flatten() for s in stress.values())], device=self.grid.device)
 
     def prepare(self, packing: Packing, numbers: wp.array, *, pressure_step: float, shear_step: float) -> None:
         """Compute the correction of a trial step per velocity mismatch.

@@ -10,10 +10,13 @@ import warp as wp
 
 from warp_lcp.granular import packing_kernels as kernels
 from warp_lcp.granular.yield_set import xyz
+from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows.layout import put
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch
+from warp_lcp.rows.readings import Reading
 
 if TYPE_CHECKING:
     from warp_lcp.granular.cut_walls import CutWalls
@@ -36,6 +39,7 @@ class Packing:
         sides: of axes without an end, if there are any.
         cut: solids that cut cells, if there are any; `base` has those cells alone that they leave nothing of.
         counted: the cells whose stresses are solved for; None: all of the domain.
+        known: the cells of `densest`; None: all that are stored.
 
     Attributes:
         base: that of the arguments.
@@ -56,7 +60,7 @@ class Packing:
 
     def __init__(
         self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None,
-        counted: Window | None = None,
+        counted: Window | None = None, known: Window | None = None,
     ) -> None:  # fmt: skip
         self.grid, self.base, self._capacity, self.sides, self.cut = grid, base, capacity, sides, cut
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
@@ -71,6 +75,11 @@ class Packing:
         self.nodes = Window(low, (high[0] + more, high[1] + 1, high[2] + 1), grid.device)
         self.counted = counted or grid.domain
         self.strained, self.moved, self.stressed = self._around(0, 1), self._around(1, 1), self._around(1, 2)
+        self._known = known or grid.everywhere
+        self._rows = wp.zeros((2, *grid.shape[:2]), dtype=wp.float64, device=grid.device)  # count, largest fraction of each row
+        self._found = Reading(grid.device, 2)
+        self._rate = Scalar()  # dx / dt [m/s]
+        self._update = LaunchGraph(grid.device, self._launch)
         if sides is not None:  # what a row's neighbors hold may lie at the other end of it
             self.spans.assign(np.full((*grid.shape[:2], 2), (low[2], high[2] + 1), dtype=np.int32))
 
@@ -83,14 +92,32 @@ class Packing:
             dt: time step [s].
             solid: velocity of the solids on each component's faces [m/s]; empty: they stand still.
         """
+        self._rate.value = self.grid.spacing / dt
+        self._update.run(density, velocity, solid, variant=tuple(field.ptr for field in (density, *velocity, *solid)))
+        self._found.changed()
+
+    @property
+    def sand_cells(self) -> int:
+        """Number of counted cells whose flags are not 0."""
+        return int(self._found.numpy()[0])
+
+    @property
+    def densest(self) -> float:
+        """Largest fraction of a cell, in units of the densest packing.
+
+        Of cells whose capacity is more than a half.
+        """
+        return float(self._found.numpy()[1])
+
+    def _launch(self, density: wp.array, velocity: Sequence[wp.array], solid: Sequence[wp.array]) -> None:
+        """Launch an update."""
         grid, dimension = self.grid, self.grid.dimension
         domain, nodes = grid.domain, self.nodes
         domain.launch(kernels.fraction_kernel, [self.base, self._capacity, density, self.fraction])
         if self.sides is not None:
             self.sides.wrap(self.fraction)
-        rate = grid.spacing / dt
         openings, volume, around = (None, None, [None] * 3) if self.cut is None else (self.cut.openings, self.cut.volume, self.cut.around)
-        inputs = [self.base, self._capacity, self.fraction, grid.planes, rate, volume, self.kind, self.flags, self.drive]
+        inputs = [self.base, self._capacity, self.fraction, grid.planes, self._rate, volume, self.kind, self.flags, self.drive]
         domain.launch(kernels.contents_kernel, inputs)
         if self.sides is not None:
             self.sides.wrap(self.flags, self.kind)
@@ -106,10 +133,19 @@ class Packing:
             )  # fmt: skip
         inverse, share = (put(kernels.Faces(), dict(zip("xyz", fields, strict=False))) for fields in (self.inverse, self.share))
         domain.launch(kernels.stiffness_kernel, [dimension, self.flags, inverse, share, openings, self.stiff])
+        self._launch_counts(density)
         if self.sides is not None:
             return  # the spans are whole rows
         domain.launch_rows(kernels.span_kernel, [self.flags, self._own])
         nodes.launch_rows(kernels.widen_kernel, [self._own, self.spans])
+
+    def _launch_counts(self, density: wp.array) -> None:
+        """Launch what finds `sand_cells` and `densest`."""
+        self.counted.launch_rows(kernels.count_kernel, [self.flags, self._rows])
+        self._known.launch_rows(kernels.most_kernel, [self.base, self._capacity, density, self._rows])
+        clear(self._found.array)
+        rows = self._rows.shape[1] * self._rows.shape[2]
+        launch_list(kernels.fold_kernel, rows, [self._rows, self._found.array], device=self.grid.device, ordered=True)
 
     def _around(self, below: int, above: int) -> Window:
         """Return the counted cells and so many layers of nodes on their lower and upper sides, as far as there are nodes."""
@@ -117,7 +153,7 @@ class Packing:
         window = Window.of(low, high, self.grid.device)
         return window.common(self.nodes) or self.nodes
 
-    def join(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:
+    def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
         """Make a field of stresses consistent with neighboring parts of the grid."""
         if self.sides is not None:
             self.sides.wrap(stress, launch=launch)

@@ -4,7 +4,7 @@
 import warp as wp
 
 from warp_lcp.granular.yield_set import FIRM, HOLDS, PARTLY, SHEARS_HERE
-from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, U8, cell_below, cell_kernel, list_kernel
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.rows.layout import make_struct
 
@@ -244,6 +244,35 @@ def span_kernel(k, j, first, end, flags: U8, own: I32):
             high = i + 1
     own[k, j, 0] = low
     own[k, j, 1] = high
+
+
+@cell_kernel("granular.packing")
+def count_kernel(k, j, first, end, flags: U8, rows: F64):
+    """How many cells of a row hold sand."""
+    count = int(0)
+    for i in range(first, end):
+        if flags[k, j, i] != wp.uint8(0):
+            count += 1
+    rows[0, k, j] = wp.float64(count)
+
+
+@cell_kernel("granular.packing")
+def most_kernel(k, j, first, end, base: I8, capacity: F32, density: F32, rows: F64):
+    """Largest fraction of a row's cells whose kernel is open for more than a half."""
+    most = float(0.0)
+    for i in range(first, end):
+        if base[k, j, i] != _SOLID and capacity[k, j, i] > 0.5:
+            most = wp.max(most, density[k, j, i] / capacity[k, j, i])
+    rows[1, k, j] = wp.float64(most)
+
+
+@list_kernel("granular.packing")
+def fold_kernel(i, rows: F64, found: wp.array(dtype=wp.float64)):
+    """Add up the rows' cells and find the largest of their fractions: both are exact in any order."""
+    k = i // rows.shape[2]
+    j = i - k * rows.shape[2]
+    wp.atomic_add(found, 0, rows[0, k, j])
+    wp.atomic_max(found, 1, rows[1, k, j])
 
 
 @cell_kernel("granular.packing")

@@ -12,6 +12,7 @@ from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.particle_log import Row
+from warp_lcp.rows.program import LaunchGraph
 
 
 class SandReport:
@@ -32,10 +33,14 @@ class SandReport:
         cut, stored = stress.packing.cut, Window((0, 0, 0), grid.shape, grid.device)
         self._openings = None if cut is None else cut.openings
         self._report = WindowTally(report_pass(grid.dimension, stress.rate, cut is not None), grid, stored)
+        self._taking, self._reporting = (LaunchGraph(grid.device, record) for record in (self._launch_taking, self._launch_report))
         self._base = stress.packing.base if cut is None else grid.field(wp.int8)  # no face inside a solid that cuts cells is left unknown
 
     def take(self, velocity: Sequence[wp.array]) -> None:
         """Give the faces that stresses act on the velocity that they leave [m/s], and find `known` and `contact`."""
+        self._taking.run(velocity, variant=tuple(field.ptr for field in velocity))
+
+    def _launch_taking(self, velocity: Sequence[wp.array]) -> None:
         stress, packing = self.stress, self.stress.packing
         for axis, field in enumerate(velocity):
             fields = [self._base, packing.inverse[axis], stress.checked.u[axis], field, self.known[axis]]
@@ -52,11 +57,15 @@ class SandReport:
         Args:
             mass: of a full cell [kg; kg/m in 2-D].
         """
+        self._reporting.run()
+        self._report.changed()
+        cells, yielded, taken, most = self._found()
+        return {"yielded": yielded / max(cells, 1.0), "dissipation": taken * mass, "predicted_excess": most}
+
+    def _launch_report(self) -> None:
         stress, p = self.stress, self.stress.packing
         fields = p.cells | stress.checked.fields | {"now": stress.now, "openings": self._openings, "ratio": self.ratio}
         self._report.take(p.counted, numbers=stress.numbers, **fields)
-        cells, yielded, taken, most = self._found()
-        return {"yielded": yielded / max(cells, 1.0), "dissipation": taken * mass, "predicted_excess": most}
 
     def _found(self) -> list[float]:
         """Return how many cells carry shear, how many have yielded, what friction takes and the largest excess."""

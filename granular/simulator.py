@@ -36,7 +36,9 @@ from warp_lcp.material.particle_assembly import (
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import Join, extend_velocity
-from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.rigid.body import PLANAR
+from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, missed_by_far
 
@@ -87,6 +89,9 @@ class SandSimulation(ParticleSimulation):
         super().allocate(grid, parts)
         scene, self.solids, self.sides = self.scene, parts.solids, parts.boundary.sides
         self._base, self.density = grid.field(wp.int8), grid.field()
+        self._completion, self._density_to_grid = (
+            LaunchGraph(grid.device, record, at_once=self.shared) for record in (self._launch_completion, self._launch_density)
+        )
         self.packing = self._packing()
         self.carried = None if self.bodies is None else self._carried(self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
@@ -125,6 +130,10 @@ class SandSimulation(ParticleSimulation):
     def particles_to_grid(self, window: Window) -> None:
         """Transfer the particles' velocity to the faces and apply gravity."""
         super().particles_to_grid(window)
+        with self.watch.stage("particles-to-grid", *self.velocity, *self.weights):
+            self._completion.run(window, variant=window.near is None)
+
+    def _launch_completion(self, window: Window) -> None:
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
         complete(window, self.velocity, self.weights, self.outcome.known, self._layer_filled())  # faces have mass farther out than weight
@@ -296,8 +305,7 @@ class SandSimulation(ParticleSimulation):
         """Solve for the stresses and take over the velocity that they leave; return what the log wants to know of the solve."""
         packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
         with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
-            self._find_density(window)
-            wp.copy(self._base, solids.base)
+            self._density_to_grid.run(window, variant=window.near is None)
             solids.begin_step(self.time, dt)
             if self.sources is not None:
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, self._base)
@@ -345,19 +353,22 @@ class SandSimulation(ParticleSimulation):
         dimension, bodies = self.grid.dimension, self.bodies.bodies
         self.carried.begin(
             self.packing, self.velocity, self.weights, density=self.scene.physics.density,
-            velocity=np.array([body.velocities(dimension) for body in bodies]),
-            inverse_mass=np.array([body.inverse_mass(dimension) for body in bodies]),
+            velocity=bodies.velocities() if dimension == 3 else bodies.velocities()[:, PLANAR],
+            inverse_mass=bodies.inverse_masses(dimension),
         )  # fmt: skip
 
     def _push_bodies(self, dt: float) -> None:
         """Give the bodies what the sand has done to them, and the faces beside them the velocity that this leaves."""
         if self.carried is None or self.bodies is None:
             return
-        for body, impulse in zip(self.bodies.bodies, self.carried.impulses(), strict=True):
-            body.apply_impulse(impulse)
+        self.bodies.bodies.apply_impulses(self.carried.impulses())
         self.solids.begin_step(self.time, dt)
         if self.sources is not None:
             self.sources.hold(self.solids.velocity, [])
+
+    def _launch_density(self, window: Window) -> None:
+        self._find_density(window)
+        copy(self._base, self.solids.base)
 
     def _find_density(self, window: Window) -> None:
         """Find the particles' density in the cells of a window."""
@@ -406,11 +417,7 @@ class SandSimulation(ParticleSimulation):
 
     def _most(self) -> float:
         """Return the largest fraction of a cell, in units of the densest packing."""
-        if self.boundary.capacity is None:
-            return 0.0
-        base, density, capacity = (self._own(field) for field in (self._base, self.density, self.boundary.capacity))
-        open_ = (base != SOLID) & (capacity > 0.5)
-        return self._largest([float((density[open_] / capacity[open_]).max(initial=0.0))])[0]
+        return self._largest([self.packing.densest])[0]
 
     def _own(self, field: wp.array) -> np.ndarray:
         """Return what of a field nobody else has."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
@@ -14,6 +14,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
+from warp_lcp.rows.program import LaunchGraph, clear, launch
 
 
 class Walls:
@@ -58,12 +59,31 @@ class Walls:
         faces = {"cells": self.cells, "sides": self.sides, "walls": self.walls, "friction": self.friction}
         return {**faces, "fraction": packing.fraction}
 
-    def activate(self, flags: np.ndarray) -> None:
-        """Find the faces whose cells hold sand: their number and their entries go to `active`."""
-        found = np.flatnonzero(flags.ravel()[self._host])
+    def activate(self, flags: wp.array) -> None:
+        """Find the faces whose cells hold sand: their number and their entries, ascending, go to `active`.
+
+        Args:
+            flags: uint8 of the cells, 0 where they hold none.
+        """
+        if not flags.device.is_cuda:
+            launch(activate_kernel, 1, [self.cells, flags.flatten(), self.active], device=flags.device)
+            return
+        found = np.flatnonzero(flags.numpy().ravel()[self._host])
         active = np.zeros(1 + self.count, dtype=np.int32)
         active[0], active[1 : 1 + len(found)] = len(found), found
         self.active.assign(active)
+
+
+@wp.kernel(enable_backward=False, module="granular.walls")
+@no_type_check
+def activate_kernel(cells: wp.array(dtype=wp.int32), flags: wp.array(dtype=wp.uint8), active: wp.array(dtype=wp.int32)):
+    """List the entries whose cells hold sand, in order, behind their number."""
+    count = int(0)
+    for face in range(cells.shape[0]):
+        if flags[cells[face]] != wp.uint8(0):
+            count += 1
+            active[count] = face
+    active[0] = count
 
 
 class SandSolids:
@@ -99,6 +119,7 @@ class SandSolids:
         self.base, self.index = grid.field(wp.int8), grid.field(wp.int32)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
+        self._setting = LaunchGraph(grid.device, self._launch_velocity)
         self._cells: np.ndarray | None = None  # `index` as `walls` know it
         fits = cuts and isinstance(boundary, CutBoundary) and not boundary.moves and boundary.sides is None
         self.cut = CutWalls(grid, boundary.cut, friction, self._counted) if fits and isinstance(boundary, CutBoundary) else None
@@ -161,16 +182,20 @@ class SandSolids:
 
     def begin_step(self, time: float, dt: float) -> None:
         """Find how fast the solids move in the step that starts at `time` [s] and lasts `dt` [s]."""
+        self._boundary.begin_step(time, dt)
+        if self.velocity:
+            self._setting.run()
+
+    def _launch_velocity(self) -> None:
+        """Launch what sets the velocity of the solids' faces."""
         boundary, grid = self._boundary, self.grid
-        boundary.begin_step(time, dt)
         if self.moves and isinstance(boundary, CutBoundary):
             cut = boundary.cut
             for axis, field in enumerate(self.velocity):
                 inputs = [axis, grid.planes, grid.spacing, wp.vec3i(*grid.origin), self.index, cut.turn, cut.shift, field]
                 grid.everywhere.launch(kernels.wall_velocity_kernel, inputs)
         else:
-            for field in self.velocity:  # a source that has stopped has left its own
-                field.zero_()
+            clear(*self.velocity)  # a source that has stopped has left its own
 
 
 def wall_faces(index: np.ndarray, dimension: int, counted: Window | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -17,7 +17,8 @@ from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, momentum_kernel, stress_passes
 from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
 from warp_lcp.rows import Rows
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import renamed_method
 
@@ -129,6 +130,8 @@ class Stress(wl.VariationalInequality):
         last_residual: that of pressure and friction [m/s].
     """
 
+    shared: ClassVar = False  # whether others have parts of the stresses
+
     def __init__(self, packing: Packing, walls: Walls, *, box: bool = False, rate: bool = False, bodies: SandBodies | None = None) -> None:
         grid, self.packing, self.walls, self.box, self.rate, self.bodies = packing.grid, packing, walls, box, rate, bodies
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
@@ -143,19 +146,24 @@ class Stress(wl.VariationalInequality):
         threads = int(np.prod(packing.grid.shape[:2])) * packing.counted.cells.chunks
         self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
         self._wall_sums: Reduction | None = None
-        self._host = np.zeros(NUMBERS, dtype=np.float32)
+        self._host, self._host_momentum = self.numbers.numpy(), self._momentum.numpy()  # on the CPU the memory of both
         self._program: Program | None = None  # of an accelerated step
         self._check: Program | None = None  # of the residual
         self._cells = 1
         self.last_residual = 0.0, 0.0
         self.kick_dt, self.cold = 0.0, True
         self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # as before `begin`
+        self._ratio = Scalar()  # of the time for which forces act to that in the last step
+        self._admitting, self._restarting = (
+            LaunchGraph(grid.device, record, at_once=self.shared) for record in (self._launch_admission, self._launch_restart)
+        )
         self.set_walls(walls)
 
     def set_walls(self, walls: Walls) -> None:
         """Set other walls, after solids have moved."""
         device = self.packing.grid.device
         self.walls, self._program, self._check = walls, None, None
+        self._admitting.forget()
         self._sums.zero_()
         self._grain = 1 if device.is_cuda else WALL_GRAIN
         cut = self.packing.cut
@@ -171,30 +179,37 @@ class Stress(wl.VariationalInequality):
             dt: time step [s].
             kick_dt: time for which forces act in it [s]; stresses are impulses and are rescaled from the last step's pressure.
         """
-        wp.copy(self._last, self.now)
         self._last_kick = self.kick_dt
-        self._host = np.array(
-            [bound.k, bound.cohesion, bound.tension, *(gravity * kick_dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing, bound.gain,
-             bound.halfway], dtype=np.float32,
+        self._host[:] = (
+            bound.k, bound.cohesion, bound.tension, *(gravity * kick_dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing, bound.gain,
+            bound.halfway,
         )  # fmt: skip
-        self.numbers.assign(self._host)
-        p = self.packing
-        flags = p.flags.numpy()
-        self._cells = max(self._count(flags[tuple(map(slice, p.counted.low, p.counted.high))]), 1)
-        self.walls.activate(flags)
+        self._upload(self.numbers, self._host)
+        self._cells = max(self._count(), 1)
         self.cold = kick_dt > GROWN * self.kick_dt
-        ratio = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
-        share = xyz(share=p.share)
-        p.counted.run(self.velocity.passes.admit, ratio=ratio, flags=p.flags, stiff=p.stiff, **share, **self._stresses)
+        self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
+        self._admitting.run()
+        self.kick_dt = kick_dt
+
+    def _launch_admission(self) -> None:
+        """Launch what makes the last stresses those of the new packing: rescaled, 0 where it admits none, without the checkerboard."""
+        p, share = self.packing, xyz(share=self.packing.share)
+        copy(self._last, self.now)
+        self.walls.activate(p.flags)
+        p.counted.run(self.velocity.passes.admit, ratio=self._ratio, flags=p.flags, stiff=p.stiff, **share, **self._stresses)
         if self.bodies is not None:
             self.bodies.forget(self._stresses)
         p.join(self._point)
         p.counted.run(self.velocity.passes.damp, flags=p.flags, source=self._point, now=self.now, **share)
-        self.kick_dt = kick_dt
 
-    def _count(self, flags: np.ndarray) -> int:
-        """Return how many cells hold sand, given the flags of the counted ones."""
-        return int(np.count_nonzero(flags))
+    def _count(self) -> int:
+        """Return how many cells hold sand."""
+        return self.packing.sand_cells
+
+    def _upload(self, array: wp.array, host: np.ndarray) -> None:
+        """Copy the host's numbers to an array; on the CPU they are its memory."""
+        if self.packing.grid.device.is_cuda:
+            array.assign(host)
 
     def roll_back(self) -> None:
         """Restore the stresses before `begin`; the step is not taken."""
@@ -211,16 +226,20 @@ class Stress(wl.VariationalInequality):
             momentum: the most of the last step that is repeated, at first.
         """
         self._host[[PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD]] = pressure_step, shear_step, lookahead
-        self.numbers.assign(self._host)
-        state = np.zeros(STATE)
+        self._upload(self.numbers, self._host)
+        state = self._host_momentum
+        state[:] = 0.0
         state[[BETA_X, BETA_X + 1]] = momentum
         state[[NEXT_X, NEXT_X + 1]] = 0.25
         state[REST] = 1.0 - MOST_MOMENTUM
-        self._momentum.assign(state)
-        wp.copy(self._point, self.now)
-        wp.copy(self._before, self.now)
+        self._upload(self._momentum, state)
+        self._restarting.run()
         if self.bodies is not None:
             self.bodies.prepare(self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step)
+
+    def _launch_restart(self) -> None:
+        for stress in (self._point, self._before):
+            copy(stress, self.now)
 
     def limit_momentum(self, momentum: float) -> None:
         """Limit all later momenta to `momentum`."""

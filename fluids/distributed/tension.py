@@ -22,6 +22,7 @@ class SharedSurfaceTension(SurfaceTension):
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         super().__init__(*settings, **more)
         self.part, self._counted = part, part.owned
+        self._pushing.at_once = self._calming.at_once = True  # ranks exchange halos, and their particles are others
 
     def _join(self, field: wp.array) -> None:
         self.part.fill(field)

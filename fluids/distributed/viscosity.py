@@ -30,6 +30,8 @@ class SharedViscosity(Viscosity):
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         self.part = part
         super().__init__(*settings, solved=part.owned, across=part.ranks if part.ranks.size > 1 else None, **more)
+        for graph in self._graphs.values():
+            graph.at_once = True  # ranks exchange halos in some
 
     def _multigrid(self) -> VectorMultigrid:
         return SharedVectorMultigrid(self.part) if self.part.ranks.size > 1 else VectorMultigrid(self.grid)

@@ -132,12 +132,13 @@ class SharedVectorMultigrid(VectorMultigrid):
         self._whole = VectorMultigrid(StaggeredGrid(part.decomposition.counts, grid.spacing, grid.dimension, grid.device))
         return levels
 
-    def set_up(self, window: Window) -> None:
+    def set_up(self) -> None:
         """Make the coarse levels from the finest, all of them anew."""
-        super().set_up(window)
+        super().set_up()
         last, first = self.levels[-1], self._whole.levels[0]
         last.part.collect(last.equations, first.equations)
-        self._whole.set_up(first.grid.everywhere)
+        self._whole.move_to(first.grid.everywhere)
+        self._whole.set_up()
 
     def _cycle(self, number: int, launch: Launch) -> None:
         level = self.levels[number]

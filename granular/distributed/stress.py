@@ -23,7 +23,8 @@ from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_kernels import PERIOD
 from warp_lcp.granular.yield_set import COLUMNS
-from warp_lcp.rows.program import Launch, perform
+from warp_lcp.grid.staggered import Window
+from warp_lcp.rows.program import Launch, launch, perform
 
 REACH = 2  # cells from the box whose stresses the velocities around it feel
 
@@ -41,7 +42,9 @@ class SharedPacking(Packing):
     def __init__(self, part: Subdomain, base: wp.array, capacity: wp.array, **more: Any) -> None:
         self._part = part
         self._forest: StarForest | None = None  # of this step's sand
-        super().__init__(part.grid, base, capacity, counted=part.owned, **more)
+        slices = part.known.slices
+        known = Window.of([axis.start for axis in slices], [axis.stop for axis in slices], part.grid.device)
+        super().__init__(part.grid, base, capacity, counted=part.owned, known=known, **more)
 
     def update(self, *arguments: Any) -> None:
         """Take sand as it is now, see the base class."""
@@ -50,7 +53,7 @@ class SharedPacking(Packing):
             self._forest.free()
             self._forest = None
 
-    def join(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:
+    def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
         """Fill the ghost cells of a field of stresses that hold sand; in others they are 0. Collective."""
         perform(partial(self._fill, stress), launch)
         super().join(stress, launch=launch)
@@ -72,6 +75,8 @@ class SharedStress(Stress):
         more: as of `Stress`.
     """
 
+    shared = True
+
     def __init__(self, part: Subdomain, packing: SharedPacking, walls: Walls, **more: Any) -> None:
         self._part = part
         super().__init__(packing, walls, **more)
@@ -83,8 +88,8 @@ class SharedStress(Stress):
         super().begin(*arguments)
         self._part.fill(self.now, width=REACH)
 
-    def _count(self, flags: np.ndarray) -> int:
-        return int(self._part.ranks.sum(super()._count(flags)))
+    def _count(self) -> int:
+        return int(self._part.ranks.sum(super()._count()))
 
     def _end_step(self, step: int, launch: Launch) -> None:
         if self._part.ranks.size == 1:

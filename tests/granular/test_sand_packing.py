@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.solids import wall_faces
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.granular.solids import Walls, wall_faces
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 
 DT, DX = 0.01, 0.1
@@ -134,3 +134,33 @@ def test_wall_faces_lie_between_open_cells_and_solids(dimension: int) -> None:
     assert set(zip(cells.tolist(), sides.tolist(), walls.tolist(), strict=True)) == expected
     assert len(cells) == len(expected)
     assert (np.diff(cells) >= 0).all()  # so that a cell's faces are one thread's, in one order
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(dimension: int) -> None:
+    random = np.random.default_rng(dimension)
+    grid = StaggeredGrid((7, 5, 4 if dimension == 3 else 1), DX, dimension)
+    base = np.where(random.random(grid.shape) < 0.3, SOLID, 0).astype(np.int8)
+    capacity = random.uniform(0.2, 1.0, grid.shape).astype(np.float32)
+    arrays = [wp.array(host, dtype=kind, device=grid.device) for host, kind in ((base, wp.int8), (capacity, wp.float32))]
+    counted = Window((1, 2, 2), (grid.shape[0] - 1, 5, 6), grid.device)
+    packing = Packing(grid, *arrays, counted=counted)
+    index = np.full(grid.shape, -1, dtype=np.int32)
+    index[0], index[-1], index[:, 0], index[:, -1], index[..., 0], index[..., -1] = [0] * 6
+    walls = Walls(grid, index, [0.5])
+    density, velocity = grid.field(), grid.faces()
+    for step in range(4):
+        host = random.uniform(0.0, 1.2, grid.shape) * (random.random(grid.shape) < 0.5) * (step != 2)
+        if step == 3:
+            density = grid.field()  # another array than what is recorded knows
+        density.assign(host.astype(np.float32))
+        packing.update(density, velocity, DT)
+        walls.activate(packing.flags)
+        flags = packing.flags.numpy()
+        assert packing.sand_cells == np.count_nonzero(flags[tuple(map(slice, counted.low, counted.high))])
+        seen = (base != SOLID) & (capacity > 0.5)
+        seen[: 1 if dimension == 2 else 0] = False
+        seen[2 if dimension == 2 else grid.shape[0] :] = False  # in 2-D one plane is used
+        assert packing.densest == (density.numpy()[seen] / capacity[seen]).max(initial=0.0)
+        held, active = np.flatnonzero(flags.ravel()[walls.cells.numpy()]), walls.active.numpy()
+        np.testing.assert_array_equal(active[: 1 + len(held)], [len(held), *held])

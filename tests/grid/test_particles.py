@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from warp_lcp.grid.particles import MARGIN, SORT_EVERY, Particles, lattice, seed, sort_keys
+from warp_lcp.grid.particles import MARGIN, SORT_EVERY, Particles, _rows_of_sort, lattice, seed, sort_keys
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((7, 5, 1), 0.2, 2)
@@ -51,7 +51,8 @@ def test_keys_are_sorted_as_numpy_sorts_them(count: int, bits: int, monkeypatch:
             wl.set_threads(threads)
             key = wp.array(np.append(keys, rng.integers(0, 9, count)), dtype=wp.int32, device="cpu")
             order = wp.full(2 * count, -7, dtype=wp.int32, device="cpu")
-            sort_keys(key, order, count, bits)
+            rows, counts = _rows_of_sort(count, key.device), wp.zeros(32 * (2048 + 16), dtype=wp.int32, device="cpu")
+            sort_keys((key[:count], key[count:]), (order[:count], order[count:]), counts, rows, rows.places, bits)
             np.testing.assert_array_equal(order.numpy()[:count], expected)
             np.testing.assert_array_equal(key.numpy()[:count], keys[expected])
     finally:

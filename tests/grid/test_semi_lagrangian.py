@@ -29,7 +29,15 @@ def carried(grid: StaggeredGrid, velocity: list[wp.array], dt: float, values: np
     levels = np.ones(grid.shape) if level is None else level
     field, out = (wp.array(v.astype(np.float32), device="cpu") for v in (values, np.full(grid.shape, -7.0)))
     carry_field(
-        grid, grid.everywhere, velocity, dt, field, out, axis=axis, level=wp.array(levels.astype(np.float32), device="cpu"), least=0.5
+        grid,
+        grid.everywhere,
+        velocity,
+        dt / grid.spacing,
+        field,
+        out,
+        axis=axis,
+        level=wp.array(levels.astype(np.float32), device="cpu"),
+        least=0.5,
     )
     return out.numpy()
 

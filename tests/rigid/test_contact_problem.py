@@ -5,6 +5,7 @@ import pytest
 import scipy.sparse
 import warp as wp
 from bodies_at_hand import GRAVITY, bodies_of, run
+from scipy.sparse.csgraph import connected_components
 
 import warp_lcp as wl
 from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
@@ -26,6 +27,22 @@ def problem_of(dimension, seed):
     b = rng.normal(size=(5, dimension))
     b[:, 0] = -np.abs(b[:, 0])
     return ContactProblem(first, second, one, other, b, rng.uniform(0.1, 0.9, 5), 4)
+
+
+def test_islands_are_the_connected_components_of_pairs():
+    rng = np.random.default_rng(77)
+    for _ in range(30):
+        bodies, k = int(rng.integers(1, 12)), int(rng.integers(0, 15))
+        first, second = rng.integers(0, bodies, k), rng.integers(0, bodies + 1, k)
+        second[second == first] = bodies
+        rows = np.zeros((k, 2, 3))
+        order, starts = ContactProblem(first, second, rows, rows, np.zeros((k, 2)), np.zeros(k), bodies).islands()
+        pairs = second < bodies
+        links = scipy.sparse.coo_array((np.ones(pairs.sum()), (first[pairs], second[pairs])), shape=(bodies, bodies))
+        labels = connected_components(links, directed=False)[1][first]
+        expected = np.argsort(labels, kind="stable")
+        np.testing.assert_array_equal(order, expected)
+        np.testing.assert_array_equal(starts, np.append(np.flatnonzero(np.diff(labels[expected], prepend=-1)), k))
 
 
 def stack(dimension, count=3):

@@ -108,6 +108,25 @@ def test_motions_of_several_bodies_are_those_of_each():
         np.testing.assert_allclose(here @ turn.T + shift, moved, atol=1e-3)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_impulses_and_inverse_masses_of_several_bodies_are_those_of_each(dimension):
+    rng, k = np.random.default_rng(18), 3 if dimension == 2 else 6
+    bodies = [tumbling() for _ in range(3)]
+    states = BodyStates(bodies)
+    states.advance(0.1)
+    bodies[1].hold = rng.normal(size=(k, k))
+    each = [copy(body) for body in bodies]
+    for one in each:
+        one.values = one.values.copy()
+    inverses = states.inverse_masses(dimension)
+    impulses = rng.normal(size=(3, k))
+    states.apply_impulses(impulses)
+    for n, one in enumerate(each):
+        np.testing.assert_allclose(inverses[n], one.inverse_mass(dimension), rtol=0, atol=1e-15)
+        one.apply_impulse(impulses[n])
+        np.testing.assert_allclose(bodies[n].values, one.values, rtol=0, atol=1e-14)
+
+
 def test_the_center_of_mass_goes_where_its_pose_does():
     top = tumbling()
     top.advance(0.3)

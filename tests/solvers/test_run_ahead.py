@@ -1,4 +1,4 @@
-"""What a GPU does of a solve without its host is what the host would have had it do; only with the plugin `emulated_cuda`."""
+"""What a device does of a solve without its host is what the host would have had it do, on the CPU and, emulated, on CUDA."""
 
 import sys
 from typing import Any
@@ -121,3 +121,94 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     many = [Reading(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]  # more than there is room for: each has memory of its own
     many[-1].array.fill_(3.0)
     assert (many[-1].numpy() == 3.0).all()
+
+
+@pytest.fixture
+def both(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return what makes a problem in place, one workspace that the host leads, and one that the device does."""
+
+    def make(seed: int) -> tuple[wl.LCP, Any, Any]:
+        rng = np.random.default_rng(seed)
+        problem, b = random_problem(rng)
+        b.assign(np.where(problem.unknown.numpy() == 1, rng.standard_normal(b.size), 0.0))
+        with monkeypatch.context() as patch:
+            patch.setattr(RunAhead, "suits", lambda work: False)
+            alone = SOLVER.init(problem)
+        return problem, alone, SOLVER.init(problem)
+
+    return make
+
+
+def outcomes(problem: wl.LCP, works: tuple[Any, ...], **options: Any) -> list[Any]:
+    """Return histories, ends and iterates of a solve from each workspace, by the records that a callback was given too."""
+    found = []
+    for work in works:
+        seen: list[Any] = []
+        limit = options.get("stop_at", 1 << 30)
+
+        def look(record: Any, work: Any = work, seen: list[Any] = seen, limit: int = limit) -> None:
+            seen.append((record.iteration, record.residual, record.active, record.step, work.x.numpy().tobytes()))
+            if record.iteration >= limit:
+                raise StopIteration
+
+        given = {name: value for name, value in options.items() if name != "stop_at"}
+        result = wl.solve(problem, SOLVER, workspace=work, callback=look if "stop_at" in options else None, **given)
+        rows = [(r.iteration, r.residual, r.active, r.step) for r in result.history]
+        found.append((seen, rows, result.status, result.residual, work.x.numpy().tobytes()))
+    return found
+
+
+@pytest.mark.cpu_form("threads are the CPU's")
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+def test_threads_take_the_steps_of_the_host(threads: int, both: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = wl.get_threads()
+    wl.set_threads(threads)
+    for module in ("team", "row_pass", "program"):
+        monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 64)
+    try:
+        problem, alone, ahead = both(4100 + threads)
+        guess = problem.layout.zeros(wp.float64)
+        for rtol in (1e-3, 1e-6, 1e-9):
+            one, other = outcomes(problem, (alone, ahead), x0=guess, stopping=wl.StoppingCriteria(rtol=rtol))
+            assert one == other
+            wp.copy(guess, alone.x)
+            guess = wp.clone(guess)  # elsewhere
+    finally:
+        wl.set_threads(before)
+
+
+@pytest.mark.parametrize("stop_at", [0, 1, 3, 1 << 30])
+def test_who_looks_at_each_step_sees_its_iterate(stop_at: int, both: Any) -> None:
+    problem, alone, ahead = both(4200)
+    for guess in (None, problem.layout.zeros(wp.float64)):
+        one, other = outcomes(problem, (alone, ahead), x0=guess, stop_at=stop_at)
+        assert one == other
+        assert len(one[0]) == len(one[1])
+
+
+@pytest.mark.parametrize(
+    "limits", [{"max_iterations": 0}, {"max_iterations": 2}, {"rtol": 0.0}, {"rtol": 1e-15, "patience": 3}, {"merits": True}]
+)
+def test_limits_end_both_alike(limits: dict[str, Any], both: Any) -> None:
+    problem, alone, ahead = both(4300)
+    guess = problem.layout.zeros(wp.float64)
+    for _ in range(2):
+        one, other = outcomes(problem, (alone, ahead), x0=guess, stopping=wl.StoppingCriteria(**limits))
+        assert one == other
+        guess.assign(alone.x.numpy() * 0.9)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_what_is_not_finite_is_found_by_both(wrong: float, both: Any) -> None:
+    problem, alone, ahead = both(4400)
+    guess, inside = problem.layout.zeros(wp.float64), np.flatnonzero(problem.unknown.numpy() == 1)
+    for work in (alone, ahead):
+        bad = wp.clone(guess)
+        bad.assign(np.where(np.arange(bad.size) == inside[-1], wrong, 0.0))
+        with pytest.raises(ValueError, match="x0 holds 1 values that are not finite"):
+            wl.solve(problem, SOLVER, workspace=work, x0=bad)
+    one, other = outcomes(problem, (alone, ahead), x0=guess)
+    assert one == other
+    problem.b.assign(np.where(np.arange(guess.size) == inside[0], wrong, problem.b.numpy()))
+    one, other = outcomes(problem, (alone, ahead), x0=guess)
+    assert one[2] is other[2] is wl.SolveStatus.NON_FINITE

@@ -66,7 +66,7 @@ class SharedDensityCorrection(DensityCorrection):
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         super().__init__(*settings, **more)
         self.part, self._solved = part, part.owned
-        self._preparation.at_once = True  # ranks exchange particles and halos in it
+        self._preparation.at_once = self._displacing.at_once = True  # ranks exchange particles and halos in them
         self._boxes: list[Any] = [None if f is None else part.box_like(f) for f in self._fields]
         self._cells, self._rhs, self._guess, _, _ = self._boxes
 

@@ -32,6 +32,7 @@ class SharedFlights(Flights):
 
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         super().__init__(*settings, **more)
+        self._growing.at_once = True  # in other windows each time
         self._part, owned = part, part.owned
         low, high = owned.low[::-1], [h - 1 for h in owned.high[::-1]]
         self._beside, self._below = (part.grid.window(low, high, grow=layers) for layers in (1, 2))

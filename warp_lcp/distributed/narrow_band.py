@@ -30,6 +30,7 @@ class SharedNarrowBand(NarrowBand):
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         self.part = part
         super().__init__(*settings, **more)
+        self._carrying.at_once = True  # ranks exchange halos in it
         self._own, self._before = part.owned, part.grid.origin
         self._first = NEW  # place of fresh particles
 
@@ -46,11 +47,12 @@ class SharedNarrowBand(NarrowBand):
         super().restore(state)
         self._join(self.depth, *self.velocity)
 
-    def _relax(self, window: Window) -> None:
+    def _relax(self, fallen: int = 0) -> None:
         """Let depths fall on all ranks until none falls any more: a way to the shore may lead through several boxes."""
         falls = True
         while falls:
-            super()._relax(window)
+            super()._relax(fallen)
+            fallen = 0
             before = self._now.numpy().copy()
             self.part.fill(self._now)
             after = np.minimum(before, self._now.numpy())
@@ -76,5 +78,5 @@ class SharedNarrowBand(NarrowBand):
     def _join(self, *fields: wp.array) -> None:
         self.part.fill(*fields)
 
-    def _summed(self, window: Window) -> ParticleTotals:
-        return reduce(ParticleTotals.joined, self.part.ranks.collect(super()._summed(window)))
+    def _summed(self, window: Window, *, launched: bool = False) -> ParticleTotals:
+        return reduce(ParticleTotals.joined, self.part.ranks.collect(super()._summed(window, launched=launched)))

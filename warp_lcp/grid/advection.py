@@ -205,8 +205,8 @@ def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved:
 
 
 def carry_field(
-    grid: StaggeredGrid, window: Window, velocity: list[wp.array], dt: float, field: wp.array, out: wp.array, *, axis: int, level: wp.array,
-    least: float, before: tuple[int, int, int] = (0, 0, 0),
+    grid: StaggeredGrid, window: Window, velocity: list[wp.array], way: float | Scalar, field: wp.array, out: wp.array, *, axis: int,
+    level: wp.array, least: float, before: tuple[int, int, int] = (0, 0, 0),
 ) -> None:  # fmt: skip
     """Advect a field for a time step (semi-Lagrangian).
 
@@ -214,7 +214,7 @@ def carry_field(
         grid: the grid.
         window: cells to consider, in the domain and the ring's upper layer.
         velocity: of each component on the faces [m/s].
-        dt: time step [s].
+        way: dt / dx [s/m].
         field: float32, of faces or cells; not `out`.
         out: float32 (written). Where the level is no more than `least`: the velocity as it was, 0 at cell centers.
         axis: whose faces the field lies on, or `CENTERS`.
@@ -222,9 +222,10 @@ def carry_field(
         least: see `out`.
         before: cells (x, y, z) of a larger grid before this one, whose places are rounded as there.
     """
-    inner = Window.of([max(start, 1) for start in window.low], window.high, window.device)
+    if min(window.low) < 1:
+        window = Window.of([max(start, 1) for start in window.low], window.high, window.device)
     before_x, before_y, before_z = before
-    inner.run(
-        carry_pass(axis), FaceVelocity.of(velocity), planes=grid.planes, h=dt / grid.spacing, least=least, level=level, field=field,
+    window.run(
+        carry_pass(axis), FaceVelocity.of(velocity), planes=grid.planes, h=way, least=least, level=level, field=field,
         out=out, before_x=before_x, before_y=before_y, before_z=before_z,
     )  # fmt: skip

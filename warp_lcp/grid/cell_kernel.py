@@ -110,7 +110,8 @@ def launch_list(
     """
     listed = next((a.listed for a in inputs if hasattr(a, "listed")), None) if is_recording() else None
     inputs, sized = [wp.vec2i(0, 0), *inputs], 0 if listed is None else listed.entries
-    launch_ranges(kernel, (count,), cost, inputs, device=wp.get_device(device), launch=launch, ordered=ordered, sized=sized)
+    extent = None if listed is None else listed.rows
+    launch_ranges(kernel, (count,), cost, inputs, device=wp.get_device(device), launch=launch, ordered=ordered, sized=sized, extent=extent)
 
 
 def _kernel(function: Callable, module: str) -> wp.Kernel:

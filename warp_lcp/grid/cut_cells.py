@@ -15,13 +15,14 @@ import warp as wp
 from warp_lcp.grid import cut_cells_kernels as kernels
 from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motions, Pose
-from warp_lcp.grid.node_distance import NodeBox, NodeDistances, NodeSampler, ShapeTable, nodes_near
+from warp_lcp.grid.node_distance import NodeBox, NodeDistances, NodeSampler, ShapeTable, node_window, nodes_near
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.solids import Geometry
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows.host_array import HostArray
+from warp_lcp.rows.program import LaunchGraph, clear, copy
 
 DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
 
@@ -102,11 +103,18 @@ class CutCells:
             self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving]))
             self._standing = NodeDistances(grid, second=len(solids) > 1)
             self._standing.copy_from(self._nodes)
+            self._near, self._swept = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
+            # a mesh is measured in parts, and the host decides about each
+            measured = any(not isinstance(run, ShapeTable) for run in self._runs)
+            self._entering = LaunchGraph(grid.device, self._launch_entering, at_once=measured)
+            self._refreshing = LaunchGraph(grid.device, self._refresh)
+            self._filling = LaunchGraph(grid.device, self._launch_velocity)
             self.moving = kernels.Moving()
             self.moving.nodes, self.moving.standing = self._nodes.struct, self._standing.near
             self.moving.moves = wp.array([False, *(s.motion is not None for s in solids)], dtype=wp.uint8, device=grid.device)
-            self._enter_moving(0.0)
-        self._refresh()
+            self.place(0.0)
+        else:
+            self._refresh()
         dropped, partial = self._counts.numpy().tolist()
         self.whole_cells = partial == 0 and not self.moves and not self._reaches_into_open_cells()
         self.notes = (*notes, *(self._result_notes(dropped) if remarks else ()))
@@ -137,10 +145,9 @@ class CutCells:
         """
         if not self.moves:
             return
-        self._nodes.copy_from(self._standing)
-        wp.copy(self.base, self._marks)
         self._enter_moving(time)
-        self._refresh()
+        self._join()
+        self._refreshing.run()
 
     def set_velocity(self, time: float, dt: float) -> None:
         """Set the velocity: displacement of the solids' points over a time, divided by it.
@@ -165,15 +172,19 @@ class CutCells:
         near = _around([box for box in (self._moved_from, self._moved_to) if box is not None])
         if near is None:
             return
-        grid = self.grid
-        first = np.maximum(near[0], 1)
-        last = np.minimum(near[1] - 1, np.array(grid.counts) + 1)
-        if (first <= last).all():
-            fields = [field for each in (self.open, self.wall, self.velocity) for field in (*each, *each[1:2])[:3]]  # in 2-D no third one
-            inputs = [self.moving, grid.planes, grid.spacing, wp.vec3i(*grid.origin), wp.vec3i(*grid.counts)]
-            window = grid.window(first.tolist(), last.tolist())
-            window.launch(kernels.velocity_kernel, [*inputs, *fields[:6], self.turn, self.shift, *fields[6:]])
+        first, end = np.maximum(near[0], 1), np.minimum(near[1], np.array(self.grid.counts) + 2)
+        if (first < end).all():
+            self._swept.move_to(node_window(self.grid, first, end))
+            self._filling.run()
         self._moved_from = self._moved_to
+
+    def _launch_velocity(self) -> None:
+        """Launch the pass that sets the velocity of the solids on faces."""
+        assert self.velocity is not None, "a solid moves"
+        grid = self.grid
+        fields = [field for each in (self.open, self.wall, self.velocity) for field in (*each, *each[1:2])[:3]]  # in 2-D no third one
+        inputs = [self.moving, grid.planes, grid.spacing, wp.vec3i(*grid.origin), wp.vec3i(*grid.counts)]
+        self._swept.launch(kernels.velocity_kernel, [*inputs, *fields[:6], self.turn, self.shift, *fields[6:]])
 
     def moving_block(self) -> tuple[list[int], list[int]] | None:
         """Return the block of cells beside moving solids, or None.
@@ -193,17 +204,20 @@ class CutCells:
         for run in self._runs:
             if isinstance(run, ShapeTable):
                 run.place(rotations[0, run.places], translations[0, run.places])
-        self._enter()
-        boxes = []
-        for run in self._runs:
-            if isinstance(run, ShapeTable):
-                near = (run.low < run.high).all(axis=1)
-                boxes += [(run.low[near].min(axis=0), run.high[near].max(axis=0))] if near.any() else []
-            elif (box := nodes_near(self.grid, self._placed(run))) is not None:
-                boxes.append(box)
-        self._moved_to = _around(boxes)
+        boxes = [run.box if isinstance(run, ShapeTable) else nodes_near(self.grid, self._placed(run)) for run in self._runs]
+        self._moved_to = _around([box for box in boxes if box is not None])
+        nowhere = np.zeros(3, dtype=np.int64)
+        self._near.move_to(node_window(self.grid, *self._sampler.inner(*(self._moved_to or (nowhere, nowhere)))))
+        self._entering.run()
         if self._moved_to is not None:
-            self._sampler.look_at_centers(self._nodes, self._all_placed, *self._moved_to, self.base)
+            self._sampler.look_at_centers(self._nodes, self._all_placed, *self._moved_to, self.base, listed=True)
+
+    def _launch_entering(self) -> None:
+        """Launch what enters the solids that move into the distances of those that stand, and lists cells that only centers tell about."""
+        self._nodes.copy_from(self._standing)
+        copy(self.base, self._marks)
+        self._enter()
+        self._sampler.list_flat_cells(self._nodes, self._near)
 
     def _placed(self, place: int) -> Geometry:
         """Return a solid that moves where it is, by its place among those."""
@@ -228,13 +242,12 @@ class CutCells:
 
     def _refresh(self) -> None:
         """Fill everything that follows from the distances."""
-        self._join()
         grid, nodes = self.grid, self._nodes
         planes = grid.planes
         faces = dict(zip(("ax", "ay", "az"), [*self.open, *self.open[1:2]], strict=False))  # in 2-D nothing is done to the third
         walls = dict(zip(("wx", "wy", "wz"), [*self.wall, *self.wall[1:2]], strict=False))
         nearest = dict(zip(("d", "o", "d2", "o2"), nodes.arrays, strict=True))
-        self._counts.zero_()
+        clear(self._counts)
         # the marks are in `base`, until the next kernel fills it
         grid.domain.run(kernels.FRACTIONS, planes=planes, marks=self.base, counts=self._counts, **nearest, **faces, **walls)
         for number in range(2 * grid.dimension):

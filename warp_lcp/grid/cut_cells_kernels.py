@@ -12,6 +12,7 @@ from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.native import text
+from warp_lcp.rows.program import launch
 
 DROP = 1.0e-3  # open fractions below become 0: raised, they would lift a flow along the wall; kept, they spoil the condition number
 CLOSED, OPEN, CUT = 0, 1, 2  # states of cells
@@ -221,7 +222,7 @@ def integrate_kernel(
     everywhere.run(OPEN_CELLS, planes=planes, state=state, capacity=capacity)
     if window.device.is_cpu:
         inputs = [wp.vec3i(*window.low), wp.vec3i(*window.high), wp.vec3i(*origin), planes, near, state, capacity]
-        wp.launch(cut_in_order_kernel, 1, inputs, device=window.device)
+        launch(cut_in_order_kernel, 1, inputs, device=window.device)
         return
     chunks = -(-(window.high[2] - window.low[2]) // window.cells.grain)
     for color in itertools.product(range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)):
@@ -230,4 +231,4 @@ def integrate_kernel(
         rows = [-(-max(high - low - color, 0) // COLORS) for low, high, color in zip(window.low, window.high, (z, y, x), strict=True)]
         if min(rows) > 0:
             dim = (rows[0], rows[1], -(-rows[2] // window.cells.grain) if chunks > 1 else 1)
-            wp.launch(cut_kernel, dim, [window.cells, wp.vec3i(x, y, z), planes, near, state, capacity], device=window.device)
+            launch(cut_kernel, dim, [window.cells, wp.vec3i(x, y, z), planes, near, state, capacity], device=window.device)

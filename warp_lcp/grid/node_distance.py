@@ -16,8 +16,9 @@ from warp_lcp.grid import node_distance_kernels as kernels
 from warp_lcp.grid.node_distance_kernels import COARSE, FAR, Nearest
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
 from warp_lcp.grid.solids_kernels import block_of, item_points
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.rows.host_array import HostArray
+from warp_lcp.rows.program import clear, copy
 
 NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
@@ -59,7 +60,14 @@ class NodeDistances:
     def copy_from(self, other: NodeDistances) -> None:
         """Become a copy of `other`."""
         for target, source in zip(self.arrays, other.arrays, strict=True):
-            wp.copy(target, source)
+            copy(target, source)
+
+
+def node_window(grid: StaggeredGrid, low: np.ndarray, high: np.ndarray) -> Window:
+    """Return the window of nodes low <= (x, y, z) < high, without cells where there are none."""
+    if (low >= high).any():
+        return Window((1, 1, 1), (1, 1, 2), grid.device)
+    return Window(_kji(low), _kji(high), grid.device)
 
 
 def nodes_near(grid: StaggeredGrid, geometry: Geometry, reach: float = FAR) -> tuple[np.ndarray, np.ndarray] | None:
@@ -94,6 +102,7 @@ class ShapeTable:
     Attributes:
         low: first node (x, y, z) near each solid where it is, shape (n, 3).
         high: one past the last.
+        box: around the nodes near them; None: there are none.
     """
 
     def __init__(self, grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]], places: Sequence[int]) -> None:
@@ -124,6 +133,8 @@ class ShapeTable:
         groups["number"], groups["first"], groups["end"] = [number for number, _ in solids], self._starts, self._starts + counts
         self._block = block_of(np.zeros(3), np.ones(3), grid.spacing, grid.dimension, grid.origin)
         self.low = self.high = np.zeros((len(solids), 3), dtype=np.int64)
+        self.box: NodeBox | None = None
+        self._window = ActiveWindow(grid.domain)
 
     @staticmethod
     def holds(geometry: Geometry) -> bool:
@@ -146,13 +157,13 @@ class ShapeTable:
         self._solids.host["low"], self._solids.host["high"] = self.low, self.high
         self._solids.send()
         self._shapes.send()
+        near = (self.low < self.high).all(axis=1)
+        self.box = (self.low[near].min(axis=0), self.high[near].max(axis=0)) if near.any() else None
+        self._window.move_to(node_window(self.grid, *(self.box or (self.low[0], self.low[0]))))
 
     def enter(self, nodes: NodeDistances, snap: float) -> None:
         """Enter the solids' distances; those within `snap` [cells] of a surface are 0."""
-        near = (self.low < self.high).all(axis=1)
-        if near.any():
-            window = Window(_kji(self.low[near].min(axis=0)), _kji(self.high[near].max(axis=0)), self.grid.device)
-            window.launch(kernels.enter_solids, [self._block, self._solids.array, self._shapes.array, snap, nodes.struct])
+        self._window.launch(kernels.enter_solids, [self._block, self._solids.array, self._shapes.array, snap, nodes.struct])
 
 
 class NodeSampler:
@@ -202,8 +213,9 @@ class NodeSampler:
                     wp.launch(kernels.claim_listed, count, inputs, device=self.grid.device)
 
     def look_at_centers(
-        self, nodes: NodeDistances, solids: Callable[[], Sequence[Geometry]], low: np.ndarray, high: np.ndarray, marks: wp.array
-    ) -> None:
+        self, nodes: NodeDistances, solids: Callable[[], Sequence[Geometry]], low: np.ndarray, high: np.ndarray, marks: wp.array,
+        listed: bool = False,
+    ) -> None:  # fmt: skip
         """Mark as HOLLOW the cells in the open whose corners all have distance 0: gaps of one cell, where plates have no mark.
 
         Args:
@@ -212,13 +224,13 @@ class NodeSampler:
             low: first node (x, y, z) from which on cells are considered.
             high: one past the last node.
             marks: int8, one a stored cell (updated).
+            listed: whether `list_flat_cells` has listed the cells.
         """
-        low, high = np.maximum(low, 1), np.minimum(high, np.array(self.grid.shape[::-1]) - 1)
+        low, high = self.inner(low, high)
         if (low >= high).any():
             return
-        window = Window(_kji(low), _kji(high), self.grid.device)
-        self._listed.zero_()
-        window.launch(kernels.find_flat_cells, [self.grid.planes, nodes.near, self._list, self._listed])
+        if not listed:
+            self.list_flat_cells(nodes, node_window(self.grid, low, high))
         found = int(self._listed.numpy()[0])
         if found > len(self._list):
             longest = int(np.argmax(high - low))
@@ -232,6 +244,15 @@ class NodeSampler:
             for order, geometry in enumerate(solids()):
                 distances = self._measure(geometry, found, kernels.listed_points, [block, listed])
                 wp.launch(kernels.mark_listed, found, [listed, distances, order == 0, marks], device=self.grid.device)
+
+    def inner(self, low: np.ndarray, high: np.ndarray) -> NodeBox:
+        """Return a box of nodes without those that are the low corner of no cell inside the ring."""
+        return np.maximum(low, 1), np.minimum(high, np.array(self.grid.shape[::-1]) - 1)
+
+    def list_flat_cells(self, nodes: NodeDistances, window: Window) -> None:
+        """List the cells of a window in the open whose corners all have distance 0."""
+        clear(self._listed)
+        window.launch(kernels.find_flat_cells, [self.grid.planes, nodes.near, self._list, self._listed])
 
     def _measure(self, geometry: Geometry, count: int, fill: wp.Kernel, inputs: list[Any], *, unsigned: bool = False) -> wp.array:
         """Return the distances [m] of `count` points that a kernel makes; only a mesh can be asked for those without sign."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.rows import KernelFile, RowPass, Rows
-from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
+from warp_lcp.rows.memory import DeviceRows, RowsMemory, Scalar, Slot
 from warp_lcp.rows.program import is_recording
 from warp_lcp.rows.team import get_threads
 
@@ -27,6 +27,7 @@ CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs not
 SHARES = 2  # that a thread's planes are cut into where particles add to them: chunks that touch two shares are read twice
 LEAST_PLANES = 4  # of a share
 PARTICLE = 16  # cells of a usual pass that a particle of one costs
+LIST_ROOM = 1.25  # of the threads of a captured launch over a list's entries
 MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
 
@@ -42,7 +43,8 @@ class ListMemory:
     """
 
     def __init__(self, device: wp.Device) -> None:
-        self.device, self.count, self.rows = device, Scalar(), RowsMemory()
+        self.device, self.count = device, Scalar()
+        self.rows = DeviceRows(LIST_ROOM) if device.is_cuda else RowsMemory()
         self._slots: dict[str, Slot] = {}
         self._entries = ctypes.c_int64()
         self.entries = ctypes.addressof(self._entries)
@@ -105,8 +107,10 @@ def scatter(
     number = count if listed is None else listed.count
     if grid.device.is_cuda:
         rows = Rows.listed(count, grid.device)
+        rows = rows if listed is None else replace(rows, memory=listed.rows)
     else:
-        shares = 1 if touched is None else max(1, min(SHARES * get_threads(), grid.shape[3 - grid.dimension] // LEAST_PLANES))
+        planes = grid.shape[3 - grid.dimension]
+        shares = 1 if touched is None else min(SHARES * get_threads(), -(-planes // LEAST_PLANES))
         rows = Rows.listed(shares, grid.device, 1, weight=1 << 20)  # a share is a piece
     given |= {"touched": touched, "runs": runs, "count": number, "chunk": CPU_GRAIN, "shares": shares}
     given["position"] = position

@@ -1,5 +1,7 @@
 """Particles in approximate cell order: position, velocity, APIC gradients."""
 
+import itertools
+import math
 import typing
 from dataclasses import dataclass, field, replace
 
@@ -21,6 +23,7 @@ CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host adds up
 CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
 GROWTH = 1.5  # of the storage when it is full: n appended particles are copied 2 n times at most, a third of it lies idle at most
+MOST_DIGITS = 2048  # of a round of the sort
 SORT_PIECES = 32  # of the keys that are sorted: with more there is more to add up between two passes
 SORT_EVERY = 8  # steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL 2, a sort costs 25 ns
 
@@ -136,11 +139,14 @@ class Particles:
             self._found, self._total_rows, self._places = Reading(grid.device, columns), RowsMemory(), Scalar()
             self._totals = LaunchGraph(grid.device, self._launch_totals)
             self._numbering = LaunchGraph(grid.device, self._launch_numbers)
+            self._sorting, self._sort_rows, self._sort_pieces = LaunchGraph(grid.device, self._launch_sort), RowsMemory(), Scalar()
+            self._counts = wp.zeros(SORT_PIECES * (MOST_DIGITS + kernels.APART), dtype=wp.int32, device=grid.device)
         self._last: ParticleTotals | None = None
         self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
         self._memory = ListMemory(grid.device)
         self._grow(0)
+        self._publish()
         self.append(position, velocity, kept)
 
     @property
@@ -243,8 +249,8 @@ class Particles:
         """Sort the particles by the cells of another grid from now on."""
         self.grid = grid
         if self._tally is None:
-            self._totals.forget()
-            self._numbering.forget()
+            for graph in (self._totals, self._numbering, self._sorting):
+                graph.forget()
         if self.offsets is not None:
             self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
 
@@ -273,7 +279,10 @@ class Particles:
             rows = self._rows_of_totals()
             self._total_rows.take(rows.summed)
             self._places.value = rows.places
-        self._memory.take(self.count, {**self.arrays(), "key": self.key})
+            pieces = _rows_of_sort(self.count, self.grid.device)
+            self._sort_rows.take(pieces.single)
+            self._sort_pieces.value = pieces.places
+        self._memory.take(self.count, {**self.arrays(), "key": self.key, "spare": self._spare.view})
 
     def _grow(self, before: int) -> None:
         """Make room for `count` particles and more, and keep those there were `before`."""
@@ -287,6 +296,8 @@ class Particles:
         self._spare = Column(self._capacity, self.count, device)
         self.key = zeros(2 * self._capacity, wp.int32, device)
         self._order = zeros(2 * self._capacity, wp.int32, device)
+        if self._tally is None:
+            self._sorting.forget()  # which knows the halves of both
 
     def arrange(self, step: int) -> None:
         """Number the particles by cell; sort every SORT_EVERY-th step if order allows.
@@ -322,14 +333,29 @@ class Particles:
             if self.offsets is not None:
                 self.offsets.zero_()
             return
-        self.number()
-        sort_keys(self.key, self._order, self.count, grid.size.bit_length())
-        for name, column in self._columns.items():
-            launch_list(kernels.reorder_kernel, self.count, [self._order, column.view, self._spare.view], device=grid.device, cost=4)
+        if self._tally is None:
+            self._sorting.run(variant=grid.size.bit_length())
+        else:
+            self._launch_sort()
+        for name, column in self._columns.items():  # each lies where the one before it was
             self._columns[name], self._spare = self._spare, column
         self._publish()
         if self.offsets is not None:
             wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)
+
+    def _launch_sort(self) -> None:
+        """Launch the numbering, the sort of the numbers, and the move of each column to where the one before it was."""
+        device, bits = self.grid.device, self.grid.size.bit_length()
+        self._launch_numbers()
+        if device.is_cuda:
+            wp.launch(kernels.count_up_kernel, self.count, [self._order], device=device)
+            wp.utils.radix_sort_pairs(self.key, self._order, self.count, end_bit=bits)
+        else:
+            rows = replace(_rows_of_sort(self.count, device), memory=self._sort_rows)
+            sort_keys(_halves(self.key), _halves(self._order), self._counts, rows, self._sort_pieces, bits)
+        views = [self._spare.view, *(column.view for column in self._columns.values())]
+        for target, source in itertools.pairwise(views):
+            launch_list(kernels.reorder_kernel, self.count, [self._order, source, target], device=device, cost=4)
 
     def totals(self) -> ParticleTotals:
         """Return sums over the particles; bitwise reproducible, 0 without particles."""
@@ -389,38 +415,58 @@ class Particles:
         cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / grid.spacing)
         return np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin)
 
+    def cell_of(self, position: typing.Sequence[float] | np.ndarray) -> tuple[int, int, int]:
+        """Return the interior cell (x, y, z), counted from 0, of one position [m].
+
+        The position is finite; see `cells_of`.
+        """
+        grid = self.grid
+        x, y, z = (
+            min(max(math.floor(float(v) / grid.spacing), 0), n - 1) - o
+            for v, n, o in zip(position, grid.domain_counts, grid.origin, strict=True)
+        )
+        return x, y, z
+
     def arrays(self) -> dict[str, wp.array]:
         """Return the arrays of the particles by name."""
         return {name: column.view for name, column in self._columns.items()}
 
 
-def sort_keys(key: wp.array, order: wp.array, count: int, bits: int) -> None:
-    """Sort the first keys in place, by a radix sort that is stable.
+def _rows_of_sort(count: int, device: wp.Device) -> Rows:
+    """Return the pieces in which keys are sorted."""
+    return Rows.entries(count, device, max(CPU_GRAIN, -(-count // SORT_PIECES)), weight=4)
+
+
+def _halves(array: wp.array) -> tuple[wp.array, wp.array]:
+    half = array.size // 2
+    return array[:half], array[half:]
+
+
+def sort_keys(
+    keys: tuple[wp.array, wp.array], order: tuple[wp.array, wp.array], counts: wp.array, rows: Rows, pieces: int | Scalar, bits: int
+) -> None:
+    """Launch the sort of keys in place on the CPU, by a radix sort that is stable.
 
     Args:
-        key: int32, not negative, at least 2 count entries, of which those from `count` on are scratch memory.
-        order: int32, as many entries; receives where each key was.
-        count: keys.
+        keys: int32, not negative, and scratch memory of the same size.
+        order: int32, which receives where each key was, and scratch memory.
+        counts: int32, scratch memory for `pieces` of 2048 digits and `APART` more.
+        rows: of the keys, a piece a task.
+        pieces: how many there are.
         bits: that keys have at most.
     """
-    device = key.device
-    if device.is_cuda:
-        wp.launch(kernels.count_up_kernel, count, [order], device=device)
-        wp.utils.radix_sort_pairs(key, order, count, end_bit=bits)
-        return
+    device = counts.device
     rounds = 2 * -(-bits // 22)  # an even number: the last one ends where the keys were; 2048 digits of a round stay in the L1 cache
     each = -(-bits // rounds)
-    rows = Rows.entries(count, device, max(CPU_GRAIN, -(-count // SORT_PIECES)), weight=4)
-    pieces, digits, before = rows.places, 1 << each, None
-    counts = wp.empty(pieces * (digits + kernels.APART), dtype=wp.int32, device=device)
-    here, there = (key[:count], order[:count]), (key[count : 2 * count], order[count : 2 * count])
+    (here, there), (moved_to, moved_from), before = keys, order[::-1], None
     for shift in range(0, rounds * each, each):
-        kernels.SORT_COUNT.bind(rows, key=here[0], counts=counts, digits=digits, shift=shift).launch()
+        digits = 1 << each
+        kernels.SORT_COUNT.bind(rows, key=here, counts=counts, digits=digits, shift=shift).launch()
         kernels.SORT_BEGIN.bind(Rows.entries(1, device), counts=counts, digits=digits, pieces=pieces).launch()
         kernels.SORT_PLACE.bind(
-            rows, key=here[0], order=before, sorted=there[0], moved=there[1], counts=counts, digits=digits, shift=shift
+            rows, key=here, order=before, sorted=there, moved=moved_to, counts=counts, digits=digits, shift=shift
         ).launch()
-        here, there, before = there, here, there[1]
+        here, there, before, moved_to, moved_from = there, here, moved_to, moved_from, moved_to
 
 
 def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:

@@ -14,9 +14,10 @@ TOTAL = KERNELS["warp_lcp.grid.particles.total"]
 ADD_IN_ORDER = KERNELS["warp_lcp.grid.particles.add_in_order"]
 
 APART = 16  # numbers between the counts of two pieces, so that they do not share a set of the cache
-SORT_COUNT, SORT_BEGIN, SORT_PLACE = (
-    KERNELS.kernel(f"warp_lcp.grid.particles.sort_{which}", constants={"APART": APART}) for which in ("count", "begin", "place")
-)
+_SORT = {"APART": APART}
+SORT_COUNT = KERNELS.kernel("warp_lcp.grid.particles.sort_count", constants=_SORT)
+SORT_BEGIN = KERNELS.kernel("warp_lcp.grid.particles.sort_begin", constants=_SORT)
+SORT_PLACE = KERNELS.kernel("warp_lcp.grid.particles.sort_place", constants=_SORT)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")

@@ -8,6 +8,7 @@ of the larger grid, so that a point has the same in all parts, and lies in store
 """
 
 import ctypes
+import struct
 import typing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,9 +20,9 @@ import warp as wp
 from warp_lcp.grid.particle_loops import GridPlacement
 from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
-from warp_lcp.rows.layout import BLANK, grain
-from warp_lcp.rows.memory import RowsMemory, Scalar, Slot
-from warp_lcp.rows.program import Launch, clear, launch_ranges
+from warp_lcp.rows.layout import grain
+from warp_lcp.rows.memory import DeviceRows, RowsMemory, Scalar, Slot, larger
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch_ranges
 from warp_lcp.settings import renamed_names
 
 if typing.TYPE_CHECKING:
@@ -71,6 +72,11 @@ def cell_index(coordinate: float, count: int):
     return wp.min(int(inside(coordinate, count)), count)
 
 
+def _corners(choose: typing.Callable[[int, int], int], one: tuple[int, int, int], other: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Return the smaller or the larger of two corners' coordinates, `choose` being min or max."""
+    return choose(one[0], other[0]), choose(one[1], other[1]), choose(one[2], other[2])
+
+
 @dataclass(frozen=True)
 class Window:
     """Box of stored cells, low <= (k, j, i) < high, over which kernels run.
@@ -96,10 +102,10 @@ class Window:
 
     def common(self, other: "Window") -> "Window | None":
         """Return the intersection with another window; None if it is empty."""
-        low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
-        if not (low < high).all():
+        low, high = _corners(max, self.low, other.low), _corners(min, self.high, other.high)
+        if low[0] >= high[0] or low[1] >= high[1] or low[2] >= high[2]:
             return None
-        return replace(Window.of(low.tolist(), high.tolist(), self.device), near=self.near)
+        return Window(low, high, self.device, self.near)
 
     @cached_property
     def cells(self) -> typing.Any:
@@ -223,22 +229,22 @@ class Window:
         launch_ranges(kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered)
 
     @property
+    def identity(self) -> typing.Hashable:
+        """By what recorded launches tell windows apart."""
+        return self.low, self.high, id(self.near)
+
+    @property
     def now(self) -> "Window":
         """The window itself; of an `ActiveWindow` the one that it stands for."""
         return self
 
 
-NO_CELLS = CellRange()
+NO_CELLS, BOX_OF_CELLS = CellRange(), struct.Struct("7i")  # members of a CellRange from `rows` on
 
 
-def _native(struct: typing.Any) -> typing.Any:
+def _native(made: typing.Any) -> typing.Any:
     """Return the type of a Warp struct's memory."""
-    return type(struct.__ctype__())
-
-
-def _set(native: typing.Any, members: dict[str, int]) -> None:
-    for name, value in members.items():
-        setattr(native, name, value)
+    return type(made.__ctype__())
 
 
 class _RangeMemory:
@@ -248,15 +254,29 @@ class _RangeMemory:
         self.range, self.tasks = _native(CellRange())(), ctypes.c_int64()
         self.first = 0, ctypes.addressof(self.range), ctypes.sizeof(self.range)
         self.sized = ctypes.addressof(self.tasks)
+        self.extent = self.room = (1, 1, 1)  # threads of a launch on CUDA: now, and at most so far
+
+    def take_dim(self, cells: typing.Any, dim: tuple[int, int, int]) -> None:
+        """Take a CellRange over on CUDA, with the threads that share it."""
+        self.take(cells, dim[0] * dim[1] * dim[2])
+        self.extent, self.room = dim, larger(self.room, dim)
 
     def take(self, cells: typing.Any, tasks: int) -> None:
         """Take a CellRange over."""
         ctypes.memmove(self.first[1], ctypes.addressof(cells.__ctype__()), self.first[2])
         self.tasks.value = tasks
 
+    def take_box(self, rows: int, k: int, j: int, i: int, end: int, tasks: int) -> None:
+        """Take a box of whole rows over, see `CellRange`."""
+        ctypes.memset(self.first[1], 0, self.first[2])
+        BOX_OF_CELLS.pack_into(self.range, _native(NO_CELLS).rows.offset, rows, 1, k, j, i, end, end - i)
+        self.tasks.value = tasks
+
 
 class ActiveWindow(Window):
-    """The window of the current step, in memory: launches that are recorded with it visit the window of the step in which they run.
+    """Window of the current step, in memory that recorded launches read.
+
+    A launch that is recorded with it visits the window of the step in which it runs.
 
     Args:
         window: the first one.
@@ -271,16 +291,20 @@ class ActiveWindow(Window):
     pieces: Scalar
     hulls: Slot
     _rows: tuple[RowsMemory, RowsMemory]  # of passes, of passes that sum
+    _sums: dict[int, DeviceRows]  # of passes that sum over columns of so many planes, on CUDA
     _ranges: tuple[_RangeMemory, _RangeMemory]  # of kernels for cells, for rows
     _now: Window
 
     def __init__(self, window: Window) -> None:
-        memory = {"_rows": (RowsMemory(), RowsMemory()), "_ranges": (_RangeMemory(), _RangeMemory()), "hulls": Slot()}
+        rows = DeviceRows if window.device.is_cuda else RowsMemory
+        memory = {"_rows": (rows(), rows()), "_sums": {}, "_ranges": (_RangeMemory(), _RangeMemory()), "hulls": Slot()}
         numbers = {"first": (Scalar(), Scalar()), "sizes": (Scalar(), Scalar()), "pieces": Scalar()}
         for name, value in {"device": window.device, **memory, **numbers, "_now": None}.items():
             object.__setattr__(self, name, value)  # which a dataclass that is frozen does not allow otherwise
         self.move_to(window)
 
+    __eq__, __hash__ = object.__eq__, object.__hash__
+    identity = property(id)
     low = property(lambda self: self._now.low)
     high = property(lambda self: self._now.high)
     near = property(lambda self: self._now.near)
@@ -296,28 +320,47 @@ class ActiveWindow(Window):
         if before is not None and before == window and before.near is None and window.near is None:
             return
         if self.device.is_cuda:
+            if LaunchGraph.on_device:
+                self._move_on_device(window)
             return
         (k, j, i), planes, rows, end = window.low, *window.rows, window.high[2]
         self.pieces.value = 0
         for number, value in zip((*self.first, *self.sizes), (k, j, planes, rows), strict=True):
             number.value = value
         if window.near is None:  # as `Rows.box` and `Window.cells` have it: a task takes a row
-            box = {"planes": planes, "rows": rows, "nx": end - i, "grain": max(end - i, 1), "chunks": int(end > i)}
-            cells = {"rows": rows, "chunks": 1, "k": k, "j": j, "i": i, "end": end, "grain": end - i}
+            some = int(end > i)
             for memory in self._rows:
-                memory.take(BLANK, window.low)
-                memory.tasks.value = planes * rows * box["chunks"]
-                _set(memory.layout, box | {"slab": 1})
+                memory.take_box(end - i, rows, planes, max(end - i, 1), some, window.low)
             for of_cells in self._ranges:
-                of_cells.take(NO_CELLS, planes * rows)
-                _set(of_cells.range, cells)
+                of_cells.take_box(rows, k, j, i, end, planes * rows)
             return
         for memory, rows_ in zip(self._rows, (window._shared, window._whole), strict=True):
-            memory.take(rows_.single, window.low)
+            memory.take(rows_.single)  # whose pieces have their own planes and rows
         for of_cells, pieces in zip(self._ranges, (window._pieces, window._hulls), strict=True):
             of_cells.take(_in_part(pieces), len(pieces))
         self.hulls.point_to(window._hulls)
         self.pieces.value = len(window._hulls)
+
+    def _move_on_device(self, window: Window) -> None:
+        for memory, rows in zip(self._rows, (window._shared, window._whole), strict=True):
+            memory.take(rows.single, window.low)
+        for planes, memory in self._sums.items():
+            memory.take(window.rows_of_sums(planes).summed, window.low)
+        whole = window._cells(max(window.high[2] - window.low[2], 1))
+        for of_cells, cells in zip(self._ranges, (window.cells, whole), strict=True):
+            of_cells.take_dim(cells, (*window.rows, cells.chunks))
+
+    def rows_of_sums(self, planes: int) -> Rows:
+        """Return the rows of a pass that sums."""
+        if not self.device.is_cuda:
+            return super().rows_of_sums(planes)
+        rows = self._now.rows_of_sums(planes)
+        if planes not in self._sums:
+            memory = self._sums[planes] = DeviceRows()
+            layers, rows_, chunks = self._ranges[0].room
+            memory.room = -(-layers // planes), rows_, chunks
+            memory.take(rows.summed, self.low)
+        return replace(rows, memory=self._sums[planes])
 
     @property
     def hull_pieces(self) -> typing.Any:
@@ -346,8 +389,9 @@ class ActiveWindow(Window):
             dim, cost = (1, 1, cells.chunks), self._now._visited // max(cells.chunks, 1)
         ordered = getattr(kernel, "ordered", False)
         launch_ranges(
-            kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered, first=memory.first, sized=memory.sized
-        )
+            kernel, dim, cost, [cells, *inputs], device=self.device, launch=launch, ordered=ordered,
+            first=memory.first, sized=memory.sized, extent=memory,
+        )  # fmt: skip
 
 
 class DirtyRegion:
@@ -374,10 +418,9 @@ class DirtyRegion:
         This one becomes the last. None: all cells.
         """
         now, last = (window and window.now.common(self.all)) or self.all, self._last
-        low, high = np.minimum(now.low, last.low), np.maximum(now.high, last.high)
         self._last = now
         near = None if now.near is None or last.near is None else now.near | last.near
-        return replace(Window.of(low.tolist(), high.tolist(), now.device), near=near)
+        return Window(_corners(min, now.low, last.low), _corners(max, now.high, last.high), now.device, near)
 
 
 def _in_part(pieces: wp.array) -> typing.Any:
@@ -527,10 +570,10 @@ class StaggeredGrid:
         """All cells without the ring."""
         return self.window((1, 1, 1), self.counts)
 
-    def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0) -> Window:
-        """Return the window of cells from low to high, grown and clipped.
+    def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0, shift: int = 0) -> Window:
+        """Return the window of cells from low to high, moved, grown and clipped.
 
-        (x, y, z), both included.
+        (x, y, z), both included; moved by `shift` along each axis.
 
         Of a box beyond what is stored a layer of what is nearest is left.
         """
@@ -540,8 +583,8 @@ class StaggeredGrid:
                 first.append(1)
                 last.append(2)
                 continue
-            first.append(min(max(int(low[axis]) - grow, 0), self.counts[axis] + 1))
-            last.append(max(min(int(high[axis]) + grow + 1, self.counts[axis] + 2), first[-1] + 1))
+            first.append(min(max(int(low[axis]) + shift - grow, 0), self.counts[axis] + 1))
+            last.append(max(min(int(high[axis]) + shift + grow + 1, self.counts[axis] + 2), first[-1] + 1))
         return Window.of(first, last, self.device)
 
 

@@ -62,10 +62,12 @@ class WindowTally:
         """Say that a recorded `take` has run."""
         if self._tally is None:
             self._reading.changed()
+        else:
+            self._tally.changed()
 
     def on_device(self) -> Any:
-        """Return what is found, a number a column, where it is on a GPU; None on the CPU."""
-        return None if self._tally is None else self._tally.found
+        """Return what is found, a number a column, where kernels find it."""
+        return self._reading.array if self._tally is None else self._tally.found
 
     def read(self) -> list[float]:
         """Return what the last launch found."""

@@ -245,6 +245,7 @@ class CutBoundary:
         self._displacement = LaunchGraph(grid.device, self._displace)
         self._motions, self._bounds = cut.motions, [solid.geometry.bounds() for solid in cut.solids if solid.motion is not None]
         self.kinks = tuple(time for motion in self._motions.motions for time in kinks(motion))
+        self._walls = LaunchGraph(grid.device, self._find_walls)
         self._find_walls()
         self._join_sides()
 
@@ -312,7 +313,7 @@ class CutBoundary:
         if self.moves:
             self._time = time
             self.cut.place(time)
-            self._find_walls()
+            self._walls.run()
             self._join_sides()
 
     def shapes(self) -> Sequence[Geometry]:

@@ -231,14 +231,14 @@ class DensityCorrection:
         if result.status in (wl.SolveStatus.INFEASIBLE, wl.SolveStatus.NON_FINITE):  # a closed room is too full: there is no way out
             self.x.zero_()
             return Correction(result, over_full, most)
-        self._take(result.x)
         self._way.value = share * self.grid.spacing
-        self._displacing.run()
+        self._displacing.run(result.x, variant=result.x.ptr)
         self._displace_particles(particles)
         return Correction(result, over_full, most)
 
-    def _launch_displacement(self) -> None:
+    def _launch_displacement(self, x: wp.array) -> None:
         """Launch the computation of the displacement on all faces."""
+        self._take(x)
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None

@@ -14,10 +14,12 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import flight_kernels as kernels
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.rows.program import LaunchGraph, clear
 from warp_lcp.rows.readings import Reading
 
 NARROW = 1.0  # [cells^2] the least second moment about an axis, a particle, of a body whose turning the grid resolves
 Sums = np.ndarray  # of `kernels.add_up`, float64, shape (bodies, COLUMNS)
+NOTHING: Sums = np.zeros((0, kernels.COLUMNS))
 
 
 class Flights:
@@ -53,7 +55,8 @@ class Flights:
         self._flight.straight = not coheres
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
         self._flight.origin = wp.vec3i(*grid.origin)
-        self._before: Sums = np.zeros((0, kernels.COLUMNS))
+        self._before: Sums = NOTHING
+        self._growing = LaunchGraph(grid.device, self._launch_growth)
 
     def find(self, window: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
         """Look for bodies, without waiting for their number; arguments as of `begin`, which does it where nobody has."""
@@ -61,14 +64,18 @@ class Flights:
 
     def _grow(self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
         """Grow the trees of a window's cells, and of those `around` it below whose faces they are."""
+        self._growing.run(window, around, weights, kind, variant=window.near is None)
+        self._count.changed()
+        self._found = True
+
+    def _launch_growth(self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
+        """Launch what grows the trees, and numbers the bodies."""
         named = {"parent": self._parent, "held": self._held, "several": self._several}
         around.run(kernels.ALONE, kind=kind, **named)
         window.run(kernels.UNITE, **dict(zip("uvw", [*weights, None], strict=False)), parent=self._parent)
         window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, **named)
-        self._count.array.zero_()
+        clear(self._count.array)
         around.run(kernels.NUMBER, kind=kind, **named, number=self._number, count=self._count.array)
-        self._count.changed()
-        self._found = True
 
     def begin(
         self, particles: Particles, window: Window, weights: Sequence[wp.array], kind: wp.array, dt: float, change: np.ndarray
@@ -86,7 +93,7 @@ class Flights:
         if not self._found:
             self.find(window, weights, kind)
         self._found, bodies = False, self._bodies()
-        self._before = np.zeros((bodies, kernels.COLUMNS))
+        self._before = np.zeros((bodies, kernels.COLUMNS)) if bodies else NOTHING
         if bodies == 0:
             return 0
         self._flight.who, self._flight.body = self._board(particles)

@@ -29,22 +29,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid.advection import CENTERS, carry_field
 from warp_lcp.grid.particles import Particles, ParticleTotals
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles
 from warp_lcp.material import narrow_band_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.resample import PLASTIC
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, clear, is_recording
 
 BEYOND = 3.0  # cells below the band that depths are told apart: what is carried into it must have a slope
 DEEP = 2.0  # cells below the surface from which on a cell counts as full whatever particles say
 REACH = 1.5  # of a cell's kernel, in cells
+FALLS = 2  # passes over rows, back and forth, after which most depths are found
 UNEVEN = 0.1  # how far the interior's density may differ from that at rest
 
 
@@ -95,7 +99,13 @@ class NarrowBand:
         self.held = self.fresh = 0
         self._numbered = kernels.Numbered()
         self._numbered.origin, self._numbered.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
-        self._window, self._own, self._before = grid.everywhere, grid.domain, (0, 0, 0)
+        self._own, self._before = grid.domain, (0, 0, 0)
+        self._window, self._owned, self._inner = (ActiveWindow(w) for w in (grid.everywhere, grid.domain, grid.domain))
+        self._last = Scalar(), Scalar()  # plane and row of the window
+        self._each, self._shift, self._at_rest, self._way = (Scalar() for _ in range(4))
+        launches = (self._launch_depth, self._fall, self._launch_quota, self._launch_carry)
+        self._depths, self._falling, self._quota, self._carrying = (LaunchGraph(grid.device, launch) for launch in launches)
+        self._move_to(grid.everywhere)
         self.interior = self._summed(grid.everywhere)
 
     @property
@@ -169,7 +179,9 @@ class NarrowBand:
             density: of the particles, in units of that at rest (updated).
         """
         least = max(self.width - REACH, self.full)
-        window.launch(kernels.fill_kernel, [least, self.density, self.depth, self.boundary.capacity, density])
+        if not is_recording():
+            self._at_rest.value = self.density
+        window.launch(kernels.fill_kernel, [least, self._at_rest, self.depth, self.boundary.capacity, density])
 
     def exchange(
         self, particles: Particles, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array, step: int,
@@ -188,9 +200,11 @@ class NarrowBand:
             step: number of the step, which the random part of new places depends on.
             saved: velocity as it came from the particles [m/s], for FLIP.
         """
-        self._window = window
-        grid, each = self.grid, self.particles_a_cell * self.density
-        self._measure(window, kind, phi, contact)
+        self._move_to(window)
+        grid = self.grid
+        self._each.value = self.particles_a_cell * self.density
+        self._depths.run(kind, phi, contact, variant=phi is None)
+        self._relax(fallen=FALLS)
         depths, removed = [self._now, self.depth], 0
         if particles.count:
             marks = particles.marks
@@ -198,25 +212,13 @@ class NarrowBand:
             wp.launch(kernels.leave_kernel, particles.count, [self.width, particles.key, *flat, marks], device=grid.device)
             removed = particles.remove(marks)
         self.held += self._of_all(removed)
-        self._total.zero_()
         shift = (self._steps * step) % 1.0
-        quota = [
-            self._numbered,
-            self.width,
-            each,
-            self._seeds,
-            float(shift[0]),
-            self.boundary.base,
-            *depths,
-            self._total.reshape(grid.shape),
-        ]
-        own = window.common(self._own)
-        if own is not None:
-            own.launch(kernels.quota_kernel, quota)
+        self._shift.value = float(shift[0])
+        self._quota.run(variant=self._here)
         wp.utils.array_scan(self._total, self._total, inclusive=True)
         self.fresh = int(self._total[-1:].numpy()[0])
-        if own is not None and self.fresh:
-            self._seed(particles, own, shift, saved)
+        if self._here and self.fresh:
+            self._seed(particles, self._owned, shift, saved)
         self.held -= self._of_all(self.fresh)
 
     def carry(self, velocity: list[wp.array], dt: float) -> None:
@@ -228,15 +230,28 @@ class NarrowBand:
             velocity: of each component on the faces [m/s].
             dt: time step [s].
         """
-        window = self._window
-        self.depth.zero_()
-        more = {"level": self._now, "least": 0.0, "before": self._before}
-        carry_field(self.grid, window, velocity, dt, self._now, self.depth, axis=CENTERS, **more)
-        for axis, (field, out) in enumerate(zip(velocity, self.velocity, strict=True)):
-            out.zero_()
-            carry_field(self.grid, window, velocity, dt, field, out, axis=axis, **more)
+        self._way.value = dt / self.grid.spacing
+        self._carrying.run(velocity, variant=self._here)
+        self.interior = self._summed(self._window, launched=True)
+        self._at_rest.value = self.density
+
+    def _launch_carry(self, velocity: list[wp.array]) -> None:
+        """Launch the advection, and the sums over the cells without particles."""
+        more: dict[str, Any] = {"level": self._now, "least": 0.0, "before": self._before}
+        more |= {"grid": self.grid, "window": self._inner, "velocity": velocity, "way": self._way}
+        for axis, field, out in [(CENTERS, self._now, self.depth), *zip(range(3), velocity, self.velocity, strict=False)]:
+            clear(out)
+            carry_field(field=field, out=out, axis=axis, **more)
         self._join(self.depth, *self.velocity)
-        self.interior = self._summed(window)
+        if self._here:
+            self._launch_sums(self._owned)
+
+    def _launch_quota(self) -> None:
+        """Launch what finds how many fresh particles each cell gets."""
+        clear(self._total)
+        where = [self.boundary.base, self._now, self.depth, self._total.reshape(self.grid.shape)]
+        if self._here:
+            self._owned.launch(kernels.quota_kernel, [self._numbered, self.width, self._each, self._seeds, self._shift, *where])
 
     def with_interior(self, totals: ParticleTotals) -> ParticleTotals:
         """Return sums over the particles and the interior.
@@ -295,24 +310,49 @@ class NarrowBand:
         self.held = 0
         self.interior = self._summed(self.grid.everywhere)
 
+    def _move_to(self, window: Window) -> None:
+        """Have launches visit a window."""
+        self._window.move_to(window)
+        # something is carried to the domain and the ring's upper layer: faces below the first cell lie in the wall
+        self._inner.move_to(Window.of([max(start, 1) for start in window.low], window.high, window.device))
+        for number, end in zip(self._last, window.high, strict=False):
+            number.value = end - 1
+        own = window.common(self._own)
+        self._here = own is not None  # whether any of its cells are this grid's own
+        if own is not None:
+            self._owned.move_to(own)
+
     def _measure(self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
-        """Find how deep cells lie, up to `BEYOND` below the band."""
+        """Find how deep a window's cells lie, up to `BEYOND` below the band."""
+        self._move_to(window)
+        self._shore(kind, phi, contact)
+        self._relax()
+
+    def _shore(self, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
+        """Launch the depth of what is no deeper than a cell, from which `_relax` finds that of others."""
         planes, most = self.grid.planes, self.width + BEYOND
         inputs = [planes, most, kind, phi, contact, self._keep, self.boundary.distance, self._now]
         self.grid.everywhere.launch(kernels.shore_kernel, inputs)
-        self._relax(window)
 
-    def _relax(self, window: Window) -> None:
-        """Let the depth of a window's cells fall to what their neighbors allow."""
-        planes, most = self.grid.planes, self.width + BEYOND
-        last = window.high[0] - 1, window.high[1] - 1
-        for number in range(math.ceil(most) + 1):
-            if self.grid.device.is_cpu:
-                self._changed.zero_()
-            plane, row = (0, 0) if number % 2 else last
-            window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=planes, last_plane=plane, last_row=row)
-            if self.grid.device.is_cpu and self._changed.numpy()[0] == 0:  # rows one after the other are done in three passes or so
+    def _launch_depth(self, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
+        """Launch the depth, but for falls after the first ones."""
+        self._shore(kind, phi, contact)
+        for number in range(FALLS):
+            self._fall(number % 2 == 1)
+
+    def _fall(self, forth: bool) -> None:
+        """Launch a pass in which the depth of the window's cells falls to what their neighbors allow."""
+        if self.grid.device.is_cpu:
+            clear(self._changed)
+        last: dict[str, Any] = dict(zip(("last_plane", "last_row"), (0, 0) if forth else self._last, strict=True))
+        self._window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=self.grid.planes, **last)
+
+    def _relax(self, fallen: int = 0) -> None:
+        """Let the depth fall until it is what neighbors allow, after so many passes."""
+        for number in range(fallen, math.ceil(self.width + BEYOND) + 1):
+            if number and self.grid.device.is_cpu and self._changed.numpy()[0] == 0:  # rows one after the other: three passes or so
                 break
+            self._falling.run(number % 2 == 1, variant=number % 2 == 1)
 
     def _of_all(self, count: int) -> int:
         """Return how many there are of what this grid has so many of."""
@@ -332,14 +372,18 @@ class NarrowBand:
             tail = particles.position[first:], particles.velocity[first:]
             faces_to_particles(grid, list(saved), *tail, [])
 
-    def _summed(self, window: Window) -> ParticleTotals:
-        """Add up the cells without particles."""
+    def _launch_sums(self, box: Window) -> None:
+        """Launch the sums over a box's cells without particles."""
         u, v, w = [*self.velocity, None][:3]
-        inputs = [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums]
+        box.launch_rows(kernels.sum_kernel, [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums])
+
+    def _summed(self, window: Window, *, launched: bool = False) -> ParticleTotals:
+        """Add up the cells without particles, once the sums over rows are launched."""
         box = window.common(self._own)
         if box is None:
             return ParticleTotals()
-        box.launch_rows(kernels.sum_kernel, inputs)
+        if not launched:
+            self._launch_sums(box)
         rows = box.rows_of(self._sums).reshape(-1, kernels.COLUMNS)
         cells, dx = int(rows[:, 0].sum()), self.grid.spacing
         if cells == 0:

@@ -118,10 +118,12 @@ class ParticleSimulation(ParticleCheckpoints):
         scene, self.grid, self.boundary = self.scene, grid, parts.boundary
         self.sources, self.band = parts.sources, parts.band
         self._faces_know = False  # the velocity of the particles, around them
+        self._columns: tuple[str, ...] | None = None  # of the log, once they are asked for
+        self._ends = grid.extent - 0.5 * MARGIN * grid.spacing  # [m]; a tent at the very end would reach beyond what is stored
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
-        at_once = self.shared or self.band is not None
+        at_once = self.shared
         self._transfer_to_grid = LaunchGraph(grid.device, self._launch_particles_to_grid, at_once=at_once)
-        self._extrapolation = LaunchGraph(grid.device, self._continue, at_once=at_once)
+        self._extrapolation = LaunchGraph(grid.device, self._launch_extrapolation, at_once=at_once)
         self._transfer_to_particles = LaunchGraph(grid.device, self._launch_grid_to_particles, at_once=at_once)
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
@@ -183,7 +185,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
     def _follow(self, totals: ParticleTotals, dt: float) -> None:
         """Lay another grid if the material leaves this one in a step, or has become much smaller."""
-        if self._coverage is None:
+        if self._coverage is None or (self._coverage.domain == self.grid and not self._coverage.active and not self.scene.domain.boundless):
             return
         way = travel(totals.max_speed, float(np.linalg.norm(self.gravity)), dt, self.grid.spacing)
         grow = self.reach + 3 + way  # `window`, a cell off the grid's end, where the step brings the material
@@ -273,8 +275,8 @@ class ParticleSimulation(ParticleCheckpoints):
 
     def _reached(self, totals: ParticleTotals) -> Window:
         """Return the cells that the particles can touch in a step."""
-        low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
-        box = self.grid.window(low, high, grow=self.reach + 2)
+        low, high = (self.particles.cell_of(corner) for corner in (totals.low, totals.high))
+        box = self.grid.window(low, high, grow=self.reach + 2, shift=1)
         return box if self.vicinity is None else self.vicinity.window(box, self.particles, self.reach + 2, self.step_count)
 
     def top_speed(self, totals: ParticleTotals) -> float:
@@ -310,8 +312,11 @@ class ParticleSimulation(ParticleCheckpoints):
         """
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
             self._extrapolation.run(window, list(known), kind, contact, self._layer_filled(), variant=window.near is None)
-            if self.sources is not None:
-                self.sources.hold(self.velocity, [])
+
+    def _launch_extrapolation(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
+        self._continue(window, known, kind, contact, join)
+        if self.sources is not None:
+            self.sources.hold(self.velocity, [])
 
     def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
         """Continue the velocity among the boundary's walls; `join` is called after each layer."""
@@ -408,7 +413,10 @@ class ParticleSimulation(ParticleCheckpoints):
     def logged(self, row: Row) -> Row:
         """Return the entries of a row that the log has columns for, in their order."""
         bodies = self.bodies.row() if self.bodies is not None else {}
-        return {name: (row | bodies).get(name) for name in self.columns()}
+        found = row | bodies
+        if self._columns is None:
+            self._columns = self.columns()
+        return {name: found.get(name) for name in self._columns}
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns, see `warp_lcp.material.particle_log.columns`."""
@@ -439,9 +447,11 @@ class ParticleSimulation(ParticleCheckpoints):
         """
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = self.particles.totals()
-        axes = slice(self.grid.dimension)
-        end = self.grid.extent - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored
-        if totals.finite and (totals.low[axes] >= 0.0).all() and (totals.high[axes] <= end[axes]).all():
+        end = self._ends
+        inside = all(
+            low >= 0.0 and high <= most for low, high, most in zip(totals.low[: self.grid.dimension], totals.high, end, strict=False)
+        )
+        if totals.finite and inside:
             return totals if self.band is None else self.band.with_interior(totals)
         raise SimulationFailed(f"{when} step {self.step_count}: {self._trouble(totals, end)}")
 

@@ -16,6 +16,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import sources_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows.program import LaunchGraph
 
 NOW = 1e-9  # s: a time that a step has been cut to may be off by its rounding
 GRAZED = 1e-9  # of a way: less than that in a cell is rounding
@@ -99,6 +100,8 @@ class Sources:
         if len(cells):
             self._window = grid.window((cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1)
         self._moving_walls = boundary.velocity if not boundary.open else []
+        self._running: list[bool] | None = None  # what the device knows of it
+        self._imposing = LaunchGraph(device, self._impose)
 
     def top_speed(self, time: float, span: float) -> float:
         """Return the largest speed of sources that run in a time span [m/s].
@@ -117,10 +120,11 @@ class Sources:
             velocity: u* of each component [m/s] (updated).
             kind: int8 of AIR, FLUID, SOLID (updated).
         """
-        self._fields[2].assign(np.array([source.runs(time) for source in self.sources], dtype=np.uint8))
-        self._impose(velocity, supply=True, walls=self._moving_walls, known=[])
-        if self._window is not None:
-            self._window.launch(kernels.occupy_kernel, [*self._fields, 0, kind])
+        running = [source.runs(time) for source in self.sources]
+        if running != self._running:
+            self._fields[2].assign(np.array(running, dtype=np.uint8))
+            self._running = running
+        self._imposing.run(velocity, [], kind, True, variant=(velocity[0].ptr, 0, kind.ptr, True))
 
     def hold(self, velocity: Faces, known: Faces, shown: wp.array | None = None) -> None:
         """Set the velocity of the running sources again.
@@ -132,9 +136,8 @@ class Sources:
             known: int8 of each component (updated): 1 on those faces; or empty.
             shown: int8 (updated): the sources' cells become FLUID.
         """
-        self._impose(velocity, supply=False, walls=[], known=known)
-        if shown is not None and self._window is not None:
-            self._window.launch(kernels.occupy_kernel, [*self._fields, 1, shown])
+        own = velocity[0].ptr, known[0].ptr if known else 0, 0 if shown is None else shown.ptr
+        self._imposing.run(velocity, known, shown, False, variant=(*own, False))
 
     def emit(self, particles: Particles, before: float | None, now: float) -> int:
         """Add the incoming particles and return their number.
@@ -256,12 +259,16 @@ class Sources:
         low, high = (corner[::-1] + np.array(self.grid.origin) for corner in (cells.min(axis=0), cells.max(axis=0) + 1))
         return low * self.grid.spacing, high * self.grid.spacing
 
-    def _impose(self, velocity: Faces, *, supply: bool, walls: Faces, known: Faces) -> None:
+    def _impose(self, velocity: Faces, known: Faces, cells: wp.array | None, supply: bool) -> None:
+        """Launch what `supply` does, or what `hold` does."""
+        walls = self._moving_walls if supply else []
+        if self._window is None:
+            return
         for axis, field in enumerate(velocity):
-            if self._window is None:
-                continue
             given = [field, walls[axis] if walls else None, known[axis] if known else None]
             self._window.launch(kernels.impose_kernel, [axis, int(supply), *self._fields, self._velocities, *given])
+        if cells is not None:
+            self._window.launch(kernels.occupy_kernel, [*self._fields, int(not supply), cells])
 
 
 def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) -> np.ndarray:

@@ -87,11 +87,11 @@ def _as_stencil(A: SparseOperator, rows: CompressedRows, shape: tuple[int, int, 
         middle[offsets[column - row]] += value
     kept = full & ((1 << 13) - 1) if A.symmetric else full & ~(1 << 13)
     where, d = Rows.of(padding, device), padding.zeros(wp.float64, device)
-    sums, entries, on_device = Sums(where, 4), RowEntries(rows.indptr, rows.indices, rows.values), wp.array(middle, device=device)
+    sums, matrix, on_device = Sums(where, 4), RowEntries(rows.indptr, rows.indices, rows.values), wp.array(middle, device=device)
 
     def recognize(block: wp.array[Any] | None) -> np.ndarray:
         return sums.of(
-            RECOGNIZE, entries, middle=on_device, made=d, nx=nx, ny=ny, nz=nz, full=full, kept=kept, size=padding.size, weights=block
+            RECOGNIZE, matrix, middle=on_device, made=d, nx=nx, ny=ny, nz=nz, full=full, kept=kept, size=padding.size, weights=block
         )
 
     wrong, centers, differ, positive = recognize(None)

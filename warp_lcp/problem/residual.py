@@ -76,15 +76,19 @@ class NaturalResidual:
         """Compute y = A x + b."""
         self.problem.apply_plus(x, self.problem.b, self.y)
 
-    def start(self, x: wp.array[Any], *, keep: bool, launch: Launch = wp.launch) -> None:
+    def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Project x onto the bounds, or set it to clip(0, l, u).
 
         0 where there is no unknown.
         """
-        p = self.problem
-        if self._diagonal_of is not None and self._diagonal_of != version_of(p.A):
-            self._diagonal_of = version_of(p.A)
+        if self._diagonal_of is not None and self._diagonal_of != version_of(self.problem.A):
+            self._diagonal_of = version_of(self.problem.A)
             self.rescale()
+        self.project(x, keep=keep)
+
+    def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = wp.launch) -> None:
+        """Launch the projection of x onto the bounds, or of 0, as `start` does."""
+        p = self.problem
         for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
             p.bounds.follow(x)
             WITHIN.bind(Rows.of_fields(p.layout), bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=keep).launch(launch)

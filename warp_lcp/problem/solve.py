@@ -408,7 +408,8 @@ class _LoopInBox(_Loop):
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
         """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
-        if hasattr(self.work, "begin_ahead") and self._begin_ahead(self.work, x0):
+        work: Any = self.work
+        if hasattr(work, "begin_ahead") and self._begin_ahead(work, x0):
             return None
         x, residual = self.work.x, self.residual
         guess = None if x0 is None else self._guess(x0)

@@ -274,6 +274,28 @@ class BodyStates(Sequence[RigidBody]):
         spin = spins(self.rotation, self.inverse_inertia, self.angular_momentum)
         return np.concatenate([self.momentum / self.mass[:, None], spin], axis=1)
 
+    def inverse_masses(self, dimension: int) -> np.ndarray:
+        """Return `RigidBody.inverse_mass` of all, shape (n, k, k)."""
+        turned = self.rotation @ self.inverse_inertia @ self.rotation.swapaxes(-1, -2)
+        result = np.zeros((len(self), 6, 6))
+        result[:, AXES, AXES] = 1.0 / self.mass[:, None]
+        result[:, 3:, 3:] = 0.5 * (turned + turned.swapaxes(-1, -2))
+        result = result if dimension == 3 else result[:, PLANAR][:, :, PLANAR]
+        for free, body in zip(result, self, strict=True):
+            if body.hold is not None:
+                held = free @ body.hold
+                free[:] = 0.5 * (held + held.T)
+        return result
+
+    def apply_impulses(self, impulses: np.ndarray) -> None:
+        """Apply impulses, less the parts that walls take.
+
+        Shape (n, k) [N s, N m s]; as `RigidBody.apply_impulse` of each.
+        """
+        self.given += in_space(impulses)
+        held = [impulse if body.hold is None else body.hold @ impulse for body, impulse in zip(self, impulses, strict=True)]
+        self.push(np.array(held).reshape(impulses.shape))
+
     def push(self, impulses: np.ndarray) -> None:
         """Add impulses [N s] and angular impulses [N m s], shape (n, k)."""
         six = in_space(impulses)
@@ -434,7 +456,10 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the cross products of vectors, shapes (..., 3); as `np.cross`, whose checks take ten times as long."""
+    """Return cross products of vectors, shapes (..., 3).
+
+    As `np.cross`, whose checks take ten times as long.
+    """
     result = np.empty(np.broadcast_shapes(one.shape, other.shape))
     for axis, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
         result[..., axis] = one[..., j] * other[..., k] - one[..., k] * other[..., j]

@@ -10,7 +10,9 @@ square of a stack's height; the rest is solved by sparse systems in `contact_new
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,6 +22,8 @@ import warp as wp
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_newton import ContactNewton
 from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.rows.memory import RowsMemory, Scalar
+from warp_lcp.rows.program import LaunchGraph
 
 if TYPE_CHECKING:
     from warp_lcp.rigid.joints import JointRows
@@ -55,6 +59,60 @@ class JointPart:
 
     rows: JointRows
     b: np.ndarray
+
+
+class SweepWorkspace(threading.local):
+    """Arrays of the NNCG kernel, with room for larger problems than the last, and its recorded launch; one a thread."""
+
+    def __init__(self) -> None:
+        self._room = (0, 0, 0)
+        self._q, self._dim, self._contacts, self._rtol, self._most = (Scalar() for _ in range(5))
+        self._rows, self._islands, self._device = RowsMemory(), 0, wp.get_device("cpu")
+        self._graph = LaunchGraph(self._device, self._launch)
+
+    def run(
+        self, fields: Sequence[np.ndarray], work: int, indices: Sequence[np.ndarray], shape: tuple[int, int, int],
+        stopping: StoppingCriteria,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+        """Return impulses, shape (contacts, dim), and residuals and rounds of the islands.
+
+        Args:
+            fields: what `reals` of the kernel holds before its work, impulses to start from first.
+            work: size of the kernel's work in `reals`.
+            indices: what `indices` of the kernel holds, the islands' starts last.
+            shape: number of contacts, of a contact's rows, and of a body's velocities.
+            stopping: the tolerance and the most iterations.
+        """
+        contacts, dim, q = shape
+        filled, numbers, self._islands = sum(f.size for f in fields), sum(map(len, indices)), len(indices[-1]) - 1
+        self._reserve(filled + work, numbers, self._islands)
+        np.concatenate([np.ravel(field) for field in fields], out=self._reals[:filled])
+        self._reals[filled : filled + work] = 0.0
+        np.concatenate(indices, out=self._indices[:numbers], casting="same_kind")
+        self._q.value, self._dim.value, self._contacts.value = q, dim, contacts
+        self._rtol.value, self._most.value = stopping.rtol, stopping.max_iterations
+        self._residual[: self._islands] = self._rounds[: self._islands] = 0.0
+        self._rows.take(Rows.entries(self._islands, self._device).single)
+        self._graph.run()
+        x = self._reals[: contacts * dim].reshape(contacts, dim)
+        return x.copy(), self._residual[: self._islands].copy(), self._rounds[: self._islands].copy()
+
+    def _launch(self) -> None:
+        rows = replace(Rows.entries(self._islands, self._device), memory=self._rows)
+        reals, indices, residual, rounds = self._arrays
+        NNCG.bind(
+            rows, reals=reals, indices=indices, residual=residual, rounds=rounds, q=self._q, dim=self._dim,
+            contacts=self._contacts, rtol=self._rtol, most=self._most,
+        ).launch()  # fmt: skip
+
+    def _reserve(self, *sizes: int) -> None:
+        if all(size <= room for size, room in zip(sizes, self._room, strict=True)):
+            return
+        self._room = reals, indices, islands = tuple(max(2 * size, room) for size, room in zip(sizes, self._room, strict=True))
+        self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
+        self._residual, self._rounds = np.zeros(islands), np.zeros(islands)
+        self._arrays = [_warp(values) for values in (self._reals, self._indices, self._residual, self._rounds)]
+        self._graph.forget()
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,16 +190,8 @@ class ContactProblem:
         J = np.concatenate([self.one[order], self.other[order]], axis=2)
         x = np.zeros((k, rows)) if start is None else start[order]
         fields = (x, J, self.b[order], yields, diagonal, self.friction[order])
-        size, work = k * rows, 3 * k * rows + (self.bodies + 1) * q
-        reals = np.concatenate([*(np.ravel(field) for field in fields), np.zeros(work)])
-        indices = np.concatenate([self.first[order], self.second[order], starts]).astype(np.int32)
-        residual, rounds = np.zeros((2, len(starts) - 1))
-        islands = Rows.entries(len(residual), wp.get_device("cpu"))
-        NNCG.bind(
-            islands, reals=_warp(reals), indices=_warp(indices), residual=_warp(residual), rounds=_warp(rounds), q=q, dim=rows,
-            contacts=k, rtol=stopping.rtol, most=stopping.max_iterations,
-        ).launch()  # fmt: skip
-        x = reals[:size].reshape(k, rows)
+        work, indices = 3 * k * rows + (self.bodies + 1) * q, (self.first[order], self.second[order], starts)
+        x, residual, rounds = SWEEPS.run(fields, work, indices, (k, rows, q), stopping)
         for island in np.flatnonzero(residual > unsolved):
             mine = slice(starts[island], starts[island + 1])
             x[mine], residual[island], more = self.part(order[mine])._go_on(stopping.rtol, x[mine])
@@ -166,6 +216,9 @@ class ContactProblem:
             newton.active_set(rtol)
             sweeps = swept.iterations
         return ContactImpulses(newton.x.reshape(x.shape), newton.residual, newton.steps + sweeps)
+
+
+SWEEPS = SweepWorkspace()
 
 
 def _components(first: list[int], second: list[int], bodies: int) -> np.ndarray:

@@ -7,6 +7,7 @@ and a patch of the launch, (offset in the arguments, address, bytes), has it cop
 from __future__ import annotations
 
 import ctypes
+import struct
 from typing import Any
 
 import warp as wp
@@ -17,6 +18,7 @@ _BLANK: Any = RowLayout()
 LAYOUT = type(_BLANK.__ctype__())
 LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
 ARRAY_BYTES = ctypes.sizeof(wp.array(dtype=wp.uint8).__ctype__())
+BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")  # members of a RowLayout from `nx` to `slab`; first (k, j, i)
 FORMATS: dict[Any, Any] = {
     wp.float32: ctypes.c_float, wp.float64: ctypes.c_double, wp.int32: ctypes.c_int32, wp.int64: ctypes.c_int64, wp.bool: ctypes.c_bool,
     float: ctypes.c_float, int: ctypes.c_int32, bool: ctypes.c_bool,
@@ -31,7 +33,7 @@ class Scalar:
 
     __slots__ = ("_cells", "_scaled", "_value")
 
-    def __init__(self, value: float = 0.0) -> None:
+    def __init__(self, value: float = 0) -> None:
         self._cells: dict[Any, Any] = {}  # the number in each type that kernels take it in
         self._scaled: dict[float, Scalar] = {}
         self._value = value
@@ -113,6 +115,13 @@ class RowsMemory:
         """Address of the number of tasks."""
         return ctypes.addressof(self.tasks)
 
+    def take_box(self, nx: int, rows: int, planes: int, grain: int, chunks: int, place: tuple[int, int, int]) -> None:
+        """Take whole rows of a box over, see `RowLayout`."""
+        ctypes.memset(ctypes.addressof(self.layout), 0, LAYOUT_BYTES)
+        BOX.pack_into(self.layout, LAYOUT.nx.offset, nx, rows, planes, grain, chunks, 1)
+        PLACE.pack_into(self.place, 0, *place)
+        self.tasks.value = planes * rows * chunks
+
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Take rows over.
 
@@ -123,3 +132,31 @@ class RowsMemory:
         ctypes.memmove(ctypes.addressof(self.layout), ctypes.addressof(layout.__ctype__()), LAYOUT_BYTES)
         self.place[:] = list(place)
         self.tasks.value = -(-layout.planes // max(layout.slab, 1)) * layout.rows * layout.chunks
+
+
+class DeviceRows(RowsMemory):
+    """Rows that change between runs, on CUDA: with the launch dimensions that they take, and those that a graph is captured with.
+
+    Attributes:
+        extent: threads of a launch (slabs, rows, chunks) now.
+        room: those of a captured launch: the largest that have been asked for, those beyond the rows return at once.
+        places: number of threads, of which each has a place for its sums.
+    """
+
+    __slots__ = ("extent", "places", "room", "spare")
+
+    def __init__(self, spare: float = 1.0) -> None:
+        super().__init__()
+        self.extent, self.room, self.places, self.spare = (1, 1, 1), (1, 1, 1), Scalar(), spare
+
+    def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
+        """Take rows over."""
+        super().take(layout, place)
+        self.extent = -(-layout.planes // max(layout.slab, 1)), layout.rows, layout.chunks
+        self.room = larger(self.room, self.extent, self.spare)
+        self.places.value = self.tasks.value
+
+
+def larger(room: tuple[int, ...], extent: tuple[int, ...], spare: float = 1.0) -> tuple[int, ...]:
+    """Return launch dimensions that hold others, too: where they must grow, by a factor more."""
+    return tuple(r if r >= e else int(spare * e) for r, e in zip(room, extent, strict=True))

@@ -47,6 +47,14 @@ def loops_on_device(device: wp.Device) -> bool:
     return bool(wp.is_conditional_graph_supported()) if device.is_cuda else team() is not None
 
 
+def device_program(launch: Any = None) -> Any:
+    """Return the `DeviceProgram` that records what this thread launches; None: there is none, or `launch` records."""
+    program = RECORDING.program
+    if program is None or not program.device.is_cuda or isinstance(getattr(launch, "__self__", None), Program):
+        return None
+    return program
+
+
 class Launch(Protocol):
     """Launches a kernel now, as `wp.launch` does, or records it, as `Program.launch` does."""
 
@@ -123,7 +131,7 @@ def _run_while(condition: Any, table: Table) -> None:
 
 def launch_ranges(
     kernel: Any, dim: tuple[int, ...], cells: int, inputs: list[Any], *, device: Any, launch: Launch | None, ordered: bool,
-    first: Patch | None = None, sized: int = 0,
+    first: Patch | None = None, sized: int = 0, extent: Any = None,
 ) -> None:  # fmt: skip
     """Launch a kernel whose first argument begins with the range of tasks that a thread takes, or record it.
 
@@ -137,9 +145,13 @@ def launch_ranges(
         ordered: whether tasks write what others read or write.
         first: what of the first argument recorded launches read from memory.
         sized: address of the number of tasks then; 0: that of `dim`.
+        extent: memory whose `room` bounds the launch dimensions on CUDA; None: they are always `dim`.
     """
+    if device.is_cuda and (program := device_program(launch)) is not None:
+        program.record_tasks(kernel, dim, inputs, first, sized, extent)
+        return
     tasks, recorded = math.prod(dim), launch is None and is_recording()
-    if device.is_cuda or team() is None or (launch is None and not recorded and tasks * cells < 8 * CELLS):
+    if device.is_cuda or team() is None or (launch is None and not recorded and tasks * cells < 4 * CELLS):
         (launch or wp.launch)(kernel, dim, [value_of(v) for v in inputs], device=device)
     elif tasks or (recorded and sized):
         made = wp.launch(kernel, (1,) * len(dim), [value_of(v) for v in inputs], device=device, record_cmd=True)
@@ -173,6 +185,8 @@ def copy(to: wp.array[Any], source: wp.array[Any]) -> None:
     program = RECORDING.program
     if program is None:
         wp.copy(to, source)
+    elif program.device.is_cuda:
+        program.record(DeviceCopy(to, source))
     else:
         program.record(copied(to.ptr, source.ptr, _bytes_of(to), (to, source)))
 
@@ -183,8 +197,25 @@ def clear(*arrays: wp.array[Any]) -> None:
     for array in arrays:
         if program is None:
             array.zero_()
+        elif array.size and program.device.is_cuda:
+            program.record(DeviceCopy(array, None))
         elif array.size:
             program.record(copied(array.ptr, 0, _bytes_of(array), array))
+
+
+@dataclass(frozen=True)
+class DeviceCopy:
+    """Copy of an array on CUDA, or zeros: a node of a graph."""
+
+    to: wp.array[Any]
+    source: wp.array[Any] | None
+
+    def launch(self) -> None:
+        """Copy now, or while a graph is captured."""
+        if self.source is None:
+            self.to.zero_()
+        else:
+            wp.copy(self.to, self.source)
 
 
 def _bytes_of(array: wp.array[Any]) -> int:
@@ -343,22 +374,39 @@ class Program:
         return ""
 
 
+def _identity(argument: Any) -> Hashable:
+    """Return by what a recording knows an argument: an array by its address, unless it is replaced by others; a list by its elements."""
+    if isinstance(argument, wp.array):
+        slot = getattr(argument, "slot", None)
+        return (argument.ptr, argument.shape) if slot is None else slot.address
+    if isinstance(argument, (list, tuple)):
+        return tuple(map(_identity, argument))
+    if isinstance(argument, dict):
+        return tuple((name, _identity(value)) for name, value in argument.items())
+    return getattr(argument, "identity", argument)
+
+
+MOST_RECORDED = 32  # sequences of a graph
+
+
 class LaunchGraph:
     """What a step launches between two decisions of the host: recorded at the first run, on the CPU then one native call.
 
-    On CUDA, and where launches must go through Warp, `record` is called in each run.
+    On CUDA it is one graph, see `device_graph.py`, if `on_device` is set. Otherwise, and where launches must go through Warp, `record`
+    is called in each run.
 
     Args:
         device: where the kernels run.
         record: launches by `warp_lcp.rows` what is to be recorded: kernels, `copy`, `clear`. It must not read from the device, nor
             decide anything by what changes from run to run: `Scalar`, `ActiveWindow` and lists stand for that.
-        at_once: whether to launch in each run instead, as CUDA does.
+        at_once: whether to launch in each run instead.
     """
 
+    on_device: ClassVar[bool] = False  # whether CUDA graphs are captured: rehearsed on the CPU, not yet run on a GPU
     verify: ClassVar[bool] = False  # whether each run records anew and compares: a test finds what changes though it must not
 
     def __init__(self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False) -> None:
-        self.device, self._record, self.at_once = device, record, at_once or device.is_cuda
+        self.device, self._record, self.at_once = device, record, at_once
         self._programs: dict[Hashable, Program] = {}
         self._threads = 0
 
@@ -366,19 +414,42 @@ class LaunchGraph:
         """Launch everything, or record that among the launches of a program that is being recorded.
 
         Args:
-            arguments: of `record`; the same in each run.
-            variant: by what `record` decides which of several sequences it launches; each is recorded once.
+            arguments: of `record`. Other arrays or objects are recorded for themselves.
+            variant: by what else `record` decides which of several sequences it launches; each is recorded once.
         """
-        if self.at_once or RECORDING.program is not None or team() is None:
+        if self.at_once or RECORDING.program is not None or not (self.on_device if self.device.is_cuda else team()):
             self._record(*arguments)
+            return
+        if self.device.is_cuda:
+            self._run_on_device(arguments, variant)
             return
         if self._threads != get_threads():
             self._programs, self._threads = {}, get_threads()
-        program = self._programs.get(variant)
+        key = (variant, *map(_identity, arguments))
+        program = self._programs.get(key)
         if program is None:
-            program = self._programs[variant] = self._recorded(arguments)
+            if len(self._programs) >= MOST_RECORDED:
+                self._programs.clear()
+            program = self._programs[key] = self._recorded(arguments)
         elif LaunchGraph.verify and (other := self._recorded(arguments).differs(program)):
             raise AssertionError(f"a recorded launch differs: {other}")
+        program.run()
+
+    def _run_on_device(self, arguments: tuple[Any, ...], variant: Hashable) -> None:
+        """Launch the graph of a CUDA device; what it cannot hold is launched in each run."""
+        from warp_lcp.rows.device_graph import DeviceProgram, NotRecordable
+
+        program = self._programs.get(variant)
+        if not isinstance(program, DeviceProgram) or not program.fits():
+            try:
+                self._programs[variant] = program = DeviceProgram(self.device)
+                with recording(program):
+                    self._record(*arguments)
+                program.finish()
+            except NotRecordable:
+                self.at_once = True
+                self._record(*arguments)
+                return
         program.run()
 
     def forget(self) -> None:

@@ -18,8 +18,8 @@ import warp as wp
 from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
 from warp_lcp.rows.native import HEADERS, sections, shared, text
-from warp_lcp.rows.program import Launch, is_recording, perform
-from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, ranges, team
+from warp_lcp.rows.program import Launch, device_program, is_recording, perform
+from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, memory_of, ranges, team
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
@@ -272,8 +272,8 @@ class RowPass:
             for name in names:
                 value = given[name]
                 found = 0 if value is None else value.size
-                if not found and name in self.optional:
-                    given[name] = None  # a slice of nothing has an address
+                if not found and name in self.optional and getattr(value, "slot", None) is None:
+                    given[name] = None  # a slice of nothing has an address; of a list that grows it is read when it runs
                 if found != expected is not None and (found or name not in self.optional):
                     raise ValueError(f"{self.label}: {name} has {found} elements, not {expected}")
                 if found and not (value.is_contiguous and value.device is device):
@@ -465,18 +465,22 @@ class Bound(NamedTuple):
 
     def launch(self, launch: Launch | None = None) -> None:
         """Launch the pass, or record it."""
-        if self.rows.device.is_cuda or team() is None:
+        if self.rows.device.is_cuda and (program := device_program(launch)) is not None:
+            program.record_pass(self)
+        elif self.rows.device.is_cuda or team() is None:
             (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
-        elif 0 not in threads(self.layout) or (self.rows.memory is not None and is_recording()):
-            perform(self._operation(), launch)
+        elif (made := self.operation()) is not None:
+            perform(made, launch)
 
-    def _operation(self) -> Operation:
-        """Return the pass for the team, cut into ranges of tasks."""
-        sized = self.rows.memory.sized if self.rows.memory is not None and is_recording() else 0
-        cost = max(self.layout.grain * self.rows.weight, 1)
+    def operation(self) -> Operation | None:
+        """Return the pass for the team, cut into ranges of tasks; None where it has no task, or is not for the team."""
+        recorded = self.rows.memory is not None and is_recording()
+        if self.rows.device.is_cuda or team() is None or (0 in threads(self.layout) and not recorded):
+            return None
+        cost, sized = max(self.layout.grain * self.rows.weight, 1), self.rows.memory.sized if recorded else 0
         return ranges(self.stage(), cost, ordered=self.form.declared.ordered, sized=sized)
 
-    def _patches(self) -> list[Patch]:
+    def patches(self) -> list[Patch]:
         """Return what a recorded launch reads from memory: rows, numbers, and arrays that others replace."""
         d, native, patches = self.form.declared, type(self.fields.__ctype__()), []
         if self.rows.memory is not None:
@@ -493,9 +497,10 @@ class Bound(NamedTuple):
     def stage(self, lag: int = 0, **members: int) -> Stage:
         """Return the pass for the team, as a stage of a wave whose layout has these members."""
         L = put(copy_of(self.layout), members) if members else self.layout
-        memory = ctypes.create_string_buffer(bytes(L.__ctype__()) + bytes(self.fields.__ctype__()))
+        values = bytes(L.__ctype__()) + bytes(self.fields.__ctype__())
+        memory = memory_of(ctypes.c_char, len(values)).from_buffer_copy(values)
         entry = self.form.entry(L, self.fields)
-        patches = self._patches() if is_recording() else ()
+        patches = self.patches() if is_recording() else ()
         return Stage(entry, memory, self, L.rows * L.chunks, threads(L)[0], lag, max(L.fz, 1), L.n1, patches)
 
 

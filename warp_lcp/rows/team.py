@@ -66,6 +66,12 @@ class Arguments(ctypes.Structure):
     )  # fmt: skip
 
 
+@functools.cache
+def memory_of(kind: Any, count: int) -> Any:
+    """Return the type of an array of C: one that Python does not keep takes it longer to make than a table to run."""
+    return kind * count
+
+
 class Entry:
     """A kernel on the CPU: what C calls, and the bounds of a launch.
 
@@ -145,7 +151,7 @@ class Operation:
         self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0, sized: int = 0
     ) -> None:
         made = [word for stage in stages for word in stage.words]
-        self._stages, self._kept, self.chunks = (ctypes.c_uint64 * len(made))(*made), stages, chunks
+        self._stages, self._kept, self.chunks = memory_of(ctypes.c_uint64, len(made))(*made), stages, chunks
         self.check: Callable[[], object] | None = None
         self.condition, self.sized = 0, sized
         self.words = kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks
@@ -217,7 +223,7 @@ class Table:
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
         sizes = [LANE_WORDS * n + operation.chunks for n, operation in zip(lanes, self._kept, strict=True)]  # what is left, and the cuts
         at = TABLE_WORDS + OPERATION_WORDS * len(self._kept)
-        self.words = (ctypes.c_uint64 * (at + sum(sizes)))()
+        self.words = memory_of(ctypes.c_uint64, 1 << (at + sum(sizes)).bit_length())()
         self.address = ctypes.addressof(self.words)
         total, made = 0, []
         for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
@@ -229,6 +235,7 @@ class Table:
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
         self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
         self.cut = total > len(self._kept)
+        self.asked: Arguments | None = None  # of a team of one thread, which is the same as long as that
 
 
 class Team:
@@ -241,6 +248,7 @@ class Team:
 
     def __init__(self, size: int, entry: Entry) -> None:
         self.size, self._entry = size, entry
+        self._function, self._bounds = entry.function, ctypes.c_void_p(entry.bounds)
         self.words = (ctypes.c_uint64 * (THREADS + 8 * size))()
         self.address = ctypes.addressof(self.words)
         for i, function in enumerate(_system()):
@@ -257,6 +265,9 @@ class Team:
 
     def run(self, table: Table) -> None:
         """Work through a table: with the others if nobody else uses them."""
+        if self.size == 1 and table.again is None:
+            self._run_alone(table)
+            return
         with self._lock:
             self._inside += 1
             share = SHARED if table.cut and self.size > 1 and self._inside == 1 else DONE_ALONE
@@ -283,6 +294,21 @@ class Team:
         for check in table.checks:
             check()
 
+    def _run_alone(self, table: Table) -> None:
+        """Work through a table with the caller's thread."""
+        asked = table.asked
+        if asked is None:
+            asked = table.asked = Arguments(self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE)
+        try:
+            self._do(asked)
+            while table.words[UNFINISHED]:  # the interpreter has looked after signals
+                self._do(Arguments(self.address, table.address, RUN, 0, RESUMED, PATIENCE))
+        except BaseException:
+            self._do(Arguments(self.address, table.address, CANCEL))
+            raise
+        for check in table.checks:
+            check()
+
     def stop(self) -> None:
         """Send the others home; what is called later is done by the caller."""
         self._do(Arguments(self.address, 0, QUIT))
@@ -302,7 +328,7 @@ class Team:
         self._do(Arguments(self.address, 0, SERVE, me))
 
     def _do(self, asked: Arguments) -> None:
-        self._entry.function(ctypes.c_void_p(self._entry.bounds), ctypes.byref(asked))
+        self._function(self._bounds, ctypes.byref(asked))
 
 
 def patience(table: Table) -> int:

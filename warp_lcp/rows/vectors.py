@@ -5,6 +5,7 @@ Every operator stores its fields as flat arrays (see `warp_lcp.rows.fields`), so
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,8 @@ import warp as wp
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.native import HEADERS, text
-from warp_lcp.rows.program import Launch, Task, copy
+from warp_lcp.rows.program import Launch, Task, copy, is_recording
+from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.team import Operation
 
@@ -39,8 +41,12 @@ def add_up_span(partials: wp.array(dtype=wp.float64), offset: int, start: int, n
 
 @no_type_check
 @wp.kernel(enable_backward=False, module="warp_lcp.vectors")
-def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int):
+def add_up_kernel(
+    partials: wp.array(dtype=wp.float64), before: int, n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int
+):  # fmt: skip
     """out[slot + column * segments + segment] = the sum of every `segments`-th block of a column of n partials, by one block of threads.
+
+    Columns are counted from the one after `before` others.
 
     The order of the additions does not change from run to run.
     """
@@ -48,7 +54,7 @@ def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, se
     block = t // threads
     column = block // segments
     segment = block - column * segments
-    s = add_up_span(partials, column * n, segment * threads + t - block * threads, n, threads * segments)
+    s = add_up_span(partials, (before + column) * n, segment * threads + t - block * threads, n, threads * segments)
     total = wp.tile_sum(wp.tile(s))
     if t == block * threads:
         out[slot + block] = total[0]
@@ -56,7 +62,9 @@ def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, se
 
 @no_type_check
 @wp.kernel(enable_backward=False, module="warp_lcp.vectors")
-def largest_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int):
+def largest_kernel(
+    partials: wp.array(dtype=wp.float64), before: int, n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int
+):  # fmt: skip
     """The same for the largest of them."""
     t = wp.tid()
     block = t // threads
@@ -64,7 +72,7 @@ def largest_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, s
     segment = block - column * segments
     most = -wp.float64(wp.inf)
     for i in range(segment * threads + t - block * threads, n, threads * segments):
-        most = wp.max(most, partials[column * n + i])
+        most = wp.max(most, partials[(before + column) * n + i])
     total = wp.tile_max(wp.tile(most))
     if t == block * threads:
         out[slot + block] = total[0]
@@ -95,8 +103,8 @@ def segments_of(n: int) -> int:
 
 
 def fold(
-    kernel: wp.Kernel, partials: wp.array[wp.float64], n: int, columns: int, out: wp.array[wp.float64], slot: int,
-    between: wp.array[wp.float64], launch: Launch = wp.launch,
+    kernel: wp.Kernel, partials: wp.array[wp.float64], n: Any, columns: int, out: wp.array[wp.float64], slot: int,
+    between: wp.array[wp.float64], launch: Launch = wp.launch, most: int | None = None, before: int = 0,
 ) -> None:  # fmt: skip
     """Write to out[slot], out[slot + 1], ... what `add_up_kernel` or `largest_kernel` makes of columns of n partial results, on CUDA.
 
@@ -109,13 +117,16 @@ def fold(
         slot: of the first.
         between: memory of columns * segments_of(n) numbers, where these are more than the columns.
         launch: of a program.
+        most: of n, where that is a `Scalar`.
+        before: columns before the first that is taken.
     """
-    device, segments = partials.device, segments_of(n)
+    device, segments = partials.device, segments_of(n if most is None else most)
+    launch = launch_recorded if is_recording() and not hasattr(launch, "__self__") else launch
     if segments > 1:
         blocks = columns * segments * CUDA_BLOCK
-        launch(kernel, blocks, [partials, n, CUDA_BLOCK, segments, between, 0], device=device, block_dim=CUDA_BLOCK)
-        partials, n = between, segments
-    launch(kernel, columns * CUDA_BLOCK, [partials, n, CUDA_BLOCK, 1, out, slot], device=device, block_dim=CUDA_BLOCK)
+        launch(kernel, blocks, [partials, before, n, CUDA_BLOCK, segments, between, 0], device=device, block_dim=CUDA_BLOCK)
+        partials, before, n = between, 0, segments
+    launch(kernel, columns * CUDA_BLOCK, [partials, before, n, CUDA_BLOCK, 1, out, slot], device=device, block_dim=CUDA_BLOCK)
 
 
 class Reduction:
@@ -218,6 +229,9 @@ class Tally:
     ) -> None:  # fmt: skip
         """Do what `take` does, with arguments as of `RowPass.bind_arguments`."""
         self._places, device = rows.places, rows.device
+        if is_recording() and device.is_cuda:
+            self._record(rows, structs, given, stencil, bounds)
+            return
         if self._partials.size < self._columns * self._places:
             self._partials = wp.empty(self._columns * self._places, dtype=wp.float64, device=device)
         given["out"] = self._partials
@@ -230,9 +244,27 @@ class Tally:
         elif sums:
             fold(add_up_kernel, self._partials, self._places, sums, self._reading.array, 0, self._between)
         if self._places and largest:
-            rest = self._partials[sums * self._places :]
-            fold(largest_kernel, rest, self._places, largest, self._reading.array, sums, self._between)
+            fold(largest_kernel, self._partials, self._places, largest, self._reading.array, sums, self._between, before=sums)
         self._reading.changed()
+
+    def _record(self, rows: Rows, structs: tuple[DataclassInstance, ...], given: dict[str, Any], stencil: Any, bounds: Any) -> None:
+        """Record the pass on CUDA, for as many places as the rows have in a run."""
+        assert self._reading is not None
+        memory, sums, largest = rows.memory, len(self._declared.sums), len(self._declared.largest)
+        most = self._places if memory is None else math.prod(memory.room)
+        places = self._places if memory is None else memory.places
+        if self._partials.size < self._columns * most:
+            self._partials = wp.empty(self._columns * most, dtype=wp.float64, device=rows.device)
+        given["out"] = self._partials
+        self._declared.bind_arguments(rows, structs, given, stencil, bounds).launch()
+        for kernel, count, before in ((add_up_kernel, sums, 0), (largest_kernel, largest, sums)):
+            if count:
+                fold(kernel, self._partials, places, count, self._reading.array, before, self._between, most=most, before=before)
+
+    def changed(self) -> None:
+        """Say that a recorded `take` has run."""
+        if self._reading is not None:
+            self._reading.changed()
 
     def read(self, arrange: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
         """Return what was found, a number a column.

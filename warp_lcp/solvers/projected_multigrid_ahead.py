@@ -12,7 +12,6 @@ import warp as wp
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Rows
 from warp_lcp.rows.program import Conditional, Launch, Program, loops_on_device
@@ -175,7 +174,7 @@ class Beginning:
         work, r, x = self._work, self._work.residual, self._work.x
         p, device = work.problem, work.A.device
         p.bounds.encode(launch)
-        NaturalResidual.start(r, x, keep=False, launch=launch)
+        r.project(x, keep=False, launch=launch)
         r.launch_square_of_b(launch)
         launch(kernels.take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
         r.classify = False
@@ -191,7 +190,7 @@ class Beginning:
             p.layout.copy(x, self._guess)
         else:
             CONVERT.bind(Rows.of_fields(p.layout), a=self._guess, b=x).launch(launch)
-        NaturalResidual.start(r, x, keep=True, launch=launch)
+        r.project(x, keep=True, launch=launch)
         r.classify = True
         r.assess(x, launch=launch)
         if work.scratch is not None:

@@ -145,7 +145,7 @@ class CoupledWorkspace(MultigridWorkspace):
         super()._cycle()
 
     def program_key(self) -> tuple[Any, ...]:
-        """Return by what a step's program differs from others, the bodies' term included."""
+        """Return what the launches of a truncated cycle depend on; the correction's too."""
         return (*super().program_key(), *self.correction.key)
 
     def _correct(self, program: Program) -> None:

@@ -141,7 +141,10 @@ class AssessedResidual(NaturalResidual):
 
     def set(self, slot: int, value: float) -> None:
         """Write a scalar to its slot on the device."""
-        self.scalars[int(slot) : int(slot) + 1].fill_(value)
+        if self.scalars.device.is_cpu:
+            self.scalars.numpy()[int(slot)] = value
+        else:
+            self.scalars[int(slot) : int(slot) + 1].fill_(value)
         if slot == kernels.SIZE:
             self.set(kernels.PER_SIZE, 1.0 / value if value else math.inf)
 

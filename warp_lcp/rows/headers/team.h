@@ -95,6 +95,16 @@ const auto stream = [=](const Word* op, Word runs, Long c, const Word** stages, 
 
 const auto work = [=](const Word* op, Word runs, Long c) -> Word {  // on a chunk and those that follow; how many
     if (op[WHEN] && !*(const volatile int*)op[WHEN]) return 1;  // the condition changes between operations only
+    // Tasks whose number is known when they run: as many pieces as they fill, up to the chunks, as many for each lane; piece q is of
+    // the chunk c with c*pieces/chunks <= q < (c + 1)*pieces/chunks, so that pieces lie in all lanes.
+    Long all = (Long)op[ALL], each = (Long)op[EACH], first = c;
+    if (op[SIZED]) {
+        all = *(const Long*)op[SIZED];
+        const Long chunks = (Long)op[CHUNKS], lanes = (Long)op[LANES]; Long pieces = each > 0 && all / each < chunks ? all / each : chunks;
+        pieces = pieces > lanes ? pieces - pieces % lanes : pieces > 0 ? pieces : 1;
+        first = c*pieces / chunks;
+        if (all <= 0 || first == (c + 1)*pieces / chunks) return 1;
+        each = (all + pieces - 1) / pieces; }
     char room[MOST][ROOM] __attribute__((aligned(16)));
     const Word* stages[MOST];
     for (int s = 0; s < (int)op[STAGE_COUNT]; ++s) {
@@ -105,10 +115,7 @@ const auto work = [=](const Word* op, Word runs, Long c) -> Word {  // on a chun
     if (op[KIND] == ALONE) {
         ((Call)made[FUNCTION])((void*)made[BOUNDS], made[PATCHES] ? (void*)room[0] : (void*)made[ARGUMENTS]);
         return 1; }
-    // tasks whose number is known when they run are cut into as many chunks as the largest number of them was
-    const Long all = op[SIZED] ? *(const Long*)op[SIZED] : (Long)op[ALL], share = (all + (Long)op[CHUNKS] - 1) / (Long)op[CHUNKS];
-    const Long each = op[SIZED] && share > (Long)op[EACH] ? share : (Long)op[EACH];
-    const Long begin = c*each, end = begin + each < all ? begin + each : all;
+    const Long begin = first*each, end = begin + each < all ? begin + each : all;
     if (begin >= end) return 1;
     if (op[KIND] == COPY) copy(made, begin, end); else run(made, room[0], begin, end);
     return 1; };
