@@ -230,7 +230,7 @@ class Tally:
         """Do what `take` does, with arguments as of `RowPass.bind_arguments`."""
         self._places, device = rows.places, rows.device
         if is_recording() and device.is_cuda:
-            self._record(rows, given)
+            self._record(rows, structs, given, stencil, bounds)
             return
         if self._partials.size < self._columns * self._places:
             self._partials = wp.empty(self._columns * self._places, dtype=wp.float64, device=device)
@@ -247,7 +247,7 @@ class Tally:
             fold(largest_kernel, self._partials, self._places, largest, self._reading.array, sums, self._between, before=sums)
         self._reading.changed()
 
-    def _record(self, rows: Rows, given: dict[str, Any]) -> None:
+    def _record(self, rows: Rows, structs: tuple[DataclassInstance, ...], given: dict[str, Any], stencil: Any, bounds: Any) -> None:
         """Record the pass on CUDA, for as many places as the rows have in a run."""
         assert self._reading is not None
         memory, sums, largest = rows.memory, len(self._declared.sums), len(self._declared.largest)
@@ -255,7 +255,8 @@ class Tally:
         places = self._places if memory is None else memory.places
         if self._partials.size < self._columns * most:
             self._partials = wp.empty(self._columns * most, dtype=wp.float64, device=rows.device)
-        self._declared.bind(rows, **given, out=self._partials).launch()
+        given["out"] = self._partials
+        self._declared.bind_arguments(rows, structs, given, stencil, bounds).launch()
         for kernel, count, before in ((add_up_kernel, sums, 0), (largest_kernel, largest, sums)):
             if count:
                 fold(kernel, self._partials, places, count, self._reading.array, before, self._between, most=most, before=before)
