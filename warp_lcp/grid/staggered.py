@@ -254,8 +254,8 @@ class _RangeMemory:
         self.range, self.tasks = _native(CellRange())(), ctypes.c_int64()
         self.first = 0, ctypes.addressof(self.range), ctypes.sizeof(self.range)
         self.sized = ctypes.addressof(self.tasks)
-        self.extent: tuple[int, ...] = (1, 1, 1)  # threads of a launch on CUDA: now, and at most so far
-        self.room: tuple[int, ...] = self.extent
+        self.extent: tuple[int, ...] = (1, 1, 1)  # threads of a launch on CUDA now
+        self.room: tuple[int, ...] = (1, 1, 1)  # at most so far
 
     def take_dim(self, cells: typing.Any, dim: tuple[int, int, int]) -> None:
         """Take a CellRange over on CUDA, with the threads that share it."""

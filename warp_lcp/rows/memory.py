@@ -147,9 +147,9 @@ class DeviceRows(RowsMemory):
 
     def __init__(self, spare: float = 1.0) -> None:
         super().__init__()
-        self.places, self.spare = Scalar(), spare
         self.extent: tuple[int, ...] = (1, 1, 1)
-        self.room: tuple[int, ...] = self.extent
+        self.room: tuple[int, ...] = (1, 1, 1)
+        self.places, self.spare = Scalar(), spare
 
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Take rows over."""
