@@ -65,10 +65,9 @@ class SweepWorkspace(threading.local):
     """Arrays of the NNCG kernel, with room for larger problems than the last, and its recorded launch; one a thread."""
 
     def __init__(self) -> None:
-        self._room = (0, 0, 0)
+        self._room = [0, 0, 0]
         self._q, self._dim, self._contacts, self._rtol, self._most = (Scalar() for _ in range(5))
-        self._rows, self._islands, self._device = RowsMemory(), 0, wp.get_device("cpu")
-        self._graph = LaunchGraph(self._device, self._launch)
+        self._rows, self._islands = RowsMemory(), 0
 
     def run(
         self, fields: Sequence[np.ndarray], work: int, indices: Sequence[np.ndarray], shape: tuple[int, int, int],
@@ -101,18 +100,19 @@ class SweepWorkspace(threading.local):
 
     def _launch(self) -> None:
         rows = replace(Rows.entries(self._islands, self._device), memory=self._rows)
-        numbers = {"q": self._q, "dim": self._dim, "contacts": self._contacts, "rtol": self._rtol, "most": self._most}
+        numbers: dict[str, Any] = {"q": self._q, "dim": self._dim, "contacts": self._contacts, "rtol": self._rtol, "most": self._most}
         NNCG.bind(rows, **numbers, **self._arrays).launch()
 
     def _reserve(self, *sizes: int) -> None:
         if all(size <= room for size, room in zip(sizes, self._room, strict=True)):
             return
-        self._room = reals, indices, islands = tuple(max(2 * size, room) for size, room in zip(sizes, self._room, strict=True))
+        reals, indices, islands = self._room = [max(2 * size, room) for size, room in zip(sizes, self._room, strict=True)]
         self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
         self._residual, self._rounds = np.zeros(islands), np.zeros(islands)
-        named = {"reals": self._reals, "indices": self._indices, "residual": self._residual, "rounds": self._rounds}
+        named: dict[str, np.ndarray] = {"reals": self._reals, "indices": self._indices, "residual": self._residual, "rounds": self._rounds}
         self._arrays = {name: _warp(values) for name, values in named.items()}
-        self._graph.forget()
+        self._device = wp.get_device("cpu")
+        self._graph = LaunchGraph(self._device, self._launch)
 
 
 @dataclass(frozen=True, eq=False)
