@@ -62,7 +62,7 @@ class JointPart:
 
 
 class SweepWorkspace(threading.local):
-    """Arrays of the NNCG kernel, with room for larger problems than the last, and its recorded launch; one a thread."""
+    """Arrays and recorded launch of the NNCG kernel; each Python thread has its own."""
 
     def __init__(self) -> None:
         self._room = [0, 0, 0]
