@@ -213,7 +213,7 @@ class CutCells:
             self._sampler.look_at_centers(self._nodes, self._all_placed, *self._moved_to, self.base, listed=True)
 
     def _launch_entering(self) -> None:
-        """Launch what enters the solids that move into the distances of those that stand, and lists cells that only centers tell about."""
+        """Enter the moving solids into the distances of the standing ones; list the cells that only their centers tell about."""
         self._nodes.copy_from(self._standing)
         copy(self.base, self._marks)
         self._enter()

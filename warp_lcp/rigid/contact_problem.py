@@ -62,16 +62,12 @@ class JointPart:
 
 
 class SweepWorkspace(threading.local):
-    """Arrays of the NNCG kernel and its recorded launch, one a thread.
-
-    There is room for larger problems than the last.
-    """
+    """Arrays and recorded launch of the NNCG kernel; each Python thread has its own."""
 
     def __init__(self) -> None:
-        self._room = (0, 0, 0)
+        self._room = [0, 0, 0]
         self._q, self._dim, self._contacts, self._rtol, self._most = (Scalar() for _ in range(5))
-        self._rows, self._islands, self._device = RowsMemory(), 0, wp.get_device("cpu")
-        self._graph = LaunchGraph(self._device, self._launch)
+        self._rows, self._islands = RowsMemory(), 0
 
     def run(
         self, fields: Sequence[np.ndarray], work: int, indices: Sequence[np.ndarray], shape: tuple[int, int, int],
@@ -113,12 +109,12 @@ class SweepWorkspace(threading.local):
     def _reserve(self, *sizes: int) -> None:
         if all(size <= room for size, room in zip(sizes, self._room, strict=True)):
             return
-        reals, indices, islands = (max(2 * size, room) for size, room in zip(sizes, self._room, strict=True))
-        self._room = reals, indices, islands
+        reals, indices, islands = self._room = [max(2 * size, room) for size, room in zip(sizes, self._room, strict=True)]
         self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
         self._residual, self._rounds = np.zeros(islands), np.zeros(islands)
         self._arrays = [_warp(values) for values in (self._reals, self._indices, self._residual, self._rounds)]
-        self._graph.forget()
+        self._device = wp.get_device("cpu")
+        self._graph = LaunchGraph(self._device, self._launch)
 
 
 @dataclass(frozen=True, eq=False)
