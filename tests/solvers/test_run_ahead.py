@@ -41,22 +41,23 @@ def change(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator) -> None:
     b.assign(np.where(inside, values * 10.0 ** rng.integers(-12, 6) * (rng.random() > 0.05), 0.0))
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_solves_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("seed", "precision"), [*((n, "mixed") for n in range(30)), *((n, "single") for n in range(30, 42))])
+def test_solves_are_those_of_the_host(seed: int, precision: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same iterates, histories and ends, bit for bit, of solves one after another that begin where the last one ended."""
     rng = np.random.default_rng(4000 + seed)
     problem, b = random_problem(rng)
-    ahead = SOLVER.init(problem)
+    solver = wl.ProjectedMultigrid(precision=precision)
+    ahead = solver.init(problem)
     with monkeypatch.context() as patch:
         patch.setattr(RunAhead, "suits", lambda work: False)
-        alone = SOLVER.init(problem)
+        alone = solver.init(problem)
     guess, begun = problem.layout.zeros(wp.float64), 0
     for _ in range(5):
         change(problem, b, rng)
         stopping = wl.StoppingCriteria(rtol=10.0 ** -rng.integers(1, 9), max_iterations=int(rng.integers(0, 40)))
         found = []
         for work in (alone, ahead):
-            result = wl.solve(problem, SOLVER, stopping=stopping, x0=guess, workspace=work)
+            result = wl.solve(problem, solver, stopping=stopping, x0=guess, workspace=work)
             rows = [(r.iteration, r.residual, r.active, r.step) for r in result.history]
             found.append((rows, result.status, result.iterations, result.residual, work.x.numpy().tobytes()))
         for one, other in zip(*found, strict=True):
