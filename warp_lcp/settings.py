@@ -83,8 +83,14 @@ class Settings:
         Raises:
             SettingError: a field is outside its range.
         """
-        for name, annotation in ranges(type(self)).items():  # type: ignore[arg-type]  # a class has a hash
-            object.__setattr__(self, name, checked(name, getattr(self, name), annotation))
+        kind: Any = type(self)
+        defaults = checked_defaults(kind)
+        for name, annotation in ranges(kind).items():
+            value = getattr(self, name)
+            raw, known = defaults.get(name, (None, None))
+            found = known if raw is not None and value is raw else checked(name, value, annotation)
+            if found is not value:
+                object.__setattr__(self, name, found)
 
 
 def renamed(**names: str) -> Callable[[type[Kind]], type[Kind]]:
@@ -164,6 +170,17 @@ def checked(name: str, given: object, annotation: Any) -> Any:
         return adapter(annotation).validate_python(plain)
     except ValueError:  # pydantic's words name one end of a range
         raise SettingError(name, value, rule(annotation)) from None
+
+
+@cache
+def checked_defaults(settings: type[Any]) -> dict[str, tuple[Any, Any]]:
+    """Return the default of each field of a dataclass that has one, as it is written and as the field's type."""
+    hints, defaults = ranges(settings), {field.name: field.default for field in dataclasses.fields(settings)}
+    return {
+        name: (value, checked(name, value, hints[name]))
+        for name, value in defaults.items()
+        if value is not dataclasses.MISSING and value is not None
+    }
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem.solve import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Rows
+from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Conditional, Launch, Program, loops_on_device
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import CONVERT
@@ -48,6 +50,7 @@ class RunAhead:
         self.rows = deque[np.ndarray]()
         self._found, self._judged = Reading(device, ROWS * int(kernels.ROW)), Reading(device, kernels.JUDGED)
         self._going, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self._numbers = [Scalar() for _ in range(5)]  # of the kernel that begins: stale, most, both tolerances, noise
         self._loops: dict[int, Program] = {}  # by the step's program
         self._launches: dict[Any, Any] = {}  # recorded, by their kernel
         self._beginning: Beginning | None = None
@@ -82,12 +85,17 @@ class RunAhead:
             return None
         p = work.problem
         r.renew()
-        if self._beginning is None or not self._beginning.fits(guess):
-            self._beginning = Beginning(work, guess, self._found)
-        self._beginning.run()
         counted = criteria.counted if isinstance(criteria, MeanCriteria) else None
-        given = [int(r.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, counted, work.descent.noise]
-        self._launch(kernels.begin_kernel, [r.scalars, self._found.array, self._judged.array, self._going, self._stale], given)
+        numbers = int(r.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, work.descent.noise
+        if self._beginning is None or not self._beginning.fits(guess, counted):
+            self._beginning = Beginning(work, guess, counted, self._found, self._judge_first)
+        for number, value in zip(self._numbers, numbers, strict=True):
+            number.value = value
+        self._beginning.run()
+        if work.A.device.is_cuda:
+            *given, noise = numbers
+            memory = [r.scalars, self._found.array, self._judged.array, self._going, self._stale]
+            self._launch(kernels.begin_kernel, memory, [*given, counted, noise])
         self._run(loop)
         reference, first = (math.sqrt(row[int(kernels.NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
@@ -99,6 +107,12 @@ class RunAhead:
         for _ in range(2):
             r.take(self.rows.popleft(), size)
         return reference
+
+    def _judge_first(self, counted: wp.array[Any] | None, launch: Launch) -> None:
+        """Record the kernel that decides whether the guess is good enough."""
+        *given, noise = self._numbers
+        memory = [self._work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
+        launch(kernels.begin_kernel, 1, [*memory, *given, counted, noise], device=self._work.A.device)
 
     def _launch(self, kernel: Any, memory: list[Any], given: list[Any]) -> None:
         """Launch a kernel of one thread whose last arguments differ from launch to launch."""
@@ -142,21 +156,27 @@ class Beginning:
     Args:
         work: of the solve.
         guess: stored field, read each time.
+        counted: of the criteria, see `MeanCriteria`.
         found: receives the first evaluation, see `projected_multigrid_kernels.keep_row`.
+        judge: records what decides whether the guess is good enough; on CUDA the caller launches it.
     """
 
-    def __init__(self, work: MultigridWorkspace, guess: wp.array[Any], found: Reading) -> None:
-        self._work, self._guess, self._found, device = work, guess, found, work.A.device
+    def __init__(
+        self, work: MultigridWorkspace, guess: wp.array[Any], counted: wp.array[Any] | None, found: Reading,
+        judge: Callable[[wp.array[Any] | None, Launch], None],
+    ) -> None:  # fmt: skip
+        self._work, self._guess, self._counted, self._found, device = work, guess, counted, found, work.A.device
         self._key, self._finder = work.program_key(), work.problem.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
         self._program = None if device.is_cuda else Program(device)
         if self._program is not None:
             self._searches, search = wp.zeros(1, dtype=wp.int32, device=device), Program(device)
             self._finder.record(work.scratch, search.launch)
             self._record(self._program.launch, Conditional(self._searches, search))
+            judge(counted, self._program.launch)
 
-    def fits(self, guess: wp.array[Any]) -> bool:
-        """Return whether the launches are of this guess, and of the bounds as they are."""
-        return self._guess.ptr == guess.ptr and self._key == self._work.program_key()
+    def fits(self, guess: wp.array[Any], counted: wp.array[Any] | None) -> bool:
+        """Return whether the launches are of this guess and count, and of the bounds as they are."""
+        return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.program_key()
 
     def run(self) -> None:
         """Launch everything."""
