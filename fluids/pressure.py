@@ -331,12 +331,12 @@ class PressureProjection:
         self._threshold.value = threshold
         self._last = self._kick
         self._limit.value = self._gravity * self._last
-        variant = result.x.ptr, window.near is None, self._cells.near is None, self.jump is None
-        self._projection.run(velocity, window, result.x, variant=variant)
+        variant = window.near is None, self._cells.near is None, self.jump is None
+        self._projection.run(velocity, window, self._kept_solution(result.x), variant=variant)
         self._contacts.changed()
         return Projection(result, unknowns, self._found)
 
-    def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
+    def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array | None) -> None:
         """Launch the projection: the gradient, the support of spray, the contact of wall cells."""
         self._accept(x)
         for axis, field in enumerate(velocity):
@@ -404,9 +404,17 @@ class PressureProjection:
                 axis=axis, limit=self._limit,
             )  # fmt: skip
 
-    def _accept(self, x: wp.array) -> None:
-        """Take the solution of the problem, and show its cells."""
+    def _kept_solution(self, x: wp.array) -> wp.array | None:
+        """Return a solution that lies where the last one did; another, of a method in single precision, is taken here."""
+        if x.dtype is wp.float64:
+            return x
         self._take(x)
+        return None
+
+    def _accept(self, x: wp.array | None) -> None:
+        """Take the solution of the problem, and show its cells."""
+        if x is not None:
+            self._take(x)
         copy(self.cells, self.kind)
 
     def _take(self, x: wp.array) -> None:

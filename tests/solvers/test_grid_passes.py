@@ -161,7 +161,8 @@ def test_a_step_along_the_path_is_mehrotras(form, upper):
     path._advance(X, tau, length)
     x, w, sl, v, t = x + length * dx, w + length * dx, sl + length * ds, v - length * dx, t + length * dt
     np.testing.assert_allclose(inner(X)[fluid], x[fluid], rtol=1e-12, atol=1e-12)
-    for field, expected in zip(path._pairs.values(), (w, v, sl, t) if two else (w, w, sl, sl), strict=True):
+    pairs = path._pairs
+    for field, expected in zip((pairs.w, pairs.v, pairs.s, pairs.t), (w, v, sl, t) if two else (w, w, sl, sl), strict=True):
         np.testing.assert_allclose(inner(field)[fluid], expected[fluid], rtol=1e-10, atol=1e-12)
     bounded = np.where(sl > 0, np.where(np.isfinite(w), w, 0) * sl, 0) + np.where(t > 0, np.where(np.isfinite(v), v, 0) * t, 0)
     assert path.mu * path.count == pytest.approx(bounded[fluid].sum(), rel=1e-10)

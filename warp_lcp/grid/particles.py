@@ -23,7 +23,6 @@ CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host adds up
 CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
 GROWTH = 1.5  # of the storage when it is full: n appended particles are copied 2 n times at most, a third of it lies idle at most
-MOST_DIGITS = 2048  # of a round of the sort
 SORT_PIECES = 32  # of the keys that are sorted: with more there is more to add up between two passes
 SORT_EVERY = 8  # steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL 2, a sort costs 25 ns
 
@@ -140,7 +139,7 @@ class Particles:
             self._totals = LaunchGraph(grid.device, self._launch_totals)
             self._numbering = LaunchGraph(grid.device, self._launch_numbers)
             self._sorting, self._sort_rows, self._sort_pieces = LaunchGraph(grid.device, self._launch_sort), RowsMemory(), Scalar()
-            self._counts = wp.zeros(SORT_PIECES * (MOST_DIGITS + kernels.APART), dtype=wp.int32, device=grid.device)
+            self._counts = wp.zeros(0, dtype=wp.int32, device=grid.device)
         self._last: ParticleTotals | None = None
         self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
@@ -334,6 +333,10 @@ class Particles:
                 self.offsets.zero_()
             return
         if self._tally is None:
+            least = int(self._sort_pieces.value) * ((1 << digits_of(grid.size.bit_length())[1]) + kernels.APART)
+            if self._counts.size < least:
+                self._counts = wp.zeros(least, dtype=wp.int32, device=grid.device)
+                self._sorting.forget()
             self._sorting.run(variant=grid.size.bit_length())
         else:
             self._launch_sort()
@@ -442,6 +445,12 @@ def _halves(array: wp.array) -> tuple[wp.array, wp.array]:
     return array[:half], array[half:]
 
 
+def digits_of(bits: int) -> tuple[int, int]:
+    """Return how many rounds sort keys of some bits, and the bits of a round."""
+    rounds = 2 * -(-bits // 22)  # an even number: the last one ends where the keys were; 2048 digits of a round stay in the L1 cache
+    return rounds, -(-bits // rounds)
+
+
 def sort_keys(
     keys: tuple[wp.array, wp.array], order: tuple[wp.array, wp.array], counts: wp.array, rows: Rows, pieces: int | Scalar, bits: int
 ) -> None:
@@ -450,14 +459,13 @@ def sort_keys(
     Args:
         keys: int32, not negative, and scratch memory of the same size.
         order: int32, which receives where each key was, and scratch memory.
-        counts: int32, scratch memory for `pieces` of 2048 digits and `APART` more.
+        counts: int32, scratch memory for `pieces` of a round's digits and `APART` more.
         rows: of the keys, a piece a task.
         pieces: how many there are.
         bits: that keys have at most.
     """
     device = counts.device
-    rounds = 2 * -(-bits // 22)  # an even number: the last one ends where the keys were; 2048 digits of a round stay in the L1 cache
-    each = -(-bits // rounds)
+    rounds, each = digits_of(bits)
     (here, there), (moved_to, moved_from), before = keys, order[::-1], None
     for shift in range(0, rounds * each, each):
         digits = 1 << each

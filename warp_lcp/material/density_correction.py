@@ -232,13 +232,21 @@ class DensityCorrection:
             self.x.zero_()
             return Correction(result, over_full, most)
         self._way.value = share * self.grid.spacing
-        self._displacing.run(result.x, variant=result.x.ptr)
+        self._displacing.run(self._kept_solution(result.x))
         self._displace_particles(particles)
         return Correction(result, over_full, most)
 
-    def _launch_displacement(self, x: wp.array) -> None:
-        """Launch the computation of the displacement on all faces."""
+    def _kept_solution(self, x: wp.array) -> wp.array | None:
+        """Return a solution that lies where the last one did; another, of a method in single precision, is taken here."""
+        if x.dtype is wp.float64:
+            return x
         self._take(x)
+        return None
+
+    def _launch_displacement(self, x: wp.array | None) -> None:
+        """Launch the computation of the displacement on all faces."""
+        if x is not None:
+            self._take(x)
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None

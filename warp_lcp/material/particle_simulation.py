@@ -289,7 +289,8 @@ class ParticleSimulation(ParticleCheckpoints):
         with self.watch.stage("particles-to-grid", *p.arrays().values(), *self.velocity, *self.weights):
             for kick, change in zip(self.kicks, self.gravity * self.kick_dt, strict=True):
                 kick.value = float(change)
-            self._transfer_to_grid.run(window, variant=window.near is None)
+            acts = tuple(kick.value != 0.0 for kick in self.kicks)  # gravity may be turned between steps
+            self._transfer_to_grid.run(window, variant=(window.near is None, acts))
 
     def _launch_particles_to_grid(self, window: Window) -> None:
         p = self.particles
