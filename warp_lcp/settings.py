@@ -83,9 +83,9 @@ class Settings:
         Raises:
             SettingError: a field is outside its range.
         """
-        kind: Any = type(self)
-        defaults = checked_defaults(kind)
-        for name, annotation in ranges(kind).items():
+        kind = type(self)
+        defaults = checked_defaults(kind)  # type: ignore[arg-type]  # a class has a hash
+        for name, annotation in ranges(kind).items():  # type: ignore[arg-type]
             value = getattr(self, name)
             raw, known = defaults.get(name, (None, None))
             found = known if raw is not None and value is raw else checked(name, value, annotation)
@@ -175,7 +175,8 @@ def checked(name: str, given: object, annotation: Any) -> Any:
 @cache
 def checked_defaults(settings: type[Any]) -> dict[str, tuple[Any, Any]]:
     """Return the default of each field of a dataclass that has one, as it is written and as the field's type."""
-    hints, defaults = ranges(settings), {field.name: field.default for field in dataclasses.fields(settings)}
+    hints = ranges(settings)  # type: ignore[arg-type]
+    defaults = {field.name: field.default for field in dataclasses.fields(settings)}
     return {
         name: (value, checked(name, value, hints[name]))
         for name, value in defaults.items()

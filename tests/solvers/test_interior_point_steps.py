@@ -135,7 +135,8 @@ def compare(method, work, problem, plain, place, steps, tolerance):
         sides = (("w", plain.w, plain.low), ("s", plain.s, plain.low), ("v", plain.v, plain.high), ("t", plain.t, plain.high))
         for name, own, there in sides:
             if work._upper or name in "ws":
-                np.testing.assert_allclose(getattr(work._pairs, name).numpy()[place][there], own[there], rtol=1e-5, atol=tolerance, err_msg=name)
+                found = getattr(work._pairs, name).numpy()[place][there]
+                np.testing.assert_allclose(found, own[there], rtol=1e-5, atol=tolerance, err_msg=name)
 
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])

@@ -114,6 +114,7 @@ class CutCells:
             self.moving.moves = wp.array([False, *(s.motion is not None for s in solids)], dtype=wp.uint8, device=grid.device)
             self.place(0.0)
         else:
+            self._join()
             self._refresh()
         dropped, partial = self._counts.numpy().tolist()
         self.whole_cells = partial == 0 and not self.moves and not self._reaches_into_open_cells()

@@ -446,7 +446,7 @@ def _halves(array: wp.array) -> tuple[wp.array, wp.array]:
 
 
 def digits_of(bits: int) -> tuple[int, int]:
-    """Return how many rounds sort keys of some bits, and the bits of a round."""
+    """Return the rounds of the sort of keys of some bits, and the bits of a round."""
     rounds = 2 * -(-bits // 22)  # an even number: the last one ends where the keys were; 2048 digits of a round stay in the L1 cache
     return rounds, -(-bits // rounds)
 
