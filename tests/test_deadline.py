@@ -100,7 +100,8 @@ def test_inner_iterations_look_at_the_clock(solve):
     for problem in (case("grid", "")[0], *(wl.LCP(A, b) for A in numbered)):
         result, looks = solve(problem, wl.InteriorPoint(), 1e6)
         assert result.linear_iterations > result.iterations
-        assert looks >= result.linear_iterations
+        native = isinstance(problem.A, wl.GridPoisson)  # whose inner loop ends by itself when its time is over
+        assert looks > (result.iterations if native else result.linear_iterations - 1)
         assert solve(problem, wl.InteriorPoint(), looks - 2)[0].status is S.TIME_LIMIT
 
 

@@ -157,7 +157,7 @@ def launch_ranges(
         made = wp.launch(kernel, (1,) * len(dim), [value_of(v) for v in inputs], device=device, record_cmd=True)
         memory = arguments_of(made)
         patches = [*([first] if first else ()), *_patches(inputs, kernel, memory)] if recorded else ()
-        stage = Stage(Entry(made), memory, inputs, tasks // dim[0] if dim[0] else 0, dim[0], patches=patches)
+        stage = Stage(Entry(made), memory, (inputs, extent), tasks // dim[0] if dim[0] else 0, dim[0], patches=patches)
         perform(ranges(stage, cells, ordered=ordered, sized=sized if recorded else 0), launch or wp.launch)
 
 
