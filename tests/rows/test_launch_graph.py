@@ -176,6 +176,21 @@ def test_variants_are_recorded_for_themselves():
     assert calls == [False, True, True]
 
 
+def test_a_recording_outlives_its_team():
+    """Threads are set to others and back: the recording is valid, the team is another one."""
+    before, a = wl.get_threads(), wp.ones(3, dtype=wp.float32)
+    graph = LaunchGraph(a.device, lambda: clear(a))
+    try:
+        for threads in (1, 2, 1, 3, 1):
+            wl.set_threads(threads)
+            if threads == 1:
+                a.fill_(1.0)
+                graph.run()
+                assert not a.numpy().any()
+    finally:
+        wl.set_threads(before)
+
+
 def test_a_changed_recording_is_found(guarded):
     """What a recording depends on, but does not read from memory, is found by recording anew."""
     fields = [wp.zeros(3, dtype=wp.float32), wp.zeros(3, dtype=wp.float32)]

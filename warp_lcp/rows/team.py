@@ -235,7 +235,7 @@ class Table:
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
         self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
         self.cut = total > len(self._kept)
-        self.asked: Arguments | None = None  # of a team of one thread, which is the same as long as that
+        self.asked: Arguments | None = None  # of the last team of one thread
 
 
 class Team:
@@ -297,7 +297,7 @@ class Team:
     def _run_alone(self, table: Table) -> None:
         """Work through a table with the caller's thread."""
         asked = table.asked
-        if asked is None:
+        if asked is None or asked.team != self.address:  # of another team, which is gone
             asked = table.asked = Arguments(self.address, table.address, RUN, 0, DONE_ALONE, PATIENCE)
         try:
             self._do(asked)
