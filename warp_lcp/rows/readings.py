@@ -48,9 +48,10 @@ class Reading:
     def numpy(self) -> np.ndarray:
         """Return the numbers as they are after all that has been launched, not to be written to."""
         if self._board is None:
-            if self._view is None:
-                self._view = self.array.numpy()
-            return self._view
+            found = self.array.numpy() if self._view is None else self._view
+            if self.array.device.is_cpu:  # the memory itself; of a GPU whose board is full it is a copy
+                self._view = found
+            return found
         return self._board.fetched(self._change)[self._slice].view(self._kind)
 
 
