@@ -59,8 +59,6 @@ class RunAhead:
     def suits(work: MultigridWorkspace) -> bool:
         """Return whether the device can do without its host: where loops run on it, on a grid in one process."""
         plain = type(work.hierarchy) is Hierarchy and isinstance(work.problem.A, GridPoisson)
-        if work.A.device.is_cuda and not work.exact:  # a rounded iterate cannot be undone: the host looks after each step there
-            return False
         return plain and work.problem.layout.across is None and loops_on_device(work.A.device)
 
     def steps(self, tolerance: float, left: int) -> bool:
