@@ -77,7 +77,7 @@ class SurfaceTension:
         self._scale, self._factor = Scalar(), Scalar()  # kick_dt sigma / (rho dx^2); by which gradients are multiplied
         self._measured: ActiveWindow | None = None  # cells whose energy has been measured; None: none have liquid
         self._cells = ActiveWindow(grid.domain)
-        self._pushing = LaunchGraph(grid.device, self._push, at_once=boundary.moves)  # lists of wall cells are made anew
+        self._pushing = LaunchGraph(grid.device, self._push, at_once=boundary.moves)  # the lists of wall cells are rebuilt
         self._calming = LaunchGraph(grid.device, self._calm)
         self._measuring = LaunchGraph(grid.device, lambda kind: self._energy.take(self._cells, **self._faces(kind), **self._shares))
         self._find_walls()

@@ -85,7 +85,7 @@ class WallDrag:
     def _slow_down(
         self, sums: WallSums, window: Window, velocity: Sequence[wp.array], projection: PressureProjection, phi: wp.array | None
     ) -> None:
-        """Launch the drag, whose impulses nobody asks for."""
+        """Launch the drag without the output of impulses."""
         for given in self._given(sums, velocity, projection, phi, apply=True):
             sums.launch(drag_kernel, window, given)
 

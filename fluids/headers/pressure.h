@@ -94,7 +94,7 @@ SIMD8 for (int i = edge; i < last; ++i) {
 // kernel fluids.pressure.support: Give faces with weight beside projected ones their change, up to
 // `limit` [m/s] and not beyond them; they become 2. Open faces between AIR cells that particles
 // gave weight, beside projected ones. All that a face reads of others is of projected ones, which
-// nobody writes here, so that the order does not matter.
+// no other task writes here: the order does not matter.
 //   compute    float64
 //   box        int8 kind; float32 open_x?, open_y?, open_z?, solid_x?, solid_y?, solid_z?, phi?;
 //              float64 x; float32 field; int8 known; float32 weight, jump?

@@ -1,4 +1,4 @@
-"""Steps whose launches are recorded once and run again, against the same launches made anew in each step."""
+"""Recorded steps against steps that launch at once."""
 
 from typing import Any
 
@@ -29,10 +29,10 @@ def steps(tables: dict[str, Any]) -> tuple[LiquidSimulation, list[dict[str, Any]
 
 @pytest.mark.parametrize("model", MODELS)
 def test_recorded_launches_give_the_same_bits(monkeypatch, model):
-    """Positions, velocities and log are those of launches that are made anew."""
+    """Positions, velocities and log equal those of launches at once."""
     recorded, rows = steps(MODELS[model])
     monkeypatch.setattr(LaunchGraph, "run", lambda graph, *given, variant=None: graph._record(*given))
-    anew, expected = steps(MODELS[model])
+    direct, expected = steps(MODELS[model])
     assert rows == expected
     for name, array in recorded.particles.arrays().items():
-        assert np.array_equal(array.numpy(), anew.particles.arrays()[name].numpy()), name
+        assert np.array_equal(array.numpy(), direct.particles.arrays()[name].numpy()), name

@@ -103,7 +103,7 @@ def test_a_list_may_be_replaced_and_grow():
         program.run()
         np.testing.assert_array_equal(values.numpy(), np.full(len(values), number, dtype=np.float32))
     memory.take(Rows.listed(20, DEVICE, 1).single)
-    assert not program.fits()  # it must be captured anew
+    assert not program.fits()  # it must be captured again
 
 
 def test_what_a_graph_cannot_hold_is_refused():

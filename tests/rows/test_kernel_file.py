@@ -174,7 +174,7 @@ def test_every_kernel_and_snippet_is_taken():
     words = {word for path in (*SOURCES, *headers) for word in re.findall(r"""["'.:]([\w.]+)["']""", SOURCES.get(path) or path.read_text())}
     for header in headers:
         for section in sections(header).values():
-            assert {section.name, section.name.rpartition(".")[2]} & words, f"{header}:{section.line}: nobody takes {section.name}"
+            assert {section.name, section.name.rpartition(".")[2]} & words, f"{header}:{section.line}: no Python module uses {section.name}"
             assert section.kind == "snippet" or header in users, header
 
 

@@ -31,7 +31,7 @@ def threads(request):
 
 @pytest.fixture
 def guarded(monkeypatch):
-    """Have each run record anew and compare, and refuse what does not belong into a recording."""
+    """Record again in each run and compare; refuse direct launches and reads while recording."""
     monkeypatch.setattr(LaunchGraph, "verify", True)
 
     def refuse(owner, name):
@@ -192,7 +192,7 @@ def test_a_recording_outlives_its_team():
 
 
 def test_a_changed_recording_is_found(guarded):
-    """What a recording depends on, but does not read from memory, is found by recording anew."""
+    """`verify` finds an array that was replaced without a slot."""
     fields = [wp.zeros(3, dtype=wp.float32), wp.zeros(3, dtype=wp.float32)]
     graph = LaunchGraph(fields[0].device, lambda: clear(fields[0]))
     graph.run()
@@ -261,7 +261,7 @@ SCENES = {
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_step_records_nothing_that_changes(scene, guarded):
-    """Recordings of a step stay what they were: each run records anew and compares."""
+    """The recorded launches of a step do not change from step to step."""
     resolution, _ = SCENES[scene]
     run = wl.Run(scene, resolution=resolution, device="cpu")
     simulation = next(iter(run)).simulation

@@ -83,23 +83,23 @@ ROUNDED = 1e-10  # of the terms of a sum whose weights were computed
 
 @dataclass(frozen=True, slots=True)
 class FaceCoefficients:
-    """Coefficients of the lower faces of cells, which join these.
+    """Coefficients of the lower faces of cells.
 
     Attributes:
-        face_x: along x, a stored field; empty: `cx` everywhere.
-        face_y: along y; empty: `cy`.
-        face_z: along z; empty: `cz`.
-        cx: the same along x for all faces.
-        cy: likewise along y.
-        cz: likewise along z.
+        fx: along x, a stored field; None: `nx` everywhere.
+        fy: along y; None: `ny`.
+        fz: along z; None: `nz`.
+        nx: the same along x for all faces.
+        ny: likewise along y.
+        nz: likewise along z.
     """
 
-    face_x: wp.array[Any]
-    face_y: wp.array[Any]
-    face_z: wp.array[Any]
-    cx: float
-    cy: float
-    cz: float
+    fx: wp.array[Any] | None
+    fy: wp.array[Any] | None
+    fz: wp.array[Any] | None
+    nx: float
+    ny: float
+    nz: float
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/components.h")
@@ -322,8 +322,7 @@ class ComponentFinder:
                 )
             scratch = self._own
         parent, grounded = scratch[0].view(wp.int32), scratch[1]
-        cells, (x, y, z) = A.cells_around.flatten(), (face.flatten() for face in A.faces)
-        faces = FaceCoefficients(x, y, z, *A.uniform)
+        cells, faces = A.cells_around.flatten(), A.face_coefficients
         SINGLETONS.bind(rows, parent=parent, grounded=grounded).launch(launch)
         UNITE.bind(rows, faces, cells=joined.flatten(), parent=parent).launch(launch)
         GROUND.bind(rows, faces, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded).launch(launch)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
+from warp_lcp.operators.components import ComponentFinder, FaceCoefficients, FloatingComponents, Scratch
 from warp_lcp.operators.grid_operator import GridOperator, check_coefficients
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
@@ -29,27 +28,6 @@ __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
 Face = Any  # a number or an array
 AXES = "xyz"
-
-
-@dataclass(frozen=True, slots=True)
-class StoredFaces:
-    """Coefficients of the lower faces of cells.
-
-    Attributes:
-        fx: along x, a stored field; None: `nx` everywhere.
-        fy: along y; None: `ny`.
-        fz: along z; None: `nz`.
-        nx: the same along x for all faces.
-        ny: likewise along y.
-        nz: likewise along z.
-    """
-
-    fx: wp.array[Any] | None
-    fy: wp.array[Any] | None
-    fz: wp.array[Any] | None
-    nx: float
-    ny: float
-    nz: float
 
 
 class GridPoisson(GridOperator):
@@ -237,6 +215,12 @@ class GridPoisson(GridOperator):
         total, count = sums if across is None else across.sum(sums)
         return float(total / max(count, 1))
 
+    @property
+    def face_coefficients(self) -> FaceCoefficients:
+        """Coefficients of the faces as kernels take them."""
+        fx, fy, fz = (f.flatten() if f.size else None for f in self.faces)
+        return FaceCoefficients(fx, fy, fz, *self.uniform)
+
     records = True
 
     def _fill_stencil(self) -> None:
@@ -248,8 +232,7 @@ class GridPoisson(GridOperator):
             x, y, z = (c > 0 for c in self.uniform)
             COUNT_FACES.bind(reach, cells=cells, diagonal=s.d, around_x=x, around_y=y, around_z=z).launch()
             return
-        fx, fy, fz = (f.flatten() if f.size else None for f in self.faces)
-        faces = StoredFaces(fx, fy, fz, *self.uniform)
+        faces = self.face_coefficients
         x, y, z = (f.size > 0 for f in self.faces)
         shift = self.shift.flatten() if self.shift.size else None
         DIAGONAL.bind(

@@ -442,7 +442,7 @@ class _LoopInBox(_Loop):
         return SolveStatus.INFEASIBLE if lost > self.tolerance else None
 
     def _begin_ahead(self, work: BeginsAhead, x0: Array | None) -> bool:
-        """Let the device begin; return whether it has. It takes no step ahead of somebody who looks at each, or of a deadline."""
+        """Begin on the device; return whether it has begun. With a callback, merits or a deadline the host takes each step."""
         watched = self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
         work.allow(0 if watched else self.stopping.max_iterations)
         if x0 is None or watched:

@@ -76,7 +76,7 @@ def value_of(number: Any) -> Any:
 
 
 class Slot:
-    """Where an array lies that is replaced by others between runs: the arrays that stand for it have it as their `slot`."""
+    """Address of an array that other arrays replace between runs; the current array has it as attribute `slot`."""
 
     __slots__ = ("_memory", "address")
 

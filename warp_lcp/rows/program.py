@@ -403,7 +403,7 @@ class LaunchGraph:
     """
 
     on_device: ClassVar[bool] = False  # whether CUDA graphs are captured: rehearsed on the CPU, not yet run on a GPU
-    verify: ClassVar[bool] = False  # whether each run records anew and compares: a test finds what changes though it must not
+    verify: ClassVar[bool] = False  # whether each run records again and compares with the first recording, for tests
 
     def __init__(self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False) -> None:
         self.device, self._record, self.at_once = device, record, at_once
@@ -453,7 +453,7 @@ class LaunchGraph:
         program.run()
 
     def forget(self) -> None:
-        """Record anew in the next run: arrays are others."""
+        """Record again in the next run, since arrays have been replaced."""
         self._programs = {}
 
     def _recorded(self, arguments: tuple[Any, ...]) -> Program:

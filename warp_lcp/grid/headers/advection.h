@@ -1,6 +1,6 @@
 // Kernels of advection: of particles, and of fields.
 
-// snippet runge_kutta: A third-order Runge-Kutta step of particles, whatever it is that stops
+// snippet runge_kutta: A third-order Runge-Kutta step of particles; the kernel says what stops
 // them. That is two functions on a block of n particles: prepare(n) once a step, and move(a, A, b,
 // B, c, C, n), which sets `to` to what can be reached from `from` on the way to from + a A + b B +
 // c C, and `hit` to whether something was in the way. They may note particles in `list`.
@@ -104,7 +104,7 @@ auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, i
         begin[m] = (int)(k*s1 + j*s2 + i - back); end[m] = (int)(K*s1 + J*s2 + I - back); cells[m] = stays ? -1 : most;
     }
     int careful = 0;
-    for (int m = 0; m < n; ++m) {  // no branches: half of the particles change cells, and nobody guesses which
+    for (int m = 0; m < n; ++m) {  // no branches: half of the particles change cells, which no branch predictor foresees
         list[careful] = m;
         careful += (int)(cells[m] >= 0) & ((int)(room[begin[m]] <= cells[m]) | (int)(room[end[m]] <= 1));
     }

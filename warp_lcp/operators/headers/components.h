@@ -2,11 +2,11 @@
 
 // snippet joined: Where faces join cells, and the roots of their trees
 const auto* c = cells; int* P_ = parent; const long long s1 = zp, s2 = yp;
-const auto x = [&](long long k) { return face_x ? face_x[k] > 0 : cx > 0; };
-const auto y = [&](long long k) { return face_y ? face_y[k] > 0 : cy > 0; };
-const auto z = [&](long long k) { return face_z ? face_z[k] > 0 : cz > 0; };
+const auto x = [&](long long k) { return fx ? fx[k] > 0 : nx > 0; };
+const auto y = [&](long long k) { return fy ? fy[k] > 0 : ny > 0; };
+const auto z = [&](long long k) { return fz ? fz[k] > 0 : nz > 0; };
 const auto find = [&](int i) { while (P_[i] != i) i = P_[i]; return i; };
-const bool uniform = !face_x && !face_y && !face_z;
+const bool uniform = !fx && !fy && !fz;
 
 // kernel components.singletons: every cell is a tree of its own, and hangs on nothing
 //   compute    float32
@@ -17,9 +17,9 @@ for (int k = 0; k < n; ++k) { parent[k] = (int)(p + k); grounded[k] = 0; }
 // that trees do not depend on the order of threads; a lost race is seen in what the atomic minimum
 // returns, and tried again
 //   compute    float32
-//   reads      int8 cells; F face_x?, face_y?, face_z?
+//   reads      int8 cells; F fx?, fy?, fz?
 //   whole      int32 parent
-//   numbers    float64 cx, cy, cz
+//   numbers    float64 nx, ny, nz
 //   ordered
 #include "joined"
 const bool first = P.first == 0;  // from there a periodic axis leads to the last cell, from other rows to the one below
@@ -33,7 +33,7 @@ const auto unite = [&](int i, int j) {
         a = find(old); b = find(b); } };
 // what to join is found in bytes, many cells at a time: 1 the cell to the left, 2 the one below along y, 4 along z; the cell to the
 // left has been joined to its own lower neighbors, and those joined to ours need no more
-const unsigned char ax = cx > 0, ay = cy > 0, az = cz > 0;
+const unsigned char ax = nx > 0, ay = ny > 0, az = nz > 0;
 unsigned char join[M];
 for (int begin = 0; begin < n; begin += M) {
     const int m = n - begin < M ? n - begin : (int)M; const signed char* e = c + begin;
@@ -67,12 +67,12 @@ for (int begin = 0; begin < n; begin += M) {
 
 // kernel components.ground: Mark the roots of what AIR or a shift holds
 //   compute    float32
-//   reads      int8 cells; F face_x?, face_y?, face_z?, shift?
+//   reads      int8 cells; F fx?, fy?, fz?, shift?
 //   whole      int32 parent; uint8 grounded
-//   numbers    float64 cx, cy, cz
+//   numbers    float64 nx, ny, nz
 #include "joined"
 if (uniform && !shift) {
-    const unsigned char ax = cx > 0, ay = cy > 0, az = cz > 0; unsigned char hit[M];
+    const unsigned char ax = nx > 0, ay = ny > 0, az = nz > 0; unsigned char hit[M];
     for (int begin = 0; begin < n; begin += M) {
         const int m = n - begin < M ? n - begin : (int)M; const signed char* e = c + begin; unsigned char any = 0;
         SIMD for (int k = 0; k < m; ++k) {
