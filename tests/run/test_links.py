@@ -169,7 +169,7 @@ def test_a_folder_that_becomes_a_link_while_it_runs(scene, tmp_path, name):
                 while not (out / "checkpoints" / "step_000001.npz").exists():  # written beside the run, after the first frame
                     time.sleep(0.01)
                 shutil.copytree(out / name, elsewhere)
-                shutil.rmtree(out / name)
+                (out / name).rename(tmp_path / "before")  # at once: a thread may be writing
                 (out / name).symlink_to(elsewhere)
                 self.before = content(elsewhere)
 

@@ -1,6 +1,7 @@
 """What a device does of a solve without its host is what the host would have had it do, on the CPU and, emulated, on CUDA."""
 
 import sys
+import weakref
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.stopping import MeanCriteria
-from warp_lcp.rows.readings import BYTES, LINE, Reading, board_of
+from warp_lcp.rows.readings import BYTES, LINE, Reading
 from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 emulated = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there")
@@ -102,7 +103,10 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     from benchmarks.emulated_cuda import meter
 
     device = wp.get_device("cpu")
-    board, (a, c) = board_of(device.alias), (Reading(device, 2), Reading(device, 3, wp.int32))
+    a, c = Reading(device, 2), Reading(device, 3, wp.int32)
+    board = a._board
+    assert board is not None
+    assert c._board is board
     a.array.fill_(1.5)
     c.array.fill_(7)
     a.changed()
@@ -119,9 +123,17 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     for _ in range(3):
         Reading(device, 2)
     assert board._end <= end + LINE
-    many = [Reading(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]  # more than there is room for: each has memory of its own
+    circle: list[Any] = [Reading(device, 2)]
+    circle.append(circle)
+    held = weakref.ref(circle[0])
+    del circle
+    many = [Reading(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]  # more than there is room for: a second board has the rest
+    assert held() is None  # what nobody has any more is given back before
+    assert many[-1]._board is many[-2]._board is not board
+    assert Reading(device, 2 * BYTES).numpy().size == 2 * BYTES  # larger than a board is by default
     for value in (3.0, 4.0):  # what is read is what is there, however often
         many[-1].array.fill_(value)
+        many[-1].changed()
         assert (many[-1].numpy() == value).all()
 
 

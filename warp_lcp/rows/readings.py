@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import gc
 import weakref
 from typing import Any
 
@@ -25,20 +25,21 @@ class Reading:
     """
 
     _board: Board | None
+    _view: np.ndarray  # of an array that the host reads as it is
 
     def __init__(self, device: wp.Device, count: int = 1, dtype: Any = wp.float64) -> None:
         self.array: wp.array[Any]
         self._board, self._change = None, 0
-        self._view: np.ndarray | None = None  # of an array that the host reads as it is
-        board, size = board_of(device.alias) if device.is_cuda else None, count * wp.types.type_size_in_bytes(dtype)
-        place = None if board is None else board.take(size)
-        if board is None or place is None:
+        if not device.is_cuda:
             self.array = wp.zeros(count, dtype=dtype, device=device)
+            self._view = self.array.numpy()
             return
-        self.array = wp.array(ptr=board.memory.ptr + place, dtype=dtype, shape=count, device=device)
+        size = count * wp.types.type_size_in_bytes(dtype)
+        self._board, place = place_of(device, size)
+        self.array = wp.array(ptr=self._board.memory.ptr + place, dtype=dtype, shape=count, device=device)
         self.array.zero_()
-        self._board, self._slice, self._kind = board, slice(place, place + size), wp.dtype_to_numpy(dtype)
-        weakref.finalize(self, board.give_back, place, size)
+        self._slice, self._kind = slice(place, place + size), wp.dtype_to_numpy(dtype)
+        weakref.finalize(self, self._board.give_back, place, size)
 
     def changed(self) -> None:
         """Say that launches have written to it."""
@@ -48,10 +49,7 @@ class Reading:
     def numpy(self) -> np.ndarray:
         """Return the numbers as they are after all that has been launched, not to be written to."""
         if self._board is None:
-            found = self.array.numpy() if self._view is None else self._view
-            if self.array.device.is_cpu:  # the memory itself; of a GPU whose board is full it is a copy
-                self._view = found
-            return found
+            return self._view
         return self._board.fetched(self._change)[self._slice].view(self._kind)
 
 
@@ -60,10 +58,11 @@ class Board:
 
     Args:
         device: where it is.
+        size: of it, in bytes.
     """
 
-    def __init__(self, device: wp.Device) -> None:
-        self.memory = wp.zeros(BYTES, dtype=wp.uint8, device=device)
+    def __init__(self, device: wp.Device, size: int = BYTES) -> None:
+        self.memory = wp.zeros(-(-size // LINE) * LINE, dtype=wp.uint8, device=device)
         self._host, self._end, self._changes, self._known = np.zeros(0, dtype=np.uint8), 0, 0, 0
         self._free: dict[int, list[int]] = {}  # places by their size
 
@@ -72,7 +71,7 @@ class Board:
         size = -(-size // LINE) * LINE
         if free := self._free.get(size):
             return free.pop()
-        if self._end + size > BYTES:
+        if self._end + size > self.memory.size:
             return None
         self._end += size
         self._known = -1  # what has been fetched is too short
@@ -94,7 +93,18 @@ class Board:
         return self._host
 
 
-@functools.cache
-def board_of(device: str) -> Board:
-    """Return a device's board."""
-    return Board(wp.get_device(device))
+_boards: dict[str, Board] = {}  # the newest of each device
+
+
+def place_of(device: wp.Device, size: int) -> tuple[Board, int]:
+    """Return a board of a device that has so many bytes free, and their place on it."""
+    board = _boards.get(device.alias) or _boards.setdefault(device.alias, Board(device))
+    place = board.take(size)
+    if place is None:
+        gc.collect()  # readings that only a circle of references still holds
+        place = board.take(size)
+    if place is None:  # the old one stays as long as its readings do
+        board = _boards[device.alias] = Board(device, max(size, BYTES))
+        place = board.take(size)
+        assert place is not None
+    return board, place

@@ -6,7 +6,7 @@ import json
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,8 +130,10 @@ class Profile:
             self.stages.setdefault(name, Stage(beside=True)).add(time.perf_counter() - begun)
 
     def wrote(self, name: str, *files: Path) -> None:
-        """Add the sizes of files to a stage."""
-        self.stages[name].bytes += sum(file.stat().st_size for file in files)
+        """Add the sizes of files to a stage, of those that nobody has moved since."""
+        for file in files:
+            with suppress(FileNotFoundError):
+                self.stages[name].bytes += file.stat().st_size
 
     def table(self, steps: int, seconds: float) -> str:
         """Return a table of the stages, and of what no stage accounts for.
