@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.fluids import surface_tension_kernels as kernels
+from warp_lcp.fluids.pressure import LiquidBoundary, three
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.level_set import REACH as REACH_OF_PHI
 from warp_lcp.grid.level_set_kernels import BINOMIAL
@@ -27,6 +28,23 @@ STIFFEST = 2.08  # the largest z^3 (2 exp(-z^2/2) - exp(-z^2)): of a filtered ca
 FARTHER = 9  # quarters of a cell from the mirror of a cell in a solid to where all cells around are open, at most
 REACH = 6  # cells around particles that are smoothed: two of the widest filter's spreads, with what `window` spares
 SAFETY = 3.0  # in the square of the longest step: particles add noise
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceShares:
+    """Smoothed shares of liquid in cells, and the series of the distance to the surface [cells] in them.
+
+    Attributes:
+        once: shares after the passes of the step, float32.
+        twice: after twice as many.
+        linear: first coefficient of the distance in 2 once - twice less 1/2.
+        cubic: third coefficient.
+    """
+
+    once: wp.array
+    twice: wp.array
+    linear: float
+    cubic: float
 
 
 class SurfaceTension:
@@ -79,7 +97,7 @@ class SurfaceTension:
         self._cells = ActiveWindow(grid.domain)
         self._pushing = LaunchGraph(grid.device, self._push, at_once=boundary.moves)  # the lists of wall cells are rebuilt
         self._calming = LaunchGraph(grid.device, self._calm)
-        self._measuring = LaunchGraph(grid.device, lambda kind: self._energy.take(self._cells, **self._faces(kind), **self._shares))
+        self._measuring = LaunchGraph(grid.device, lambda kind: self._energy.take(self._cells, self._faces(kind), self._shares))
         self._find_walls()
 
     def longest_step(self) -> float:
@@ -107,7 +125,7 @@ class SurfaceTension:
             self._find_walls()
         self._passes_done = passes = self._passes_for(kick_dt)
         self._once, self._twice, self._bend = self._roles(passes)
-        self._shares = {"once": self._once, "twice": self._twice, "planes": self.grid.planes, **_profile(passes)}
+        self._shares = SurfaceShares(self._once, self._twice, *_profile(passes))
         self._scale.value = kick_dt * self.coefficient / (self.density * self.grid.spacing**2)
         if self._cosine != 0.0:  # the last step has left those of its surface
             self._lean.fill_(self._cosine)
@@ -125,15 +143,16 @@ class SurfaceTension:
         grid, planes, bend = self.grid, self.grid.planes, self._bend
         self._find_curvature(window, passes)
         if self._cosine != 0.0:  # how the surface goes on into walls depends on its curvature
-            found = [self._shares[name] for name in ("linear", "cubic", "once", "twice")]
-            inputs = [*self._walls, self._raised, planes, 1.0 / (grid.dimension - 1), self._cosine, *found, bend, self._lean.flatten()]
+            s, bending = self._shares, 1.0 / (grid.dimension - 1)
+            shares = [s.linear, s.cubic, s.once, s.twice]
+            inputs = [*self._walls, self._raised, planes, bending, self._cosine, *shares, bend, self._lean.flatten()]
             launch_list(kernels.lean_kernel, len(self._walls[0]), inputs, device=grid.device)
             self._join(self._lean)
             self._find_curvature(window, passes)
-        window.run(kernels.JUMP, **self._shares, bend=bend, jump=self.jump, kind=kind, scale=self._scale)
+        window.run(kernels.JUMP, self._shares, planes=planes, bend=bend, jump=self.jump, kind=kind, scale=self._scale)
         self._join(self.jump)
         for axis, field in enumerate(velocity):
-            window.run(self._passes.push, **self._faces(kind), planes=planes, jump=self.jump, field=field, axis=axis)
+            window.run(self._passes.push, self._faces(kind), jump=self.jump, field=field, axis=axis)
 
     def _find_curvature(self, window: Window, passes: int) -> None:
         """Find the curvature [1/cells] in cells near the surface, and continued into walls: its nearest point may lie in one."""
@@ -143,7 +162,7 @@ class SurfaceTension:
         window.launch(kernels.share_kernel, [self._phi, self._blocked, capacity, self._cosine, first])
         once = self._smoothed(window, first, free, passes, 0)
         self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
-        window.run(kernels.CURVATURE, **self._shares, bend=self._bend, limit=self._most)
+        window.run(kernels.CURVATURE, self._shares, planes=self.grid.planes, bend=self._bend, limit=self._most)
         self._join(self._bend)
         self._continue(self._bend, 0, 0.0)
 
@@ -184,9 +203,9 @@ class SurfaceTension:
         """Return the areas of surface and wet walls, in faces of cells."""
         return self._energy.read() if self._measured is not None else [0.0, 0.0]
 
-    def _faces(self, kind: wp.array) -> dict[str, Any]:
-        open_faces = {f"open_{axis}": field for axis, field in zip("xyz", [*self.boundary.open, None, None, None], strict=False)}
-        return {"kind": kind, "phi": self._phi, **open_faces, **{f"solid_{axis}": None for axis in "xyz"}}
+    def _faces(self, kind: wp.array) -> LiquidBoundary:
+        """Return the cells, the surface and the walls, which rest."""
+        return LiquidBoundary(kind, self._phi, self.grid.planes, *three(self.boundary.open), *three(()))
 
     def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
         """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
@@ -222,11 +241,11 @@ class SurfaceTension:
         *self._walls, self._raised = (wp.array(v, dtype=kind, device=device) for v, kind in zip(lists, kinds, strict=True))
 
 
-def _profile(passes: int) -> dict[str, float]:
+def _profile(passes: int) -> tuple[float, float]:
     """Return the series of the distance [cells] in the share 2 once - twice less 1/2, across a plane."""
     narrow, wide = (math.sqrt(0.25 + 0.5 * count) for count in (passes, 2 * passes))
     first, third = ((2.0 / narrow**n - 1.0 / wide**n) / math.sqrt(2.0 * math.pi) for n in (1, 3))
-    return {"linear": 1.0 / first, "cubic": third / (6.0 * first**4)}
+    return 1.0 / first, third / (6.0 * first**4)
 
 
 def wall_cells(

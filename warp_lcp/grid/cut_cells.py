@@ -245,16 +245,19 @@ class CutCells:
         """Fill everything that follows from the distances."""
         grid, nodes = self.grid, self._nodes
         planes = grid.planes
-        faces = dict(zip(("ax", "ay", "az"), [*self.open, *self.open[1:2]], strict=False))  # in 2-D nothing is done to the third
-        walls = dict(zip(("wx", "wy", "wz"), [*self.wall, *self.wall[1:2]], strict=False))
-        nearest = dict(zip(("d", "o", "d2", "o2"), nodes.arrays, strict=True))
+        ax, ay, az = [*self.open, *self.open[1:2]][:3]  # in 2-D nothing is done to the third
+        wx, wy, wz = [*self.wall, *self.wall[1:2]][:3]
+        d, o, d2, o2 = nodes.arrays
         clear(self._counts)
         # the marks are in `base`, until the next kernel fills it
-        grid.domain.run(kernels.FRACTIONS, planes=planes, marks=self.base, counts=self._counts, **nearest, **faces, **walls)
+        grid.domain.run(
+            kernels.FRACTIONS, planes=planes, marks=self.base, counts=self._counts, d=d, o=o, d2=d2, o2=o2, ax=ax, ay=ay, az=az,
+            wx=wx, wy=wy, wz=wz,
+        )  # fmt: skip
         for number in range(2 * grid.dimension):
             if self.open_sides >> number & 1:
                 self._open_side(number >> 1, SIDES[number])
-        grid.domain.run(kernels.STATES, planes=planes, d=nodes.near, base=self.base, state=self._state, **faces)
+        grid.domain.run(kernels.STATES, planes=planes, d=nodes.near, base=self.base, state=self._state, ax=ax, ay=ay, az=az)
         if self.capacity is not None:
             integrate_kernel(grid.domain, planes, nodes.near, self._state, self.capacity, grid.origin)
             continue_beyond(grid, self.open_sides, self.capacity)

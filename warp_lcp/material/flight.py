@@ -70,12 +70,13 @@ class Flights:
 
     def _launch_growth(self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
         """Launch what grows the trees, and numbers the bodies."""
-        named = {"parent": self._parent, "held": self._held, "several": self._several}
-        around.run(kernels.ALONE, kind=kind, **named)
-        window.run(kernels.UNITE, **dict(zip("uvw", [*weights, None], strict=False)), parent=self._parent)
-        window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, **named)
+        parent, held, several = self._parent, self._held, self._several
+        u, v, w = [*weights, None][:3]
+        around.run(kernels.ALONE, kind=kind, parent=parent, held=held, several=several)
+        window.run(kernels.UNITE, u=u, v=v, w=w, parent=parent)
+        window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, parent=parent, held=held, several=several)
         clear(self._count.array)
-        around.run(kernels.NUMBER, kind=kind, **named, number=self._number, count=self._count.array)
+        around.run(kernels.NUMBER, kind=kind, parent=parent, held=held, several=several, number=self._number, count=self._count.array)
 
     def begin(
         self, particles: Particles, window: Window, weights: Sequence[wp.array], kind: wp.array, dt: float, change: np.ndarray

@@ -18,11 +18,12 @@ either sign; released cells and AIR lose it only where w < 0. 5. Faces of the ri
 
 import typing
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import warp as wp
 
+from warp_lcp.grid.advection import FaceVelocity
 from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
@@ -132,12 +133,56 @@ def extend_velocity(
         extrapolate(window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED, join=join)
 
 
-_COMPONENTS = tuple(f"{name}{c}" for name in ("", "known_", "wall_", "moving_") for c in "uvw")
-_NEAREST = ("owner", "next_near", "next_owner")
-
-
 CONSTRAIN = KERNELS["warp_lcp.material.cut_wall.constrain"]
 TAKE = KERNELS["warp_lcp.material.cut_wall.take"]
+
+
+@dataclass(frozen=True, slots=True)
+class WallFields:
+    """Walls that cut cells, as the kernel takes them that constrains velocities beside them; components along z are None in 2-D.
+
+    Attributes:
+        known_u: marks of the faces along x: 1 known, 0 not, -1 deep inside solids; int8.
+        known_v: likewise along y.
+        known_w: likewise along z.
+        wall_u: numbers of the walls that close the faces along x, int16.
+        wall_v: likewise along y.
+        wall_w: likewise along z.
+        moving_u: velocity of solids on the faces along x [m/s], float32; None: they rest.
+        moving_v: likewise along y.
+        moving_w: likewise along z.
+        owner: number of the solid nearest to each node, int16; None: there is one.
+        next_near: distance of the next one [cells].
+        next_owner: its number.
+        distance: to solids at nodes [cells], float32.
+        turn: rotation of each solid.
+        shift: position of each solid.
+        separating: whether material leaves each wall freely, uint8.
+    """
+
+    known_u: wp.array
+    known_v: wp.array
+    known_w: wp.array | None
+    wall_u: wp.array
+    wall_v: wp.array
+    wall_w: wp.array | None
+    moving_u: wp.array | None
+    moving_v: wp.array | None
+    moving_w: wp.array | None
+    owner: wp.array | None
+    next_near: wp.array | None
+    next_owner: wp.array | None
+    distance: wp.array
+    turn: wp.array
+    shift: wp.array
+    separating: wp.array
+
+    @classmethod
+    def of(cls, cut: CutCells, known: Sequence[wp.array]) -> "WallFields":
+        """Return the fields of walls, with the marks of each component's faces."""
+        components = [field for of in (known, cut.wall, cut.velocity or ()) for field in [*of, None, None, None][:3]]
+        nearest = cut.nearest or [None, None, None]
+        return cls(*[*components, *nearest, cut.distance, cut.turn, cut.shift, cut.separating])
 
 
 def extend_velocity_cut(
@@ -157,16 +202,9 @@ def extend_velocity_cut(
         extrapolate(window, marks, field, 1, join=join)
         window.run(KEEP_SPRAY, axis=axis, known=marks, weight=weight, kind=kind, open=fraction)
         extrapolate(window, marks, field, layers, join=join)
-    parts = zip(("", "known_", "wall_", "moving_"), (velocity, known, cut.wall, cut.velocity or ()), strict=True)
-    fields: dict[str, Any] = dict.fromkeys(_COMPONENTS) | {
-        f"{name}{c}": field for name, of in parts for c, field in zip("uvw", of, strict=False)
-    }
-    fields |= dict(zip(_NEAREST, cut.nearest or [None] * 3, strict=True)) | {"kind": kind, "contact": contact, "distance": cut.distance}
-    fields |= {"turn": cut.turn, "shift": cut.shift, "separating": cut.separating, "dx": cut.grid.spacing}
-    fields |= dict(zip(("before_x", "before_y", "before_z"), cut.grid.origin, strict=True))
-    faces = [{"known": m, "open": o, "result": r} for m, o, r in zip(known, cut.open, scratch, strict=True)]
-    planes = len(velocity) - 1
-    for axis, face in enumerate(faces):
-        window.run(CONSTRAIN, axis=axis, planes=planes, **face, **fields)
-    for axis, (face, field) in enumerate(zip(faces, velocity, strict=True)):
-        window.run(TAKE, axis=axis, planes=planes, **face, field=field)
+    faces, placement = FaceVelocity.of(velocity), cut.grid.placement
+    walls = WallFields.of(cut, known)
+    for axis, (marks, open_, result) in enumerate(zip(known, cut.open, scratch, strict=True)):
+        window.run(CONSTRAIN, placement, faces, walls, axis=axis, known=marks, open=open_, result=result, kind=kind, contact=contact)
+    for axis, (marks, open_, result, field) in enumerate(zip(known, cut.open, scratch, velocity, strict=True)):
+        window.run(TAKE, placement, axis=axis, known=marks, open=open_, result=result, field=field)
