@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.fluids.viscosity_bodies import BodyDrag, WallPull
+from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
 from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
@@ -182,7 +182,7 @@ class Viscosity:
         self._placed = True
         given = {"u": velocity, "kind": kind, "contact": contact}
         if self._bodies is not None:
-            self._bodies.take(self._fine, self._walls_of_faces, {"kind": kind, "contact": contact}, velocity)
+            self._bodies.take(self._fine, ViscousWalls(self._distance, self._slip, kind, contact), velocity)
             if self._bodies.moved:  # a recorded iteration knows where they lay
                 self._solver = self._krylov()
         first, lost, driven, stiff = self._force(given, changed=False)
@@ -231,8 +231,17 @@ class Viscosity:
     def _cover(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
         """Give faces in walls their velocity."""
         for axis, (total, u, own) in enumerate(zip(self.change, velocity, self._solids, strict=True)):
-            covered = {"hold": self._fine.hold[axis], "h": self._slip[axis], "own": own, "kind": kind, "base": self.boundary.base}
-            self._unknowns.run(self._passes.cover, total=total, u=u, axis=axis, **covered)
+            self._unknowns.run(
+                self._passes.cover,
+                total=total,
+                u=u,
+                hold=self._fine.hold[axis],
+                h=self._slip[axis],
+                own=own,
+                kind=kind,
+                base=self.boundary.base,
+                axis=axis,
+            )
 
     def _multigrid(self) -> VectorMultigrid:
         return VectorMultigrid(self.grid)
@@ -248,11 +257,6 @@ class Viscosity:
     def _share(self, fields: Sequence[wp.array]) -> None:
         """Take what other parts of the grid know of fields, if there are any."""
 
-    @property
-    def _walls_of_faces(self) -> dict[str, Sequence[wp.array]]:
-        """What `WallPull` takes of walls."""
-        return {"d": self._distance, "h": self._slip}
-
     def impulses(self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array, points: np.ndarray) -> np.ndarray:
         """Return what viscous stresses of the last step give the domain and each solid, shape (1 + solids, 6): N s, N m s.
 
@@ -264,7 +268,7 @@ class Viscosity:
         """
         if self._pull is None:
             self._pull = WallPull(self.grid, self.boundary, range(len(points)), len(points), self._passes)
-        self._pull.take(self._inner, self._fine, self._walls_of_faces, {"kind": kind, "contact": contact}, points)
+        self._pull.take(self._inner, self._fine, ViscousWalls(self._distance, self._slip, kind, contact), points)
         pulled, drags = self._pull.pulled(velocity, points)
         if isinstance(self.boundary, CutBoundary) and self.boundary.moves:
             turn, shift = self.boundary.cut.turn.numpy(), self.boundary.cut.shift.numpy()
@@ -317,8 +321,7 @@ class Viscosity:
         """Find the equations of a step, whose change is 0 yet."""
         clear(self._change)
         fine, boundary, passes, planes = self._fine, self.boundary, self._passes, self.grid.planes
-        slip, distance, where = self._slip, self._distance, {"kind": kind, "contact": contact}
-        edges: dict[str, Any] = {"xy": fine.edges[0, 1], "xz": fine.edges.get((0, 2)), "yz": fine.edges.get((1, 2))}
+        slip, distance = self._slip, self._distance
         walls: list[wp.array | None] = [None] * 3
         nodes = index = None
         if isinstance(boundary, CutBoundary):
@@ -327,26 +330,65 @@ class Viscosity:
             index = boundary.solids.index
         near = self._box if self._placed else self.grid.everywhere
         for axis in range(self.grid.dimension if self._walls_change or not self._placed else 0):
-            solids = {"nodes": nodes, "wall": walls[axis], "kind": kind, "index": index, "slip": self._slips, "walls": self._walls}
-            near.run(passes.distance, out=distance[axis], hold=slip[axis], axis=axis, planes=planes, **solids)
-        fields = zip("vdh", (fine.volume, distance, slip), strict=True)
-        faces: dict[str, Any] = {f"{letter}{axis}": field for letter, of in fields for axis, field in zip("xyz", [*of, None], strict=False)}
-        thick = dict(zip(("mx", "my", "mz"), [*self.relative, *[None] * 3], strict=False))
-        given: dict[str, Any] = {"cell": fine.cell, "mixed": fine.mixed, "phi": self._phi, "planes": planes, "scale": self._tau}
-        self._above.run(passes.weights, **given, **edges, **faces, **thick, **where)
+            near.run(
+                passes.distance,
+                out=distance[axis],
+                hold=slip[axis],
+                nodes=nodes,
+                kind=kind,
+                wall=walls[axis],
+                index=index,
+                slip=self._slips,
+                axis=axis,
+                planes=planes,
+                walls=self._walls,
+            )
+        (vx, vy, vz), (dx, dy, dz) = _three(fine.volume), _three(distance)
+        (hx, hy, hz), (mx, my, mz) = _three(slip), _three(self.relative)
+        self._above.run(
+            passes.weights,
+            cell=fine.cell,
+            mixed=fine.mixed,
+            xy=fine.edges[0, 1],
+            xz=fine.edges.get((0, 2)),
+            yz=fine.edges.get((1, 2)),
+            vx=vx,
+            vy=vy,
+            vz=vz,
+            dx=dx,
+            dy=dy,
+            dz=dz,
+            hx=hx,
+            hy=hy,
+            hz=hz,
+            phi=self._phi,
+            mx=mx,
+            my=my,
+            mz=mz,
+            kind=kind,
+            contact=contact,
+            planes=planes,
+            scale=self._tau,
+        )
         for axis in range(self.grid.dimension):
-            given = {"diagonal": fine.diagonal[axis], "drag": fine.drag[axis], "held": fine.hold[axis], "volume": fine.volume[axis]}
-            given |= {"d": distance[axis], "h": slip[axis], "cell": fine.cell, "axis": axis, "planes": planes}
-            self._above.run(passes.diagonal, **given, **fine.across(axis), **where)
+            self._above.run(
+                passes.diagonal,
+                fine.rows(axis),
+                held=fine.hold[axis],
+                d=distance[axis],
+                h=slip[axis],
+                kind=kind,
+                contact=contact,
+                planes=planes,
+            )
         self.multigrid.set_up()
 
-    def _motion(self, axis: int) -> dict[str, Any]:
-        """Return how solids that cut cells move, and whose a component's faces are."""
-        moves = isinstance(self.boundary, CutBoundary) and self.boundary.moves
-        cut: Any = self.boundary.cut if isinstance(self.boundary, CutBoundary) and moves else None
-        numbers = {name: None if cut is None else _numbers(getattr(cut, name)) for name in ("turn", "shift")}
-        origin = dict(zip(("before_x", "before_y", "before_z"), self.grid.origin, strict=True))
-        return {"wall": None if cut is None else cut.wall[axis]} | numbers | origin
+    def _motion(self, axis: int) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
+        """Return whose a component's faces are where solids cut cells and move, and how these turn and shift; else None."""
+        if not (isinstance(self.boundary, CutBoundary) and self.boundary.moves):
+            return None, None, None
+        cut = self.boundary.cut
+        return cut.wall[axis], _numbers(cut.turn), _numbers(cut.shift)
 
     @property
     def _solids(self) -> list[wp.array | None]:
@@ -372,21 +414,40 @@ class Viscosity:
         fine, solids = self._fine, self._solids
         residual, velocity, distance = self.multigrid.components(self.multigrid.r), given["u"], self._distance
         for axis in range(self.grid.dimension):
-            of = {"u": velocity[axis], "d": distance[axis], "h": self._slip[axis], "own": solids[axis]}
-            for name, fields in (("u", velocity), ("d", distance), ("solid_", solids)):
-                of |= dict(zip((f"{name}b", f"{name}c"), fine.of_others(axis, fields), strict=True))
-            of |= {"cell": fine.cell, "mixed": fine.mixed, "volume": fine.volume[axis], "diagonal": fine.diagonal[axis]}
-            of |= {"change": self.change[axis] if changed else None, "r": residual[axis], "axis": axis, "planes": self.grid.planes}
-            where = {
-                "kind": given["kind"],
-                "contact": given["contact"],
-                "base": self.boundary.base,
-                "dx": self.grid.spacing,
-            } | self._motion(axis)
-            self._sums[axis].take(self._unknowns, **of, **fine.across(axis), **where)
+            others = (fine.of_others(axis, fields) for fields in (velocity, distance, solids))
+            (ub, uc), (db, dc), (solid_b, solid_c) = others
+            wall, turn, shift = self._motion(axis)
+            self._sums[axis].take(
+                self._unknowns,
+                fine.rows(axis),
+                self.grid.placement,
+                kind=given["kind"],
+                contact=given["contact"],
+                base=self.boundary.base,
+                u=velocity[axis],
+                ub=ub,
+                uc=uc,
+                d=distance[axis],
+                db=db,
+                dc=dc,
+                h=self._slip[axis],
+                own=solids[axis],
+                solid_b=solid_b,
+                solid_c=solid_c,
+                wall=wall,
+                turn=turn,
+                shift=shift,
+                change=self.change[axis] if changed else None,
+                r=residual[axis],
+            )
 
 
 def _numbers(array: wp.array) -> wp.array:
     """Return vectors or matrices as the numbers that they lie in memory as."""
     size = array.size * array.strides[0] // 4
     return wp.array(ptr=array.ptr, dtype=wp.float32, shape=(size,), device=array.device, capacity=4 * size)
+
+
+def _three(fields: Sequence[Any]) -> list[Any]:
+    """Return fields of three components; in 2-D the third is None."""
+    return [*fields, None, None, None][:3]

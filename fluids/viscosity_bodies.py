@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,23 @@ from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Across
 
 SPARE = 1.5  # room for links, times those there are when there is none left
+
+
+@dataclass(frozen=True, slots=True)
+class ViscousWalls:
+    """Walls as viscous forces see them.
+
+    Attributes:
+        distance: of each component's faces from walls [cells].
+        slip: the slip length of those [cells].
+        kind: of cells.
+        contact: of cells.
+    """
+
+    distance: Sequence[wp.array]
+    slip: Sequence[wp.array]
+    kind: wp.array
+    contact: wp.array
 
 
 class WallPull:
@@ -48,37 +67,46 @@ class WallPull:
         self._owners = wp.array(owners, dtype=wp.int32, device=grid.device)
         self._counts = wp.zeros(grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
-    def take(
-        self,
-        window: Window | None,
-        level: VectorLevel,
-        walls: dict[str, Sequence[wp.array]],
-        where: dict[str, wp.array],
-        points: np.ndarray,
-    ) -> None:
+    def take(self, window: Window | None, level: VectorLevel, walls: ViscousWalls, points: np.ndarray) -> None:
         """Find `rows`, `blocks` and `values`.
 
         Args:
             window: cells with all faces beside the solids; None: there are none.
             level: the equations of the step.
-            walls: `d`, distance of each component's faces from walls [cells], and `h`, the slip length of those [cells].
-            where: `kind` and `contact` of cells.
+            walls: around the liquid.
             points: about which the solids turn [m], shape (solids, 3).
         """
-        grid, distance = self.grid, walls["d"]
+        grid, distance = self.grid, walls.distance
         owners: list[Any] = [*self.boundary.cut.wall] if isinstance(self.boundary, CutBoundary) else [None] * grid.dimension
         index = self.boundary.solids.index if isinstance(self.boundary, WholeCells) else None
-        given = where | {"body": self._owners, "center": wp.array(points.ravel(), dtype=wp.float64, device=grid.device), "index": index}
-        given |= {"cell": level.cell, "mixed": level.mixed, "planes": grid.planes, "dx": grid.spacing, "width": self.width}
-        given |= dict(zip(("before_x", "before_y", "before_z"), grid.origin, strict=True)) | {"counts": self._counts}
+        center = wp.array(points.ravel(), dtype=wp.float64, device=grid.device)
         found = [(np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros((0, self.width)))]
         for axis in range(grid.dimension if window is not None else 0):
             assert window is not None
-            of = given | level.across(axis) | {"axis": axis, "d": distance[axis], "h": walls["h"][axis], "diagonal": level.diagonal[axis]}
-            of |= {"wall": owners[axis], "from_": axis * grid.size}
-            of |= dict(zip(("db", "dc"), level.of_others(axis, distance), strict=True))
-            of |= dict(zip(("wall_b", "wall_c"), level.of_others(axis, owners), strict=True))
-            found.append(self._entries(window, of))
+            (db, dc), (wall_b, wall_c) = level.of_others(axis, distance), level.of_others(axis, owners)
+            links = partial(
+                window.run,
+                self._passes.links,
+                level.rows(axis),
+                grid.placement,
+                whole=True,
+                kind=walls.kind,
+                contact=walls.contact,
+                body=self._owners,
+                center=center,
+                index=index,
+                width=self.width,
+                counts=self._counts,
+                d=distance[axis],
+                db=db,
+                dc=dc,
+                h=walls.slip[axis],
+                wall=owners[axis],
+                wall_b=wall_b,
+                wall_c=wall_c,
+                from_=axis * grid.size,
+            )
+            found.append(self._entries(links))
         self.rows, self.blocks, self.values = (np.concatenate(parts) for parts in zip(*found, strict=True))
 
     def pulled(self, velocity: Sequence[wp.array], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -105,19 +133,18 @@ class WallPull:
             drags[n], sums[n] = 0.5 * (drag + drag.T), speeds[own] @ self.values[own]
         return sums, drags
 
-    def _entries(self, window: Window, given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return rows, solids and values of a component's entries."""
+    def _entries(self, links: Callable[..., None]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return rows, solids and values of a component's entries, which `links` counts and then writes."""
         device = self.grid.device
         self._counts.zero_()
-        window.run(self._passes.links, whole=True, **given, **dict.fromkeys(("offsets", "entry_rows", "blocks", "values")))
+        links(offsets=None, entry_rows=None, blocks=None, values=None)
         counts = self._counts.numpy().copy()
         total = int(counts.sum())
         rows, blocks = (wp.zeros(total, dtype=wp.int32, device=device) for _ in range(2))
         values = wp.zeros(total * self.width, dtype=wp.float64, device=device)
         if total:
             offsets = wp.array(np.cumsum(counts) - counts, dtype=wp.int32, device=device)
-            lists = {"offsets": offsets, "entry_rows": rows, "blocks": blocks, "values": values}
-            window.run(self._passes.links, whole=True, **given, **lists)
+            links(offsets=offsets, entry_rows=rows, blocks=blocks, values=values)
         return rows.numpy(), blocks.numpy(), values.numpy().reshape(-1, self.width)
 
 
@@ -157,14 +184,12 @@ class BodyDrag:
         self._response = wp.zeros((rank, rank), dtype=wp.float64, device=grid.device)
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
 
-    def take(
-        self, level: VectorLevel, walls: dict[str, Sequence[wp.array]], where: dict[str, wp.array], velocity: Sequence[wp.array]
-    ) -> None:
+    def take(self, level: VectorLevel, walls: ViscousWalls, velocity: Sequence[wp.array]) -> None:
         """Find what pulls the bodies in a step, and how they answer to the liquid's velocity as it is; arguments as of `WallPull`."""
         block, bodies, dimension = self.boundary.cut.moving_block(), self.bodies.bodies, self.grid.dimension
         window = None if block is None else self.grid.window(*block, grow=1).common(self._solved)
         points = np.array([body.position for body in bodies])
-        self._pull.take(window, level, walls, where, points)
+        self._pull.take(window, level, walls, points)
         pulled, drags = self._pull.pulled(velocity, points)
         if self.columns.across is not None:
             found = self.columns.across.sum(np.concatenate((pulled[:, None], drags), axis=1))

@@ -8,11 +8,12 @@ Gauss-Seidel takes one component after the other, two colors of rows each, and b
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.fluids.viscosity_passes import SHIFT, viscous_passes
+from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.staggered import CLEAR, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch, Program
@@ -21,6 +22,42 @@ LEAST = 8  # cells of the longest side at which there is no coarser level
 SWEEPS = 4  # of the coarsest level, each forth and back
 MIXED = 0.5  # of the finer level's: twice that is at most `cell`, so that cells' squares outweigh their products in 3-D, too
 WALL = 0.5  # of the finer level's drag by walls, in units of its own links: half of what is near one lies in its row
+
+
+@dataclass(frozen=True, slots=True)
+class ViscousRows:
+    """Equations of the faces of one component, float32 fields but for `span` and `axis`.
+
+    Attributes:
+        axis: of the component.
+        cell: weights of links along the axis.
+        mixed: of those, what is left out of the products of different components where walls are.
+        xb: weights of links across, towards the first of the other axes.
+        xc: likewise towards the second; None in 2-D.
+        volume: what weighs on the faces.
+        drag: what walls add to the diagonal.
+        diagonal: the sum, 0 where there is no unknown.
+        span: where each row's unknowns begin and end, and its core, int32.
+    """
+
+    axis: int
+    cell: wp.array
+    mixed: wp.array
+    xb: wp.array | None
+    xc: wp.array | None
+    volume: wp.array
+    drag: wp.array
+    diagonal: wp.array
+    span: wp.array
+
+
+@dataclass(frozen=True, slots=True)
+class LevelShift:
+    """Cells from cell 2n - 1 to the first cell of the finer level that is in cell n of a coarse one: not 0 in parts of grids."""
+
+    shift_x: int = 0
+    shift_y: int = 0
+    shift_z: int = 0
 
 
 class VectorLevel:
@@ -39,10 +76,10 @@ class VectorLevel:
             holds it; the interpolation's normalization; and what that is to find.
         r: the residual, and what a sweep keeps.
         span: where a row's unknowns begin and end, and its core, a run of cells with the equations of those around them.
-        shift: from cell 2n - 1 to the first cell of the finer level that is in cell n of this one; not 0 in parts of grids.
+        shift: from the finer level's cells to this one's.
     """
 
-    shift: dict[str, Any] = dict.fromkeys(SHIFT.split(), 0)
+    shift = LevelShift()
     odd_row, odd_cell = 0, 0  # whether row and cell 0 have the colors of row and cell 1 of the whole grid
 
     def __init__(self, grid: StaggeredGrid, x: list[wp.array], b: list[wp.array]) -> None:
@@ -61,15 +98,11 @@ class VectorLevel:
         """Return what other components have of fields, a field a component."""
         return [None if other is None else fields[other] for other in self.others(axis)]
 
-    def across(self, axis: int) -> dict[str, Any]:
-        """Return the weights of links across for a component."""
-        of = [None if other is None else self.edges[min(axis, other), max(axis, other)] for other in self.others(axis)]
-        return {"xb": of[0], "xc": of[1]}
-
-    def _row(self, axis: int, x: list[wp.array]) -> dict[str, Any]:
-        y, z = self.of_others(axis, x)
-        given = {"x": x[axis], "y": y, "z": z, "cell": self.cell, "mixed": self.mixed, "diagonal": self.diagonal[axis]}
-        return given | self.across(axis) | {"axis": axis, "span": self.span}
+    def rows(self, axis: int) -> ViscousRows:
+        """Return the equations of a component's faces."""
+        xb, xc = (None if other is None else self.edges[min(axis, other), max(axis, other)] for other in self.others(axis))
+        on_faces = (self.volume[axis], self.drag[axis], self.diagonal[axis])
+        return ViscousRows(axis, self.cell, self.mixed, xb, xc, *on_faces, self.span)
 
     @property
     def equations(self) -> list[wp.array]:
@@ -105,26 +138,41 @@ class VectorLevel:
     def sweep(self, forth: bool, launch: Launch, *, band: bool = False) -> None:
         """Relax all components, the last one first if not forth; in a band at surfaces and walls alone if asked."""
         for axis in range(self.dimension) if forth else reversed(range(self.dimension)):
+            rows, (y, z) = self.rows(axis), self.of_others(axis, self.x)
             for left, color in (1, 0), (0, 1):
-                given = self._row(axis, self.x) | {"b": self.b[axis], "scratch": self.r[axis], "band": int(band)}
-                given |= {"color": color ^ self.odd_row ^ int(not forth), "order": int(not forth) ^ self.odd_cell}
+                order = int(not forth) ^ self.odd_cell
                 window = self.around(1 + left)
-                if self.grid.device.is_cuda:
-                    for parity in (0, 1):
-                        window.run(self.passes.sweep, launch=launch, only=parity ^ given["order"], **given)
-                else:
-                    window.run(self.passes.sweep, whole=True, launch=launch, only=-1, **given)
+                for only in (order, 1 ^ order) if self.grid.device.is_cuda else (-1,):
+                    window.run(
+                        self.passes.sweep,
+                        rows,
+                        whole=only < 0,
+                        launch=launch,
+                        x=self.x[axis],
+                        y=y,
+                        z=z,
+                        b=self.b[axis],
+                        scratch=self.r[axis],
+                        color=color ^ self.odd_row ^ int(not forth),
+                        order=order,
+                        only=only,
+                        band=int(band),
+                    )
             self.share([self.x[axis]], launch)
 
     def residual(self, launch: Launch) -> None:
         """Find r = b - A x."""
         for axis in range(self.dimension):
-            self.around(1).run(self.passes.residual, launch=launch, right=self.b[axis], out=self.r[axis], **self._row(axis, self.x))
+            y, z = self.of_others(axis, self.x)
+            self.around(1).run(
+                self.passes.residual, self.rows(axis), launch=launch, x=self.x[axis], y=y, z=z, right=self.b[axis], out=self.r[axis]
+            )
 
     def product(self, x: list[wp.array], out: list[wp.array], launch: Launch) -> None:
         """Find A x."""
         for axis in range(self.dimension):
-            self.around(0).run(self.passes.product, launch=launch, right=None, out=out[axis], **self._row(axis, x))
+            y, z = self.of_others(axis, x)
+            self.around(0).run(self.passes.product, self.rows(axis), launch=launch, x=x[axis], y=y, z=z, right=None, out=out[axis])
 
     def clear(self, launch: Launch) -> None:
         """Set x to 0."""
@@ -142,7 +190,7 @@ class VectorLevel:
         planes, axes = self.grid.planes, range(self.dimension)
 
         def mean(out: wp.array, of: wp.array, faces: int, scale: float) -> None:
-            window.run(self.passes.average, out=out, fine=of, planes=planes, faces=faces, scale=scale, **self.shift)
+            window.run(self.passes.average, self.shift, out=out, fine=of, planes=planes, faces=faces, scale=scale)
 
         mean(self.cell, fine.cell, 0, 0.25)
         mean(self.mixed, fine.mixed, 0, MIXED * 0.25)
@@ -151,34 +199,54 @@ class VectorLevel:
         for axis in axes:
             mean(self.volume[axis], fine.volume[axis], 1 << axis, 1.0)
             mean(self.drag[axis], fine.drag[axis], 1 << axis, WALL)
-            window.run(self.passes.close, out=self.hold[axis], fine=fine.hold[axis], axis=axis, planes=planes, **self.shift)
+            window.run(self.passes.close, self.shift, out=self.hold[axis], fine=fine.hold[axis], axis=axis, planes=planes)
         self.share(self.equations)
         for axis in axes:
-            given = {"h": self.hold[axis], "volume": self.volume[axis], "drag": self.drag[axis], "cell": self.cell}
-            given["there"] = self.there[axis]
-            window.run(self.passes.coarse_diagonal, diagonal=self.diagonal[axis], axis=axis, planes=planes, **given, **self.across(axis))
+            window.run(self.passes.coarse_diagonal, self.rows(axis), h=self.hold[axis], there=self.there[axis], planes=planes)
         self.share([*self.diagonal, *self.there])
         self.find_spans(inner)
 
     def normalize(self, coarse: VectorLevel, window: Window) -> None:
         """Find the normalization of the interpolation from a coarser level."""
         for axis in range(self.dimension):
-            given = {"coarse": coarse.there[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "x": None} | coarse.shift
-            window.run(self.passes.normalize, norm=self.norm[axis], diagonal=self.diagonal[axis], **given)
+            window.run(
+                self.passes.normalize,
+                self.rows(axis),
+                coarse.shift,
+                norm=self.norm[axis],
+                coarse=coarse.there[axis],
+                x=None,
+                planes=self.grid.planes,
+            )
 
     def restrict(self, coarse: VectorLevel, launch: Launch) -> None:
         """Make the residual the coarser level's right-hand side."""
         for axis in range(self.dimension):
-            given = {"fine": self.r[axis], "norm": self.norm[axis], "axis": axis, "planes": self.grid.planes} | coarse.shift
             coarse.around(0).run(
-                self.passes.restrict, launch=launch, out=coarse.b[axis], diagonal=coarse.diagonal[axis], span=coarse.span, **given
+                self.passes.restrict,
+                coarse.rows(axis),
+                coarse.shift,
+                launch=launch,
+                out=coarse.b[axis],
+                fine=self.r[axis],
+                norm=self.norm[axis],
+                planes=self.grid.planes,
             )
 
     def prolong(self, coarse: VectorLevel, launch: Launch) -> None:
         """Add the coarser level's solution."""
         for axis in range(self.dimension):
-            given = {"coarse": coarse.x[axis], "axis": axis, "planes": self.grid.planes, "span": self.span, "diagonal": None} | coarse.shift
-            self.around(3).run(self.passes.prolong, launch=launch, x=self.x[axis], norm=self.norm[axis], **given)
+            self.around(3).run(
+                self.passes.prolong,
+                self.rows(axis),
+                coarse.shift,
+                launch=launch,
+                x=self.x[axis],
+                norm=self.norm[axis],
+                coarse=coarse.x[axis],
+                diagonal=None,
+                planes=self.grid.planes,
+            )
 
 
 class VectorMultigrid:

@@ -16,7 +16,6 @@ ALIKE = 1.001  # viscosities at most as far apart are one
 CORE = 1e-3  # diagonals that differ by less of theirs are alike
 ALONG = 0.95  # of a cell that the distance changes by from face to face: the wall lies across the axis
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
-SHIFT = "shift_x shift_y shift_z"  # cells from one less than twice a coarse cell to the finer level's first one in it, in parts of grids
 LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE}
 KERNELS = KernelFile(Path(__file__).parent / "headers/viscosity.h", KINDS | LIMITS)
 LEVELS = KernelFile(Path(__file__).parent / "headers/viscosity_multigrid.h", {"ALIKE": CORE})

@@ -16,8 +16,7 @@ import warp as wp
 
 from warp_lcp.distributed.hierarchy import GATHERED
 from warp_lcp.distributed.subdomain import Subdomain
-from warp_lcp.fluids.viscosity_multigrid import LEAST, VectorLevel, VectorMultigrid
-from warp_lcp.fluids.viscosity_passes import SHIFT
+from warp_lcp.fluids.viscosity_multigrid import LEAST, LevelShift, VectorLevel, VectorMultigrid
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows.program import Launch, perform
 
@@ -38,8 +37,7 @@ class SharedVectorLevel(VectorLevel):
         super().__init__(part.grid, x, b)
         self.part, origin = part, part.grid.origin
         if finer is not None:
-            shifts = (2 * own - fine for own, fine in zip(origin, finer.grid.origin, strict=True))
-            self.shift = dict(zip(SHIFT.split(), shifts, strict=True))
+            self.shift = LevelShift(*[2 * own - fine for own, fine in zip(origin, finer.grid.origin, strict=True)])
         self.odd_row, self.odd_cell = (origin[1] + origin[2]) % 2, origin[0] % 2
         self._windows = [self._grown(width) for width in range(KNOWN + 1)]
 

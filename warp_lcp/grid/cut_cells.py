@@ -251,9 +251,21 @@ class CutCells:
         clear(self._counts)
         # the marks are in `base`, until the next kernel fills it
         grid.domain.run(
-            kernels.FRACTIONS, planes=planes, marks=self.base, counts=self._counts, d=d, o=o, d2=d2, o2=o2, ax=ax, ay=ay, az=az,
-            wx=wx, wy=wy, wz=wz,
-        )  # fmt: skip
+            kernels.FRACTIONS,
+            planes=planes,
+            marks=self.base,
+            counts=self._counts,
+            d=d,
+            o=o,
+            d2=d2,
+            o2=o2,
+            ax=ax,
+            ay=ay,
+            az=az,
+            wx=wx,
+            wy=wy,
+            wz=wz,
+        )
         for number in range(2 * grid.dimension):
             if self.open_sides >> number & 1:
                 self._open_side(number >> 1, SIDES[number])
