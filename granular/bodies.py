@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -22,8 +22,9 @@ from warp_lcp.granular.bodies_kernels import (
     stiffness_kernel,
 )
 from warp_lcp.granular.body_faces import BodyFaces, entries_near, find_body_faces, own_copies, unowned_copies, within
+from warp_lcp.granular.fields import StressFields
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.yield_set import F64, I32, U8, xyz
+from warp_lcp.granular.yield_set import F64, I32, U8
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import Rows
 from warp_lcp.rows.program import Launch, launch
@@ -148,10 +149,11 @@ class SandBodies:
         active[0], active[1 : 1 + len(held)] = len(held), held
         self._active.assign(active)
 
-    def forget(self, stress: Mapping[str, wp.array]) -> None:
+    def forget(self, stress: StressFields) -> None:
         """Remove stresses where only the edge of a body is near."""
         if len(self._unowned):
-            launch(forget_kernel, len(self._unowned), [self._unowned, *(s.flatten() for s in stress.values())], device=self.grid.device)
+            fields = [field.flatten() for field in (stress.now, stress.before, stress.point)]
+            launch(forget_kernel, len(self._unowned), [self._unowned, *fields], device=self.grid.device)
 
     def prepare(self, packing: Packing, numbers: wp.array, *, pressure_step: float, shear_step: float) -> None:
         """Compute the correction of a trial step per velocity mismatch.
@@ -211,9 +213,7 @@ class SandBodies:
         inputs = [int(implicit), *self._parts_of_all(launch), self._start, self._response, self._correction]
         launch(respond_kernel, len(self.numbers), [*inputs, self._force, self._error, self.velocity], device=device)
 
-    def search(
-        self, packing: Packing, velocity: Velocity, stress: Mapping[str, typing.Any], given: Mapping[str, typing.Any], launch: Launch
-    ) -> None:
+    def search(self, packing: Packing, velocity: Velocity, stress: StressFields, launch: Launch) -> None:
         """Find the bodies' velocity for which a step of the stresses is implicit.
 
         Faces and edges beside the bodies are set to it.
@@ -221,21 +221,19 @@ class SandBodies:
         Args:
             packing: where sand is.
             velocity: what a step is taken with, at the bodies' last velocity.
-            stress: now, before, point; the last is overwritten beside bodies.
-            given: the steps' momentum, numbers of the stresses.
+            stress: the stresses, of which `point` is overwritten beside bodies.
             launch: records.
         """
         p, device, walls = packing, self.grid.device, self._walls
         kernels = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate)
-        cells = p.cells | velocity.fields | {"cell": self._trial, "spans": p.spans, "openings": None}
-        faces = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p) | {"active": self._active}
-        trials = [(kernels.trial, len(self._trial), cells), (kernels.trial_wall, len(self._entries), faces)]
+        structs = (p.fields, velocity.fields, stress)
         edges = [self._shape, self._edges, flat_vector(velocity.u), flat_vector(velocity.edge)]
         for _ in range(ROUNDS):
-            for passed, count, fields in trials:
-                if count:
-                    passed.bind(Rows.entries(count, device), **stress, **given, **fields).launch(launch)
-            self.respond(packing, stress["point"], launch, implicit=True)
+            if count := len(self._trial):
+                kernels.trial.bind(Rows.entries(count, device), *structs, cell=self._trial, openings=None).launch(launch)
+            if count := len(self._entries):
+                kernels.trial_wall.bind(Rows.entries(count, device), *structs, walls.faces, active=self._active).launch(launch)
+            self.respond(packing, stress.point, launch, implicit=True)
             self.move(velocity, launch)
             if len(self._edges.at):
                 launch(kernels.strain, len(self._edges.at), edges, device=device)

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -15,7 +15,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_kernels import PERIOD
-from warp_lcp.granular.yield_set import CONSTANTS, xyz
+from warp_lcp.granular.yield_set import CONSTANTS
 from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.settings import Count, CountOrZero, NonNegative, Positive, Relaxation, Settings, ShareOrZero, renamed_names
 
@@ -203,14 +203,12 @@ class InterleavedSweeps(Settings):
     def _round(self, stress: Stress) -> None:
         p, walls, device = stress.packing, stress.walls, stress.packing.grid.device
         passes = interleaved_passes(p.grid.dimension, stress.box, stress.rate, device.is_cuda)
-        cells = {"flags": p.flags, "now": stress.now, "numbers": stress.numbers, **xyz(inverse=p.inverse, u=stress.velocity.u)}
-        share, omega = xyz(share=p.share), self.friction_relaxation
-        mass = {"drive": p.drive, "share_x": p.share[0], **xyz(mass=p.mass)}
-        _sweep(stress, passes.pressure, omega=self.pressure_relaxation, **cells, **mass)
-        _sweep(stress, passes.friction, omega=omega, **cells, **share, stiff=p.stiff)
+        structs, now, numbers, omega = (p.fields, stress.velocity.fields), stress.now, stress.numbers, self.friction_relaxation
+        _sweep(stress, passes.pressure, self.pressure_relaxation)
+        _sweep(stress, passes.friction, omega)
         if walls.count:
             rows = Rows.entries(walls.count, device, walls.count)
-            passes.wall.bind(rows, omega=omega, **cells, **share, **walls.fields(p)).launch()
+            passes.wall.bind(rows, *structs, walls.faces, omega=omega, now=now, numbers=numbers).launch()
 
 
 class StressSweepWorkspace(StressWorkspace):
@@ -221,14 +219,16 @@ class StressSweepWorkspace(StressWorkspace):
         self.problem.velocity.find(self.problem.now)
 
 
-def _sweep(stress: Stress, passed: RowPass, **given: Any) -> None:
+def _sweep(stress: Stress, passed: RowPass, omega: float) -> None:
     """Launch a sweep over all cells: in order on the CPU, in colors on CUDA."""
-    grid = stress.packing.grid
+    grid, now, numbers = stress.packing.grid, stress.now, stress.numbers
+    structs = (stress.packing.fields, stress.velocity.fields)
     if not grid.device.is_cuda:
-        grid.domain.run(passed, **given)
+        grid.domain.run(passed, *structs, omega=omega, now=now, numbers=numbers)
         return
     for cells in colors(grid.shape, grid.domain.low, grid.domain.high, grid.device.alias):
-        passed.bind(Rows.entries(cells.size, grid.device), cells=cells, **given).launch()
+        rows = Rows.entries(cells.size, grid.device)
+        passed.bind(rows, *structs, cells=cells, omega=omega, now=now, numbers=numbers).launch()
 
 
 @functools.cache

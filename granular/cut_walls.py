@@ -9,14 +9,15 @@ load, and its friction is a traction of its own.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.granular.fields import StressFields
 from warp_lcp.granular.packing import SHEARS, Packing
-from warp_lcp.granular.yield_set import COLUMNS, xyz
+from warp_lcp.granular.yield_set import COLUMNS
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
@@ -97,22 +98,32 @@ class CutWalls:
         self._numbers = wp.array(numbers, dtype=wp.int32, device=device)
         self._entries = wp.array(entries.ravel(), dtype=wp.float32, device=device)
 
-    def project(self, packing: Packing, velocity: Velocity, given: Mapping[str, Any], grain: int, launch: Launch) -> None:
+    def project(self, packing: Packing, velocity: Velocity, stress: StressFields, partials: wp.array, grain: int, launch: Launch) -> None:
         """Take a projected step of the tractions, or find what the natural residual would move.
 
         Args:
             packing: where sand is.
             velocity: that the stresses leave.
-            given: stresses, numbers and `partials`, sums; the last of each column are these.
+            stress: the stresses.
+            partials: of sums; the last of each column are these.
             grain: cells a thread takes.
             launch: launches or records.
         """
         rows = Rows.entries(self.count, self.grid.device, grain, weight=WALL_FACE)
-        behind = given["partials"].shape[0] // COLUMNS - rows.places
-        walls = {"cells": self.cells, "numbers_of": self._numbers, "walls": self._entries, "friction": self._friction}
-        fields = {"flags": packing.flags, "fraction": packing.fraction, "openings": self.openings, "share_x": packing.share[0]}
-        fields |= xyz(inverse=packing.inverse, u=velocity.u)
-        velocity.passes.traction.bind(rows, behind=behind, **walls, **fields, **given).launch(launch)
+        behind = partials.shape[0] // COLUMNS - rows.places
+        bound = velocity.passes.traction.bind(
+            rows,
+            packing.fields,
+            velocity.fields,
+            stress,
+            behind=behind,
+            cells=self.cells,
+            numbers_of=self._numbers,
+            walls=self._entries,
+            friction=self._friction,
+            partials=partials,
+        )
+        bound.launch(launch)
 
 
 def _corners(distance: np.ndarray, axes: Sequence[int]) -> np.ndarray:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.granular import packing_kernels as kernels
-from warp_lcp.granular.yield_set import xyz
+from warp_lcp.granular.fields import SandFields, three
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -159,7 +159,7 @@ class Packing:
             self.sides.wrap(stress, launch=launch)
 
     @property
-    def cells(self) -> dict[str, Any]:
-        """Arguments of a stress step, by name."""
-        fields = {"flags": self.flags, "drive": self.drive, "stiff": self.stiff}
-        return fields | xyz(share=self.share, mass=self.mass, inverse=self.inverse)
+    def fields(self) -> SandFields:
+        """Return the fields as kernels take them."""
+        components = [c for f in (self.share, self.mass, self.inverse, self.start) for c in three(f)]
+        return SandFields(*[self.flags, self.drive, self.stiff, self.fraction, self.spans, *components])

@@ -31,7 +31,6 @@ class SandReport:
         grid, self.stress = stress.packing.grid, stress
         self.ratio, self.contact, self.known = grid.field(), grid.field(wp.uint8), grid.faces(wp.int8)
         cut, stored = stress.packing.cut, Window((0, 0, 0), grid.shape, grid.device)
-        self._openings = None if cut is None else cut.openings
         self._report = WindowTally(report_pass(grid.dimension, stress.rate, cut is not None), grid, stored)
         self._taking, self._reporting = (LaunchGraph(grid.device, record) for record in (self._launch_taking, self._launch_report))
         self._base = stress.packing.base if cut is None else grid.field(wp.int8)  # no face inside a solid that cuts cells is left unknown
@@ -64,8 +63,7 @@ class SandReport:
 
     def _launch_report(self) -> None:
         stress, p = self.stress, self.stress.packing
-        fields = p.cells | stress.checked.fields | {"now": stress.now, "openings": self._openings, "ratio": self.ratio}
-        self._report.take(p.counted, numbers=stress.numbers, **fields)
+        self._report.take(p.counted, p.fields, stress.checked.fields, now=stress.now, numbers=stress.numbers, ratio=self.ratio)
 
     def _found(self) -> list[float]:
         """Return how many cells carry shear, how many have yielded, what friction takes and the largest excess."""

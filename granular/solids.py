@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.granular.cut_walls import CutWalls
-from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.fields import WallFaces
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels
@@ -51,13 +51,9 @@ class Walls:
         self.cells = wp.array(cells, dtype=wp.int32, device=device)
         self.sides = wp.array(sides, dtype=wp.uint8, device=device)
         self.walls = wp.array(walls, dtype=wp.int32, device=device)
+        self.faces = WallFaces(self.cells, self.sides, self.walls, self.friction)
         self._host = cells
         self.active = wp.zeros(1 + self.count, dtype=wp.int32, device=device)
-
-    def fields(self, packing: Packing) -> dict[str, Any]:
-        """Return what passes over faces take, by name."""
-        faces = {"cells": self.cells, "sides": self.sides, "walls": self.walls, "friction": self.friction}
-        return {**faces, "fraction": packing.fraction}
 
     def activate(self, flags: wp.array) -> None:
         """Find the faces whose cells hold sand: their number and their entries, ascending, go to `active`.

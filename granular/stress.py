@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -12,10 +12,11 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.cut_walls import WALL_FACE
+from warp_lcp.granular.fields import StressFields, VelocityFields, three
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, momentum_kernel, stress_passes
-from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
+from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
 from warp_lcp.rows import Rows
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy
@@ -69,9 +70,9 @@ class Velocity:
         self.passes = stress_passes(grid.dimension, real, box=box, rate=rate, cut=packing.cut is not None)
 
     @property
-    def fields(self) -> dict[str, Any]:
-        """Return `u` and `edge` by the argument names of the kernels."""
-        return xyz(u=self.u, edge=self.edge)
+    def fields(self) -> VelocityFields:
+        """Return the fields as kernels take them."""
+        return VelocityFields(*[*three(self.u), *three(self.edge), self.openings])
 
     def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
         """Compute velocity and rates of strain under a field of stresses.
@@ -82,18 +83,17 @@ class Velocity:
             bodies: whose faces get the velocity that they have.
             respond: first give the bodies the velocity that the stresses leave.
         """
-        p, passes, share = self.packing, self.passes, {"share_x": self.packing.share[0]}
+        p, passes, sand, fields = self.packing, self.passes, self.packing.fields, self.fields
         p.join(stress, launch=launch)
-        p.stressed.run(passes.edge_stress, launch=launch, spans=p.spans, y=stress, **xyz(share=p.share, edge=self.edge))
-        faces = share | self.fields | xyz(start=p.start, inverse=p.inverse)
-        p.moved.run(passes.face_velocity, launch=launch, spans=p.spans, y=stress, openings=self.openings, **faces)
+        p.stressed.run(passes.edge_stress, sand, fields, launch=launch, y=stress)
+        p.moved.run(passes.face_velocity, sand, fields, launch=launch, y=stress)
         if bodies is not None:
             if respond:
                 bodies.respond(p, stress, launch, implicit=False)
             bodies.move(self, launch)
         if p.sides is not None:
             p.sides.wrap(*self.u, launch=launch)
-        p.strained.run(passes.edge_strain, launch=launch, spans=p.spans, **share, **self.fields)
+        p.strained.run(passes.edge_strain, sand, fields, launch=launch)
 
 
 class Stress(wl.VariationalInequality):
@@ -193,14 +193,14 @@ class Stress(wl.VariationalInequality):
 
     def _launch_admission(self) -> None:
         """Launch what makes the last stresses those of the new packing: rescaled, 0 where it admits none, without the checkerboard."""
-        p, share = self.packing, xyz(share=self.packing.share)
+        p, sand, stresses = self.packing, self.packing.fields, self._fields
         copy(self._last, self.now)
         self.walls.activate(p.flags)
-        p.counted.run(self.velocity.passes.admit, ratio=self._ratio, flags=p.flags, stiff=p.stiff, **share, **self._stresses)
+        p.counted.run(self.velocity.passes.admit, sand, stresses, ratio=self._ratio)
         if self.bodies is not None:
-            self.bodies.forget(self._stresses)
+            self.bodies.forget(stresses)
         p.join(self._point)
-        p.counted.run(self.velocity.passes.damp, flags=p.flags, source=self._point, now=self.now, **share)
+        p.counted.run(self.velocity.passes.damp, sand, stresses, source=self._point)
 
     def _count(self) -> int:
         """Return how many cells hold sand."""
@@ -270,7 +270,7 @@ class Stress(wl.VariationalInequality):
     def _record(self, step: int, launch: Launch) -> None:
         self.velocity.find(self._point, launch=launch, bodies=self.bodies)
         if self.bodies is not None:
-            self.bodies.search(self.packing, self.velocity, self._stresses, self._step, launch)
+            self.bodies.search(self.packing, self.velocity, self._fields, launch)
         self._project(self.velocity, launch)
         self._end_step(step, launch)
 
@@ -299,25 +299,19 @@ class Stress(wl.VariationalInequality):
 
     def _project(self, velocity: Velocity, launch: Launch) -> None:
         p, walls, passes = self.packing, self.walls, velocity.passes
-        given = self._stresses | self._step
-        cells = p.cells | velocity.fields | {"spans": p.spans, "openings": velocity.openings}
-        p.counted.run(passes.step, launch=launch, partials=self._cell_sums.partials, **given, **cells)
+        structs = (p.fields, velocity.fields, self._fields)
+        p.counted.run(passes.step, *structs, launch=launch, partials=self._cell_sums.partials)
         if self._wall_sums is not None:
-            given["partials"] = self._wall_sums.partials
+            partials = self._wall_sums.partials
             if walls.count:
-                fields = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p)
                 rows = Rows.entries(walls.count, p.grid.device, self._grain, weight=WALL_FACE)
-                passes.wall.bind(rows, active=walls.active, behind=0, **fields, **given).launch(launch)
+                passes.wall.bind(rows, *structs, walls.faces, active=walls.active, behind=0, partials=partials).launch(launch)
             if p.cut is not None:
-                p.cut.project(p, velocity, given, self._grain, launch)
+                p.cut.project(p, velocity, self._fields, partials, self._grain, launch)
 
     @property
-    def _stresses(self) -> dict[str, Any]:
-        return dict(zip(("now", "before", "point"), (self.now, self._before, self._point), strict=True))
-
-    @property
-    def _step(self) -> dict[str, Any]:
-        return {"momentum": self._momentum, "numbers": self.numbers}
+    def _fields(self) -> StressFields:
+        return StressFields(self.now, self._before, self._point, self._momentum, self.numbers)
 
     def _add_up(self, launch: Launch) -> None:
         self._cell_sums.add_up(0, COLUMNS, launch=launch)

@@ -9,8 +9,6 @@ absolute value the weight) on a wall, 0 where there is no shear. Where solids cu
 cell, see `granular.cut_walls`.
 """
 
-from typing import Any
-
 import warp as wp
 
 NEWTON = 4  # iterations for the multiplier of a yielding cell: 3 are exact to 2e-6 of the bound, 4 to rounding
@@ -37,8 +35,3 @@ CONSTANTS = {
 }  # fmt: skip
 
 F64, U8, I32 = wp.float64, wp.uint8, wp.int32
-
-
-def xyz(**fields: Any) -> dict[str, Any]:
-    """Return vector components by `name_x`, `name_y`, `name_z`; None if missing."""
-    return {f"{name}_{axis}": field for name, three in fields.items() for axis, field in zip("xyz", [*three, None, None], strict=False)}

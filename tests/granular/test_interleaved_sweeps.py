@@ -6,7 +6,7 @@ import warp as wp
 from test_sand_stress import make
 
 from warp_lcp.granular.coupled import APART, colors, interleaved_passes
-from warp_lcp.granular.yield_set import xyz
+from warp_lcp.granular.fields import VelocityFields, three
 from warp_lcp.rows import Rows
 
 
@@ -35,11 +35,11 @@ def test_a_sweep_over_a_list_of_all_cells_is_that_over_the_grid(dimension: int) 
     for listed in (False, True):
         passes, now = interleaved_passes(dimension, listed=listed), wp.clone(stress.now)
         moved = [wp.array(field, dtype=wp.float32, device=grid.device) for field in u]
-        given = {"flags": p.flags, "now": now, "numbers": stress.numbers, **xyz(inverse=p.inverse, u=moved)}
+        structs = (p.fields, VelocityFields(*three(moved), *three(stress.velocity.edge), None))
         rows = Rows.entries(cells.size, grid.device) if listed else Rows.box(grid.domain.low, grid.domain.high, grid.device)
-        given |= {"cells": cells} if listed else {}
-        passes.pressure.bind(rows, omega=1.5, drive=p.drive, share_x=p.share[0], **xyz(mass=p.mass), **given).launch()
-        passes.friction.bind(rows, omega=1.0, stiff=p.stiff, **xyz(share=p.share), **given).launch()
+        given = {"now": now, "numbers": stress.numbers} | ({"cells": cells} if listed else {})
+        passes.pressure.bind(rows, *structs, omega=1.5, **given).launch()
+        passes.friction.bind(rows, *structs, omega=1.0, **given).launch()
         found.append([now.numpy(), *(field.numpy() for field in moved)])
     for whole, one in zip(*found, strict=True):
         np.testing.assert_array_equal(whole, one)

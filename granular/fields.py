@@ -1,0 +1,113 @@
+"""Structs of fields that the kernels of stresses take; components along z, and the second and third shear, are None in 2-D."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import warp as wp
+
+
+@dataclass(frozen=True, slots=True)
+class SandFields:
+    """Where sand is, see `Packing`.
+
+    Attributes:
+        flags: uint8 bits of a cell, 0 without sand.
+        drive: what of a cell is free [m/s], float32.
+        stiff: bound of the friction's diagonal in a cell, float32.
+        fraction: share of a cell that grains fill, float32.
+        spans: first and one past the last cell of each row that stresses reach, int32.
+        share_x: weight of a cell's copy on the edges of the first shear, float32.
+        share_y: likewise of the second.
+        share_z: likewise of the third.
+        mass_x: of the faces along x, in units of a full face's, float32.
+        mass_y: likewise along y.
+        mass_z: likewise along z.
+        inverse_x: 1 / mass_x, 0 where nothing can be moved, float32.
+        inverse_y: likewise along y.
+        inverse_z: likewise along z.
+        start_x: velocity along x that the stresses act on [m/s], float32.
+        start_y: likewise along y.
+        start_z: likewise along z.
+    """
+
+    flags: wp.array
+    drive: wp.array
+    stiff: wp.array
+    fraction: wp.array
+    spans: wp.array
+    share_x: wp.array
+    share_y: wp.array | None
+    share_z: wp.array | None
+    mass_x: wp.array
+    mass_y: wp.array | None
+    mass_z: wp.array | None
+    inverse_x: wp.array
+    inverse_y: wp.array | None
+    inverse_z: wp.array | None
+    start_x: wp.array
+    start_y: wp.array | None
+    start_z: wp.array | None
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityFields:
+    """A velocity of sand and what its shears are, see `Velocity`; float32 or float64.
+
+    Attributes:
+        u_x: velocity along x on faces [m/s].
+        u_y: likewise along y.
+        u_z: likewise along z.
+        edge_x: of the first shear on edges: its stress, then twice its rate times dx [m/s].
+        edge_y: likewise of the second.
+        edge_z: likewise of the third.
+        openings: of cells that solids cut, float32; None: none does.
+    """
+
+    u_x: wp.array
+    u_y: wp.array | None
+    u_z: wp.array | None
+    edge_x: wp.array
+    edge_y: wp.array | None
+    edge_z: wp.array | None
+    openings: wp.array | None
+
+
+@dataclass(frozen=True, slots=True)
+class StressFields:
+    """Stresses of a solve, float32, and the numbers of its steps.
+
+    Attributes:
+        now: the stresses.
+        before: those before the last step.
+        point: where the next gradient is taken.
+        momentum: of the next steps, float64.
+        numbers: float32, see `granular.yield_set`.
+    """
+
+    now: wp.array
+    before: wp.array
+    point: wp.array
+    momentum: wp.array
+    numbers: wp.array
+
+
+@dataclass(frozen=True, slots=True)
+class WallFaces:
+    """Faces of cells on solids.
+
+    Attributes:
+        cells: flat index of each face's cell, int32.
+        sides: of that cell on which the face is, uint8.
+        walls: number of the wall, int32.
+        friction: of each wall, float32.
+    """
+
+    cells: wp.array
+    sides: wp.array
+    walls: wp.array
+    friction: wp.array
+
+
+def three(fields: Sequence[wp.array]) -> list[wp.array | None]:
+    """Return three fields, padded with None."""
+    return [*fields, None, None][:3]
