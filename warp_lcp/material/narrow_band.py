@@ -344,8 +344,8 @@ class NarrowBand:
         """Launch a pass in which the depth of the window's cells falls to what their neighbors allow."""
         if self.grid.device.is_cpu:
             clear(self._changed)
-        last: dict[str, Any] = dict(zip(("last_plane", "last_row"), (0, 0) if forth else self._last, strict=True))
-        self._window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=self.grid.planes, **last)
+        plane, row = (0, 0) if forth else self._last
+        self._window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=self.grid.planes, last_plane=plane, last_row=row)
 
     def _relax(self, fallen: int = 0) -> None:
         """Let the depth fall until it is what neighbors allow, after so many passes."""
