@@ -72,6 +72,32 @@ def test_a_declaration_has_every_role(header):
     assert every.source == f"{every.header}:6"
 
 
+def test_kernels_of_a_module_are_compiled_together_for_the_same_types(header):
+    kernel = """// kernel mine.{name}: a copy
+//   compute    S
+//   reads      {kind} x
+//   writes     S y
+//   module     mine
+for (int k = 0; k < n; ++k) y[k] = ({factor})*x[k];
+
+"""
+    names = {"first": "S", "second": "S", "other": "R"}
+    source = "".join(kernel.format(name=n, kind=kind, factor=f + 1) for f, (n, kind) in enumerate(names.items()))
+    kernels = KernelFile(header(source))
+    first, second, other = (kernels[f"mine.{name}"] for name in names)
+    rows, device = Rows.flat(4, wp.get_device("cpu")), "cpu"
+    x, y, z = wp.array([1, 2, 3, 4], dtype=wp.int32, device=device), *(wp.zeros(4, dtype=wp.int32, device=device) for _ in range(2))
+    a = first.bind(rows, x=x, y=y)
+    assert sorted(a.form.run.module.kernels) == ["mine_first", "mine_second"]  # before either is launched
+    b = second.bind(rows, x=x, y=z)
+    assert b.form.run.module is a.form.run.module
+    assert other.bind(rows, x=x, y=y).form.run.module is not a.form.run.module
+    a.launch()
+    b.launch()
+    assert y.numpy().tolist() == [1, 2, 3, 4]
+    assert z.numpy().tolist() == [2, 4, 6, 8]
+
+
 @pytest.mark.parametrize(("real", "vector"), [(wp.float32, wp.vec3), (wp.float64, wp.vec3d)])
 def test_a_variant_has_a_type_and_a_module(header, real, vector):
     box = KernelFile(header(EVERY)).kernel("mine.list.box", module=f"test_variants.{real.__name__}", compute=real)

@@ -13,7 +13,7 @@ A declaration is a comment of a description and of lines with three blanks, a ro
 Roles are the words of `RowPass`, except that `name?` marks an array that may be None. Fields and numbers stand as in C: a type, then names.
 A type is Warp's (`float32`, `int8`, `vec3`), `int` or `bool` of Python, a capital letter for the type of the arrays given, `T` for the type
 of computations, or `vec3<T>`. `compute float32 | float64` leaves the choice to Python. `constants AXIS, ROUNDED = 0`: Python computes
-the first, the second has a usual value.
+the first, the second has a usual value. `module multigrid`: compiled in one Warp module with others that have the line.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TYPES = {kind.__name__: kind for kind in (*_INTEGERS, wp.float32, wp.float64, in
 VECTORS = {wp.float32: wp.vec3, wp.float64: wp.vec3d}
 FIELDS = ("reads", "writes", "other", "by_row", "whole", "box", "numbers")
 NAMES, FLAGS = ("ring", "sums", "largest"), ("bounds", "finer", "ordered")
-ROLES = ("compute", "stencil", *FIELDS, *NAMES, *FLAGS, "listed", "constants")
+ROLES = ("compute", "stencil", *FIELDS, *NAMES, *FLAGS, "listed", "constants", "module")
 NONE: Mapping[str, float] = {}
 
 
@@ -104,7 +104,15 @@ class _Declaration:
             raise ValueError(f"{self.where}: {self.name}: Python gives no value for the constants {', '.join(missing)}")
         values: dict[str, Any] = {n: constants.get(n, usual) for n, usual in self.constants.items()}
         stem, _, last = self.name.rpartition(".")
-        return RowPass(f"{module or stem}.{last}", self.path, compute, constants=values, declared=self.name, **self._roles(compute))
+        return RowPass(
+            f"{module or stem}.{last}",
+            self.path,
+            compute,
+            constants=values,
+            declared=self.name,
+            module=self._content("module"),
+            **self._roles(compute),
+        )
 
     def _roles(self, compute: Any) -> dict[str, Any]:
         """Return the roles as `RowPass` takes them."""

@@ -69,6 +69,8 @@ class RowPass:
         ordered: whether tasks write what others read or write: on the CPU one thread takes them, in order.
         constants: numbers that are known when the kernel is made, with their usual values; those that are given are integers, and macros.
         declared: the kernel's name in the header, see `kernel_file.py`; empty: the header is the row function alone.
+        module: Warp module of passes that are used together. They are compiled at once for each set of types: a module of its own costs
+            0.13 s before its first kernel. Not for a pass over a box, whose module its name begins with.
 
     Raises:
         ValueError: a name cannot be one in C++, is the layer's own, or stands for two things; a role or a letter is of no array.
@@ -96,10 +98,13 @@ class RowPass:
     listed: str = ""
     ordered: bool = False
     declared: str = ""
+    module: str = ""
 
     def __post_init__(self) -> None:
         """Check names, and make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
         self._check_names()
+        if self.module:
+            TOGETHER.setdefault(self.module, []).append(self)
         if self.box:
             object.__setattr__(self, "numbers", {**self.numbers, **dict.fromkeys(PLACE, int)})
             assert _form(self, (), tuple(self.constants.items()), UNIFORM, NUMBERS).kernel
@@ -130,6 +135,11 @@ class RowPass:
     def label(self) -> str:
         """The name and where it is declared, for messages."""
         return f"{self.name} ({self.source})" if self.declared else self.name
+
+    @functools.cached_property
+    def letters(self) -> frozenset[str]:
+        """Letters that stand for types."""
+        return frozenset(kind for kind in (*self.arrays.values(), *(self.stencil or ())) if isinstance(kind, str))
 
     @functools.cached_property
     def found(self) -> tuple[str, ...]:
@@ -199,6 +209,7 @@ class RowPass:
             numbers = tuple(zip(self.constants, constants, strict=True))
             shape = KNOWN if isinstance(stencil, Known) else stored[1] if stencil and stored[1] else VARIABLE if weights else UNIFORM
             made = self._forms[key] = _form(self, letters, numbers, shape, kind)
+            _make_kernels_of_module(made, letters, shape, kind)
         self._check_memory(rows, given)
         return Bound(made, rows, made.fill(stencil, bounds, given))
 
@@ -221,6 +232,12 @@ class RowPass:
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise TypeError(f"{self.label}: {', '.join(kind.__name__ for kind in kinds)}: two of them have {twice}")
         return names, tuple(_getter(share) for share in shares)
+
+    def words(self, letters: dict[str, Any], constants: Mapping[str, float], shape: str, bounds: str) -> list[str]:
+        """Return what tells a form from others: kinds of stencil and bounds, types, constants that differ from the usual ones."""
+        differing = [f"{name.lower()}{value}" for name, value in constants.items() if value != self.constants[name]]
+        kinds = [shape] * bool(self.stencil) + [bounds] * (self.bounds and bounds != NUMBERS)
+        return [*kinds, *(t.__name__ for _, t in sorted(letters.items())), *differing]
 
     @functools.cached_property
     def _members(self) -> dict[tuple[type, ...], Any]:
@@ -253,10 +270,9 @@ class RowPass:
                 why = f", as {seen[kind]}" if isinstance(kind, str) and kind in seen else ""
                 raise TypeError(f"{self.label}: {name} is {found.__name__}, not an array of {expected.__name__}{why}")
             seen.setdefault(kind, name)
-        used = {kind for kind in (*self.arrays.values(), *(self.stencil or ())) if isinstance(kind, str)}
         if others := [f"{seen[kind]} is {found.__name__}" for kind, found in letters.items() if found not in C]:
             raise TypeError(f"{self.label}: {others[0]}: a letter stands for {', '.join(t.__name__ for t in C)}")
-        return letters | dict.fromkeys(used - letters.keys(), wp.float32)  # of what is absent
+        return letters | dict.fromkeys(self.letters - letters.keys(), wp.float32)  # of what is absent
 
     @functools.cached_property
     def _lengths(self) -> list[tuple[str | None, tuple[str, ...]]]:
@@ -306,11 +322,25 @@ def _form(declared: RowPass, letters: Any, constants: Any, shape: str | Pattern,
     return Form(declared, dict(letters), dict(constants), shape, bounds)
 
 
+TOGETHER: dict[str, list[RowPass]] = {}  # passes by the Warp module in which they are compiled
+
+
+def _make_kernels_of_module(form: "Form", letters: Any, shape: str | Pattern, bounds: str) -> None:
+    """Make the kernels that belong to a form's module before Warp loads it: for one more it would compile all of them again."""
+    if not form.declared.module or form.pattern is not None:
+        return
+    for other in TOGETHER[form.declared.module]:
+        if other.letters == form.declared.letters and other.words(dict(letters), other.constants, shape, bounds) == form.words:
+            assert _form(other, letters, tuple(other.constants.items()), shape, bounds).kernel
+
+
 class Form:
     """A pass whose types and constants are known.
 
     Attributes:
         words: what tells it from other forms.
+        joins: whether it is compiled with other passes.
+        name: of its kernel.
         blank: its arguments, none of them given.
         fields: struct of its arguments.
         run: native function (layout, fields, slab, row, chunk of the first task, number of tasks).
@@ -319,11 +349,10 @@ class Form:
     def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], shape: str | Pattern, bounds: str) -> None:
         self.declared, self.letters, self.bounds, d = declared, letters, bounds, declared
         self.pattern = pattern = shape if isinstance(shape, Pattern) else None
+        self.joins = bool(d.module) and pattern is None  # the module of other passes
         shape = pattern.word if pattern else shape
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
-        differing = [f"{name.lower()}{value}" for name, value in constants.items() if value != d.constants[name]]
-        kinds = [shape] * bool(d.stencil) + [bounds] * (d.bounds and bounds != NUMBERS)
-        self.words = [*kinds, *(t.__name__ for _, t in sorted(letters.items())), *differing]
+        self.words = d.words(letters, constants, shape, bounds)
         weights = of(d.stencil[1]) if d.stencil and (shape == VARIABLE or (pattern and pattern.names)) else wp.float32
         parts = {"stencil": stencil_struct(of(d.stencil[0]), weights, pattern)} if d.stencil else {}
         parts |= {"bounds": BoundFields} if d.bounds else {}
@@ -335,9 +364,11 @@ class Form:
         def run(L: RowLayout, given: Fields, slab_: int, row_: int, chunk_: int, count_: int): ...
 
         self.blank, self._entry = Fields(), None
-        variant = f"warp_lcp.{d.name}.{'_'.join(self.words)}"
-        run.__module__ = d.name.rpartition(".")[0] if d.box else variant  # apart from other forms, which Warp would take for overloads
-        run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
+        area, _, last = d.name.rpartition(".")
+        variant = ".".join(["warp_lcp", *([d.module] if self.joins else d.name.split(".")), "_".join(self.words)])
+        run.__module__ = area if d.box else variant  # apart from other forms, which Warp would take for overloads
+        self.name = d.name.replace(".", "_") if self.joins else last
+        run.__qualname__ = f"{self.name}_rows"
         self.run = wp.func_native(self._source(letters, constants, ord(shape[0]), of))(run)
 
     def _source(self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any) -> str:
@@ -430,7 +461,7 @@ class Form:
                 first = first_task(L)
                 run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
 
-        alone.__name__ = alone.__qualname__ = self.declared.name.rpartition(".")[2]
+        alone.__name__ = alone.__qualname__ = self.name
         return wp.kernel(enable_backward=False, module=run.module.name)(alone)
 
     def entry(self, layout: Any, fields: Any) -> Entry:

@@ -12,6 +12,7 @@
 //   by_row     uint8 coarse_changed
 //   whole      uint8 changed
 //   numbers    int cells; bool periodic_x, periodic_y, periodic_z; S stiffen, held
+//   module     multigrid
 const int fx = pairs ? 2 : 1, z0 = L.fz*P.k, y0 = L.fy*P.j, z_last = z0 + deep - 1, y_last = y0 + wide - 1;
 const bool all = fx*L.fy*L.fz == 8, begins_y = y0 == 0, ends_y = y_last == L.n2 - 1, begins_z = z0 == 0, ends_z = z_last == L.n1 - 1;
 const auto due = [&]() {
@@ -225,6 +226,7 @@ for (int c = 0; c < m; ++c) {
 //   compute    float64
 //   whole      uint8 changed; float64 matrix, inverse
 //   numbers    int m, flags
+//   module     grid
 const auto due = [&]() { for (int r = 0; r < flags; ++r) if (changed[r]) return true; return false; };
 if (due()) {
     const int first = (int)p, end = first + n; const double* factors = matrix; double* X = inverse;

@@ -11,6 +11,7 @@ const auto relaxed = [&](T x, T sum_around, T weight, int k, T e) -> T { return 
 //   reads      S x, b, lower?, upper?
 //   writes     S y
 //   numbers    S omega; bool from_zero, projected
+//   module     multigrid
 #include "relax"
 const auto from_b = [&](int k, T e) -> T { return omega*b[k] / e; };
 const auto from_x = [&](int k, T e) -> T { return relaxed(x[k], around(x, k, down, up), omega, k, e); };
@@ -29,6 +30,7 @@ if (from_zero) clips(from_b); else clips(from_x);
 //   writes     S y
 //   ring       x
 //   numbers    S omega; bool from_zero, projected
+//   module     multigrid
 #include "cycle.sweep"
 
 // kernel cycle.into_ring: As cycle.sweep, into a ring of planes: what the plane that was here before had
@@ -39,6 +41,7 @@ if (from_zero) clips(from_b); else clips(from_x);
 //   writes     S y
 //   ring       y
 //   numbers    S omega; bool from_zero, projected
+//   module     multigrid
 if (L.spans.data) {
     int from = P.first, to = P.first + n;
     const auto look = [&](int k, int j) {
@@ -56,6 +59,7 @@ if (L.spans.data) {
 //   writes     S coarse
 //   other      S x, b
 //   finer
+//   module     multigrid
 T r[2*M]; const int fx = pairs ? 2 : 1;
 for (int begin = 0; begin < n; begin += M) {
     const int m = n - begin < M ? n - begin : (int)M;
@@ -75,6 +79,7 @@ for (int begin = 0; begin < n; begin += M) {
 //   writes     S x
 //   other      S coarse
 //   numbers    S scale; bool projected
+//   module     multigrid
 if (projected) {
     T e[2*M];  // the correction of each cell, so that what follows reads all fields in steps of one
     for (int begin = 0; begin < n; begin += 2*M) {
@@ -102,6 +107,7 @@ if (projected) {
 //   other      S x, lower, upper?
 //   finer
 //   numbers    S scale
+//   module     multigrid
 T low[2*M], high[2*M]; const T big = (T)1e30, inverse = reciprocal(scale); const int fx = pairs ? 2 : 1;
 for (int begin = 0; begin < n; begin += M) {
     const int m = n - begin < M ? n - begin : (int)M;

@@ -11,6 +11,7 @@ const bool uniform = !fx && !fy && !fz;
 // kernel components.singletons: every cell is a tree of its own, and hangs on nothing
 //   compute    float32
 //   writes     int32 parent; uint8 grounded
+//   module     grid
 for (int k = 0; k < n; ++k) { parent[k] = (int)(p + k); grounded[k] = 0; }
 
 // kernel components.unite: Join cells to their lower neighbors. Parents have smaller numbers, so
@@ -21,6 +22,7 @@ for (int k = 0; k < n; ++k) { parent[k] = (int)(p + k); grounded[k] = 0; }
 //   whole      int32 parent
 //   numbers    float64 nx, ny, nz
 //   ordered
+//   module     components
 #include "joined"
 const bool first = P.first == 0;  // from there a periodic axis leads to the last cell, from other rows to the one below
 const long long wrap_x = L.nx - 1, wrap_y = P.j == 0 ? (L.rows - 1)*L.s2 : -L.s2, wrap_z = P.k == 0 ? (L.planes - 1)*L.s1 : -L.s1;
@@ -70,6 +72,7 @@ for (int begin = 0; begin < n; begin += M) {
 //   reads      int8 cells; F fx?, fy?, fz?, shift?
 //   whole      int32 parent; uint8 grounded
 //   numbers    float64 nx, ny, nz
+//   module     components
 #include "joined"
 if (uniform && !shift) {
     const unsigned char ax = nx > 0, ay = ny > 0, az = nz > 0; unsigned char hit[M];
@@ -92,6 +95,7 @@ for (int k = 0; k < n; ++k) {
 //   compute    float32
 //   reads      int8 cells; int32 parent; uint8 grounded
 //   whole      int32 count
+//   module     grid
 const int q = (int)p; int floating = 0;
 SIMD for (int k = 0; k < n; ++k) floating += (cells[k] == 1) & (parent[k] == q + k) & (grounded[k] == 0);
 if (floating) count_up(count, floating);

@@ -12,6 +12,7 @@ const auto face_z = [&](long long k) -> T { if constexpr (FIELD_Z) return fz[k];
 //   reads      int8 cells
 //   writes     uint8 diagonal
 //   numbers    bool around_x, around_y, around_z
+//   module     grid
 const unsigned char along_x = around_x, along_y = around_y, along_z = around_z;
 const auto open = [&](long long k, unsigned char axis) -> unsigned char { return cells[k] != 2 ? axis : (unsigned char)0; };
 const auto count = [&](int k) {
@@ -82,6 +83,7 @@ SIMD for (int k = 0; k < n; ++k) to[k] = source[k];
 //   whole      vec2i chunks?
 //   numbers    int chunk_count; int64 size
 //   constants  CHUNK, SPAN_CELLS
+//   module     grid
 const auto none = [&](int k) {
 #ifdef __CUDA_ARCH__
     return false;

@@ -19,6 +19,7 @@ with_bounds([&](auto lower, auto upper) {
 //   compute    float64
 //   reads      float64 b; int8 unknown
 //   sums       square
+//   module     problem
 double square = 0;
 SIMD for (int i = 0; i < n; ++i) square += unknown[i] == 1 ? b[i]*b[i] : 0.0;
 
@@ -28,6 +29,7 @@ SIMD for (int i = 0; i < n; ++i) square += unknown[i] == 1 ? b[i]*b[i] : 0.0;
 //   reads      int8 unknown
 //   writes     float64 x
 //   numbers    bool keep
+//   module     problem
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int i = 0; i < n; ++i) {
         const double v = keep ? x[i] : 0.0, c = clipped(v, lower(i), upper(i)); x[i] = unknown[i] == 1 ? c : 0.0; } });
@@ -49,6 +51,7 @@ with_bounds([&](auto lower, auto upper) {
 //   bounds
 //   reads      float64 b; int8 unknown
 //   sums       bad, nan_lower, nan_upper, crossed, no_lower, no_upper
+//   module     problem
 double bad = 0, nan_lower = 0, nan_upper = 0, crossed = 0, no_lower = 0, no_upper = 0; const double inf = (double)INFINITY;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {

@@ -5,6 +5,7 @@
 // thread that holds none, as one whose core another process has. Who takes a chunk changes no result. What is taken of a lane is said with
 // the table's number of runs, so that a thread that comes late takes nothing, and nothing is set back.
 #ifndef __CUDA_ARCH__
+#define APART __attribute__((noinline))  // not copied to where it is called: the compiler would take twice as long
 typedef unsigned long long Word; typedef long long Long; typedef void (*Call)(void*, void*);
 enum { RUN, SERVE, CANCEL, QUIT };                                                                    // what is asked for
 enum { ALONE, TASKS, SLABS, COPY };                                                                   // operations
@@ -19,7 +20,7 @@ const auto get = [](const Word* w) { return __atomic_load_n(w, __ATOMIC_SEQ_CST)
 const auto set = [](Word* w, Word v) { __atomic_store_n(w, v, __ATOMIC_SEQ_CST); };
 const auto call = [=](int number, auto... arguments) { return ((long (*)(decltype(arguments)...))T[CALLS + number])(arguments...); };
 const auto now = [=] { long t[2] = {0, 0}; call(CLOCK, (int)T[CALLS + CLOCK_NUMBER], (void*)t); return (Long)t[0]*1000000000 + t[1]; };
-const auto relax = [=](int spins, int most, int yields) {  // a little at first, then let others have the core, then sleep
+const auto relax = [=](int spins, int most, int yields) APART {  // a little at first, then let others have the core, then sleep
     if (spins < most) {
 #if defined(__x86_64__)
         __builtin_ia32_pause();
@@ -42,7 +43,7 @@ const auto copy = [](const Word* made, Long begin, Long end) {  // bytes of a fi
 const auto run = [](const Word* made, char* arguments, Long begin, Long end) {
     ((int*)arguments)[0] = (int)begin; ((int*)arguments)[1] = (int)end;
     ((Call)made[FUNCTION])((void*)made[BOUNDS], arguments); };
-const auto plane = [=](const Word* made, char* arguments, Long i, Long least, Long most) {  // plane i of the finest rows, if its turn has come
+const auto plane = [=](const Word* made, char* arguments, Long i, Long least, Long most) APART {  // plane i of the finest rows, if its turn has come
     const Long finer = (Long)made[FINER], planes = (Long)made[PLANES]; Long k = i;
     if (finer > 1) {  // a coarser level's plane is done once, with its last finer one
         const Long all = (Long)made[FINER_PLANES];
@@ -54,7 +55,7 @@ const auto plane = [=](const Word* made, char* arguments, Long i, Long least, Lo
     run(made, arguments, k*tasks, (k + 1)*tasks); };
 
 const auto start_of = [](const Word* op, Word lane) { return lane*op[CHUNKS] / op[LANES]; };
-const auto take_of = [=](const Word* op, Word lane, Word runs, bool back, Long wanted) -> Long {  // a chunk, if it is wanted; else -1
+const auto take_of = [=](const Word* op, Word lane, Word runs, bool back, Long wanted) APART -> Long {  // a chunk, if it is wanted; else -1
     Word* word = (Word*)op[TAKEN] + lane*LANE_WORDS; const Word start = start_of(op, lane), all = start_of(op, lane + 1) - start;
     for (;;) {
         Word w = get(word);
@@ -120,7 +121,7 @@ const auto work = [=](const Word* op, Word runs, Long c) -> Word {  // on a chun
     if (op[KIND] == COPY) copy(made, begin, end); else run(made, room[0], begin, end);
     return 1; };
 
-const auto help = [=](Word* H, Word runs, Long limit) -> int {  // work through a table; 1: the caller's time is over first
+const auto help = [=](Word* H, Word runs, Long limit) APART -> int {  // work through a table; 1: the caller's time is over first
     const Word* op = (const Word*)H[OPERATIONS]; const Word* last = op + WORDS*H[COUNT];
     const Long began = me ? 0 : now(); Long since = began; int spins = 0;
     for (;;) {
@@ -182,4 +183,5 @@ else if (mode == CANCEL) {  // nobody takes any more, who comes later neither; w
             __atomic_fetch_sub(T + SLEEPERS, 1, __ATOMIC_SEQ_CST);
             call(UNLOCK, (void*)(T + MUTEX));
             spins = 0; } } }
+#undef APART
 #endif

@@ -23,6 +23,7 @@ return s;
 //   compute    float64
 //   whole      float64 partials, scalars
 //   numbers    int count, slot
+//   module     problem
 for (int k = 0; k < n; ++k) {
     const double* v = partials + (P.first + k)*(long long)count; double s = 0;
     SIMD8 for (int i = 0; i < count; ++i) s += v[i];

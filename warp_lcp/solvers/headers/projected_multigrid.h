@@ -8,6 +8,7 @@
 //   writes     float64 x; S q
 //   whole      float64 scalars
 //   constants  SIZE, BETA, STEP, PER_SIZE
+//   module     projected_multigrid.steps
 const S beta = (S)scalars[BETA]; const T step = scalars[STEP], inverse = step != 0 ? reciprocal(step) : 0;
 const bool fresh = beta == 0;  // then q may hold anything, a NaN too
 fetch(0, n, x, z, q);
@@ -137,6 +138,7 @@ for (int begin = 0; begin < n; begin += M) {
 //   writes     S lo, hi?
 //   whole      float64 scalars
 //   constants  SIZE, BETA, STEP, PER_SIZE
+//   module     projected_multigrid.steps
 const T inverse = reciprocal(scalars[SIZE]), big = 1e30;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
