@@ -119,7 +119,7 @@ class Loader(importlib.machinery.SourceFileLoader):
         path = self.get_filename(fullname)
         source = self.get_data(path).decode()
         if not fullname.startswith(REAL):
-            source = source.replace(".is_cuda", ".is_cuda_like").replace(".is_cpu", ".is_cpu_like")
+            source = re.sub(r"\.(is_cuda|is_cpu)\b", r".\1_like", source)
         source = source.replace("block_dim: int = 256", "block_dim: int = 1")  # fibers only where threads meet
         return compile(source, path, "exec", dont_inherit=True)
 
