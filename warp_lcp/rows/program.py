@@ -272,6 +272,10 @@ class Program:
         """Whether the team works through all of it, and none of it waits for other ranks."""
         return all(isinstance(command, Operation) and command.check is None for command in self._commands)
 
+    def fits(self) -> bool:
+        """Return whether its launches have room for the rows as they are now."""
+        return True
+
     @property
     def has_run(self) -> bool:
         """Whether all of its kernels are loaded: it has run, or they were loaded as they were recorded, on the CPU."""
@@ -420,44 +424,44 @@ class LaunchGraph:
         if self.at_once or RECORDING.program is not None or not (self.on_device if self.device.is_cuda else team()):
             self._record(*arguments)
             return
-        if self.device.is_cuda:
-            self._run_on_device(arguments, variant)
-            return
-        if self._threads != get_threads():
+        if not self.device.is_cuda and self._threads != get_threads():
             self._programs, self._threads = {}, get_threads()
         key = (variant, *map(_identity, arguments))
         program = self._programs.get(key)
-        if program is None:
+        if program is None or not program.fits():
             if len(self._programs) >= MOST_RECORDED:
                 self._programs.clear()
-            program = self._programs[key] = self._recorded(arguments)
-        elif LaunchGraph.verify and (other := self._recorded(arguments).differs(program)):
-            raise AssertionError(f"a recorded launch differs: {other}")
-        program.run()
-
-    def _run_on_device(self, arguments: tuple[Any, ...], variant: Hashable) -> None:
-        """Launch the graph of a CUDA device; what it cannot hold is launched in each run."""
-        from warp_lcp.rows.device_graph import DeviceProgram, NotRecordable
-
-        program = self._programs.get(variant)
-        if not isinstance(program, DeviceProgram) or not program.fits():
-            try:
-                self._programs[variant] = program = DeviceProgram(self.device)
-                with recording(program):
-                    self._record(*arguments)
-                program.finish()
-            except NotRecordable:
+            program = self._recorded(arguments)
+            if program is None:  # on CUDA
                 self.at_once = True
                 self._record(*arguments)
                 return
+            self._programs[key] = program
+        elif LaunchGraph.verify and not self.device.is_cuda:
+            other = self._recorded(arguments)
+            assert other is not None
+            if difference := other.differs(program):
+                raise AssertionError(f"a recorded launch differs: {difference}")
         program.run()
 
     def forget(self) -> None:
         """Record again in the next run, since arrays have been replaced."""
         self._programs = {}
 
-    def _recorded(self, arguments: tuple[Any, ...]) -> Program:
-        program = Program(self.device)
-        with recording(program):
-            self._record(*arguments)
-        return program
+    def _recorded(self, arguments: tuple[Any, ...]) -> Program | None:
+        """Return the program of some arguments; None where a graph of CUDA cannot hold it, so that it is launched in each run."""
+        if not self.device.is_cuda:
+            program = Program(self.device)
+            with recording(program):
+                self._record(*arguments)
+            return program
+        from warp_lcp.rows.device_graph import DeviceProgram, NotRecordable
+
+        on_device = DeviceProgram(self.device)
+        try:
+            with recording(on_device):
+                self._record(*arguments)
+        except NotRecordable:
+            return None
+        on_device.finish()
+        return on_device
