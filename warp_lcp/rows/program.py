@@ -92,6 +92,18 @@ class Conditional:
         wp.capture_if(self.condition, self.program._launch)
 
 
+@dataclass(frozen=True)
+class Loop:
+    """A program that is repeated on CUDA while a number on the device is not 0, within a graph."""
+
+    condition: wp.array[Any]
+    program: Program
+
+    def launch(self) -> None:
+        """Repeat it now, or record that in the graph that is being captured."""
+        wp.capture_while(self.condition, self.program._launch)
+
+
 def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
     """Call a function, or have the team do an operation, now if `launch` launches now; else record it among the launches."""
     program = getattr(launch, "__self__", None)
@@ -218,6 +230,25 @@ class DeviceCopy:
             wp.copy(self.to, self.source)
 
 
+@dataclass(frozen=True)
+class DeviceCall:
+    """What Warp launches by a function of its own on CUDA, a sort or a scan: nodes of a graph."""
+
+    function: Callable[[], object]
+
+    def launch(self) -> None:
+        """Do it now, or while a graph is captured."""
+        self.function()
+
+
+def call(function: Callable[[], object]) -> None:
+    """Do on CUDA what Warp launches by a function of its own, now or among recorded launches."""
+    if RECORDING.program is None:
+        function()
+    else:
+        RECORDING.program.record(DeviceCall(function))
+
+
 def _bytes_of(array: wp.array[Any]) -> int:
     return int(array.size * wp.types.type_size_in_bytes(array.dtype))
 
@@ -311,7 +342,9 @@ class Program:
         Args:
             condition: shape (1,), wp.int32.
         """
-        if self._loops_here():
+        if RECORDING.program is not None and self.device.is_cuda:
+            RECORDING.program.record(Loop(condition, self))
+        elif self._loops_here():
             if condition.ptr not in self._loops:
                 self._loops[condition.ptr] = self._captured_loop(condition)
             self._loops[condition.ptr]()
