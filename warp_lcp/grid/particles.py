@@ -345,7 +345,10 @@ class Particles:
             wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)
 
     def _keys_to_sort(self) -> int:
-        """Return how many keys a GPU sorts: at most a quarter more than there are particles, so that a graph serves many numbers of them."""
+        """Return how many keys a GPU sorts: at most a quarter more than particles.
+
+        So one graph serves many numbers of particles.
+        """
         step = 1 << max(self.count.bit_length() - 3, 0)
         return min(-(-self.count // step) * step, self._capacity)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
@@ -119,9 +120,9 @@ def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
 
 @contextmanager
 def together(device: wp.Device) -> Iterator[Launch]:
-    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches at once."""
+    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches now or records."""
     if device.is_cuda or team() is None:
-        yield wp.launch
+        yield launch
         return
     program = Program(device)
     yield program.launch
@@ -439,7 +440,8 @@ class LaunchGraph:
         at_once: whether to launch in each run instead.
     """
 
-    on_device: ClassVar[bool] = False  # whether CUDA graphs are captured: rehearsed on the CPU, not yet run on a GPU
+    # whether CUDA graphs are captured: equal bits when emulated on the CPU, not yet run on a GPU
+    on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"
     verify: ClassVar[bool] = False  # whether each run records again and compares with the first recording, for tests
 
     def __init__(self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False) -> None:
