@@ -257,7 +257,9 @@ class Verdict:
             cwd=ROOT, check=True, capture_output=True, text=True, timeout=600,
         ).stdout  # fmt: skip
         (self.out / "model.md").write_text(said)
-        return ", ".join([*(f"{cells} {ms} ms" for cells, ms, *_ in rows), *(f"a step at {n} {ms} ms, from graphs {graphs}" for n, ms, graphs in steps)])
+        return ", ".join(
+            [*(f"{cells} {ms} ms" for cells, ms, *_ in rows), *(f"a step at {n} {ms} ms, from graphs {graphs}" for n, ms, graphs in steps)]
+        )
 
     def _step_time(self, n: int, *, on_device: bool) -> float:
         """Return the time of a step of the dam break [s], with `LaunchGraph.on_device` or without."""

@@ -25,9 +25,9 @@ for line in sys.stdin:
 """
 
 
-def made(name: str) -> Any:
+def made(name: str, cells: int = 32) -> Any:
     """Return the simulation of a built-in scene, small."""
-    scene = load_scene(name, [f"domain.resolution={CELLS.get(name, 32)}"])
+    scene = load_scene(name, [f"domain.resolution={CELLS.get(name, cells)}"])
     return simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
 
 
@@ -101,20 +101,18 @@ def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
     ("name", "most"),
     [
         ("dam-break", {"calls": 15, "readbacks": 2, "launches": 230}),
-        ("column-collapse", {"calls": 60, "readbacks": 17, "launches": 800}),
-        ("floating-bodies", {"calls": 125, "readbacks": 30, "launches": 450}),
+        ("column-collapse", {"calls": 40, "readbacks": 20, "launches": 1000}),
+        ("floating-bodies", {"calls": 120, "readbacks": 32, "launches": 450}),
     ],
 )
-def test_graphs_of_a_step_give_the_same_bits_with_few_calls(
-    name: str, most: dict[str, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_graphs_of_a_step_give_the_same_bits_with_few_calls(name: str, most: dict[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
     """The host waits for the device at each readback, and graphs hold no allocations."""
     from benchmarks.emulated_cuda import meter
 
     states, counts = [], []
     for on_device in (False, True):
         monkeypatch.setattr(LaunchGraph, "on_device", on_device)
-        simulation = made(name)
+        simulation = made(name, 16 if name == "column-collapse" else 32)
         for _ in range(4):
             meter.clear()
             row = simulation.step(min(simulation.stable_dt(), DT))
@@ -124,7 +122,7 @@ def test_graphs_of_a_step_give_the_same_bits_with_few_calls(
     for what, number in most.items():  # of the last step: the first ones load kernels and capture graphs
         assert counts[-1][what] <= number, what
         assert counts[-1][what] > number // 2, f"{what}: lower the bound"
-    assert counts[-1]["calls"] < counts[3]["calls"] // 2 + 60
+    assert counts[-1]["calls"] < counts[3]["calls"] // 2  # graphs, in place of launches
     assert name != "dam-break" or counts[-1]["allocations"] == 0
 
 
