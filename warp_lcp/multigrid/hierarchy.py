@@ -266,7 +266,7 @@ class Hierarchy:
 
     @property
     def knows_changes(self) -> bool:
-        """Whether `refresh` finds the rows that have changed, all by launches that can be recorded."""
+        """Whether `refresh` finds the changed rows by launches that can be recorded."""
         return self.finest.stencil.spans is not None and self.finest.stencil.pattern is None
 
     @cached_property

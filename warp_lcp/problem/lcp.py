@@ -139,9 +139,9 @@ class LCP(Pickled):
         return self._faults(field, Bounds(self.layout, *INFINITE))[0]
 
     def look_at(self, field: wp.array[Any], launch: Launch = wp.launch) -> Reading:
-        """Launch the check of `not_finite`; return the reading whose first number is its result.
+        """Launch the check of `not_finite`; return the reading of its result.
 
-        For a problem in one process.
+        Its first number counts the values that are not finite. For a problem in one process.
         """
         self._counts.launch(CHECK, launch=launch, bounds=Bounds(self.layout, *INFINITE).operands, b=field, unknown=self.unknown)
         return self._counts.reading
