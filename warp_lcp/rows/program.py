@@ -244,10 +244,8 @@ class DeviceCall:
 
 def call(function: Callable[[], object]) -> None:
     """Do on CUDA what Warp launches by a function of its own, now or among recorded launches."""
-    if RECORDING.program is None:
-        function()
-    else:
-        RECORDING.program.record(DeviceCall(function))
+    program = RECORDING.program
+    function() if program is None else program.record(DeviceCall(function))
 
 
 def _bytes_of(array: wp.array[Any]) -> int:
@@ -440,8 +438,7 @@ class LaunchGraph:
         at_once: whether to launch in each run instead.
     """
 
-    # whether CUDA graphs are captured: equal bits when emulated on the CPU, not yet run on a GPU
-    on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"
+    on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"  # whether CUDA graphs are captured: not yet run on a GPU
     verify: ClassVar[bool] = False  # whether each run records again and compares with the first recording, for tests
 
     def __init__(self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False) -> None:
