@@ -119,7 +119,7 @@ class Loader(importlib.machinery.SourceFileLoader):
         path = self.get_filename(fullname)
         source = self.get_data(path).decode()
         if not fullname.startswith(REAL):
-            source = source.replace(".is_cuda", ".is_cuda_like").replace(".is_cpu", ".is_cpu_like")
+            source = re.sub(r"\.(is_cuda|is_cpu)\b", r".\1_like", source)
         source = source.replace("block_dim: int = 256", "block_dim: int = 1")  # fibers only where threads meet
         return compile(source, path, "exec", dont_inherit=True)
 
@@ -176,6 +176,9 @@ def emulate_decisions():
         return done
 
     wp.capture_launch = capture_launch
+    context.Launch.launch = counting("calls", context.Launch.launch)
+    for name in ("radix_sort_pairs", "array_scan"):
+        setattr(wp.utils, name, counting("calls", getattr(wp.utils, name)))
     wp.copy = counting("calls", wp.copy)
     for name in ("zero_", "fill_"):
         setattr(wp.array, name, counting("calls", getattr(wp.array, name)))
@@ -227,12 +230,12 @@ if COMPARE:
 def replayed():
     """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
     from warp_lcp.rows import device_graph
-    from warp_lcp.rows.program import Program
+    from warp_lcp.rows.program import Loop, Program
 
     device_graph.noted = lambda device, event: None
     wp.is_conditional_graph_supported = lambda: True
     Program._captured = lambda self, commands: list(commands)
-    Program._captured_loop = lambda self, condition: lambda: wp.capture_while(condition, self._launch)
+    Program._captured_loop = lambda self, condition: lambda: wp.capture_launch([Loop(condition, self)])
 
 
 emulate_kernels()

@@ -36,7 +36,7 @@ from warp_lcp.benchmarks.harness.record import Table
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.problems import natural, splash
-from warp_lcp.rows.program import Program, loops_on_device
+from warp_lcp.rows.program import LaunchGraph, Program, loops_on_device
 from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 CLOSE, ALIKE = 1e-5, 2e-2  # relative: solutions to 1e-8, and where particles are after many steps
@@ -89,6 +89,7 @@ class Verdict:
         self.claim("residuals by NumPy", self.residuals)
         self.claim("the same bits in every run", self.repeats)
         self.claim("graphs do what launches do", self.graphs)
+        self.claim("steps from graphs are those from launches", self.step_graphs)
         self.claim("steps without the host are the host's", self.ahead)
         self.claim("a step waits for the device twice", self.waiting)
         self.claim("grids without unknowns are refused", self.empty)
@@ -156,6 +157,21 @@ class Verdict:
         other = [name for name, x in recorded.items() if not np.array_equal(x, alone[name])]
         assert not other, f"differ: {', '.join(other)}"
         return f"{len(alone)} solves, bit for bit"
+
+    def step_graphs(self) -> str:
+        """Step scenes with `LaunchGraph.on_device`, and without."""
+        other, names = [], ("dam-break", "column-collapse-2d")
+        for name in names:
+            taken = []
+            for on in (False, True):
+                with mock.patch.object(LaunchGraph, "on_device", on):
+                    taken.append(list(gpu_cases.states(name, self.device, self.steps)))
+            for step, (a, b) in enumerate(zip(*taken, strict=True)):
+                if not all(np.array_equal(a[key], b[key]) for key in a):
+                    other.append(f"{name} from step {step} on")
+                    break
+        assert not other, f"differ: {', '.join(other)}"
+        return f"{self.steps} steps of {' and '.join(names)}, bit for bit"
 
     def ahead(self) -> str | None:
         """Solve, and step a liquid, with the host's judgment after each step."""
@@ -233,6 +249,21 @@ class Verdict:
         self.tables.append(Table("Cold solves of a splash to 1e-6", ["cells", "ms", "iterations", "status"], rows))
         assert all(row[-1] == "CONVERGED" for row in rows), rows
         for n in (16,) if self.rehearsal else (64, 128):
+            steps.append([f"{n}", *(f"{1e3 * self._step_time(n, on_device=on):.1f}" for on in (False, True))])
+        self.tables.append(Table("Steps of the dam break", ["cells along x", "ms", "ms, step graphs"], steps))
+        cells = ("16", "16") if self.rehearsal else ("128", "64")
+        said = subprocess.run(
+            [sys.executable, "-m", "benchmarks.gpu_model", "--cells", cells[0], "--step-cells", cells[1]],
+            cwd=ROOT, check=True, capture_output=True, text=True, timeout=600,
+        ).stdout  # fmt: skip
+        (self.out / "model.md").write_text(said)
+        return ", ".join(
+            [*(f"{cells} {ms} ms" for cells, ms, *_ in rows), *(f"a step at {n} {ms} ms, from graphs {graphs}" for n, ms, graphs in steps)]
+        )
+
+    def _step_time(self, n: int, *, on_device: bool) -> float:
+        """Return the time of a step of the dam break [s], with `LaunchGraph.on_device` or without."""
+        with mock.patch.object(LaunchGraph, "on_device", on_device):
             simulation = gpu_cases.simulation("dam-break", self.device, n)
             for count in (10, 20):  # until it moves, and what is timed
                 wp.synchronize()
@@ -240,15 +271,7 @@ class Verdict:
                 for _ in range(count):
                     simulation.step(simulation.stable_dt())
                 wp.synchronize()
-            steps.append([f"{n}", f"{1e3 * (time.perf_counter() - start) / count:.1f}"])
-        self.tables.append(Table("Steps of the dam break", ["cells along x", "ms"], steps))
-        cells = ("16", "16") if self.rehearsal else ("128", "64")
-        said = subprocess.run(
-            [sys.executable, "-m", "benchmarks.gpu_model", "--cells", cells[0], "--step-cells", cells[1]],
-            cwd=ROOT, check=True, capture_output=True, text=True, timeout=600,
-        ).stdout  # fmt: skip
-        (self.out / "model.md").write_text(said)
-        return ", ".join([*(f"{cells} {ms} ms" for cells, ms, *_ in rows), *(f"a step at {cells} {ms} ms" for cells, ms in steps)])
+        return (time.perf_counter() - start) / count
 
     def bandwidth(self) -> str:
         """Measure the kernels on the finest grid against copying."""

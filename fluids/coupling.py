@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -15,7 +16,7 @@ from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.program import LaunchGraph, clear, launch
+from warp_lcp.rows.program import LaunchGraph, call, clear, launch
 
 SPARE = 1.5  # room for entries, times those there are when there is none left
 
@@ -113,7 +114,7 @@ class BodyCoupling:
         self._beside.launch_rows(kernels.enter_kernel, [self._solids, kind, self._counts, None, None, None, None])
         first, device = 0, self.grid.device  # whose offset is 0
         if device.is_cuda:
-            wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
+            call(partial(wp.utils.array_scan, self._counts, self._offsets, inclusive=False))
             first = len(self._counts) - 1
         launch(kernels.offsets_kernel, 1, [first, self._counts, self._offsets, self.columns.count], device=device)
 

@@ -16,6 +16,16 @@ from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
 from warp_lcp.rows.program import LaunchGraph, clear, launch
 
+INTS, BYTES = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
+CUDA_LISTS = 1024  # parts of the list of faces, a thread of a GPU each
+
+
+@wp.func
+@no_type_check
+def part_begin(part: int, entries: int, parts: int):
+    """Return the first entry of one of equal parts of a list."""
+    return int((wp.int64(part) * wp.int64(entries)) // wp.int64(parts))
+
 
 class Walls:
     """Friction on the faces between sand and solids.
@@ -52,7 +62,7 @@ class Walls:
         self.sides = wp.array(sides, dtype=wp.uint8, device=device)
         self.walls = wp.array(walls, dtype=wp.int32, device=device)
         self.faces = WallFaces(self.cells, self.sides, self.walls, self.friction)
-        self._host = cells
+        self._counts = wp.zeros(CUDA_LISTS if device.is_cuda else 0, dtype=wp.int32, device=device)
         self.active = wp.zeros(1 + self.count, dtype=wp.int32, device=device)
 
     def activate(self, flags: wp.array) -> None:
@@ -61,18 +71,17 @@ class Walls:
         Args:
             flags: uint8 of the cells, 0 where they hold none.
         """
-        if not flags.device.is_cuda:
-            launch(activate_kernel, 1, [self.cells, flags.flatten(), self.active], device=flags.device)
+        device, fields = flags.device, [self.cells, flags.flatten(), self.active]
+        if not device.is_cuda:
+            launch(activate_kernel, 1, fields, device=device)
             return
-        found = np.flatnonzero(flags.numpy().ravel()[self._host])
-        active = np.zeros(1 + self.count, dtype=np.int32)
-        active[0], active[1 : 1 + len(found)] = len(found), found
-        self.active.assign(active)
+        for kernel in (count_active_kernel, list_active_kernel):
+            launch(kernel, CUDA_LISTS, [*fields, self._counts], device=device)
 
 
 @wp.kernel(enable_backward=False, module="granular.walls")
 @no_type_check
-def activate_kernel(cells: wp.array(dtype=wp.int32), flags: wp.array(dtype=wp.uint8), active: wp.array(dtype=wp.int32)):
+def activate_kernel(cells: INTS, flags: BYTES, active: INTS):
     """List the entries whose cells hold sand, in order, behind their number."""
     count = int(0)
     for face in range(cells.shape[0]):
@@ -80,6 +89,32 @@ def activate_kernel(cells: wp.array(dtype=wp.int32), flags: wp.array(dtype=wp.ui
             count += 1
             active[count] = face
     active[0] = count
+
+
+@wp.kernel(enable_backward=False, module="granular.walls_cuda")
+@no_type_check
+def count_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
+    """Count the entries of one of equal parts of the list whose cells hold sand; a thread a part."""
+    t, n, count = wp.tid(), cells.shape[0], int(0)
+    for face in range(part_begin(t, n, counts.shape[0]), part_begin(t + 1, n, counts.shape[0])):
+        if flags[cells[face]] != wp.uint8(0):
+            count += 1
+    counts[t] = count
+
+
+@wp.kernel(enable_backward=False, module="granular.walls_cuda")
+@no_type_check
+def list_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
+    """List them in order, behind their number: each part's after those of the parts before it."""
+    t, n, count = wp.tid(), cells.shape[0], int(0)
+    for before in range(t):
+        count += counts[before]
+    for face in range(part_begin(t, n, counts.shape[0]), part_begin(t + 1, n, counts.shape[0])):
+        if flags[cells[face]] != wp.uint8(0):
+            count += 1
+            active[count] = face
+    if t == counts.shape[0] - 1:
+        active[0] = count
 
 
 class SandSolids:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -24,9 +25,9 @@ for line in sys.stdin:
 """
 
 
-def made(name: str) -> Any:
+def made(name: str, cells: int = 32) -> Any:
     """Return the simulation of a built-in scene, small."""
-    scene = load_scene(name, [f"domain.resolution={CELLS.get(name, 32)}"])
+    scene = load_scene(name, [f"domain.resolution={CELLS.get(name, cells)}"])
     return simulators()[scene.scene.simulator].create(scene, device="cpu", folder=Path.cwd())
 
 
@@ -93,6 +94,36 @@ def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
     assert allocations == 0
     assert readbacks <= 2  # what the solve has come to, and what the step has
     assert launches <= 200  # most of them in graphs: levels of 16^3 cells are quicker so than in one block
+
+
+@EMULATED
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [
+        ("dam-break", {"calls": 15, "readbacks": 2, "launches": 230}),
+        pytest.param("column-collapse", {"calls": 40, "readbacks": 20, "launches": 1000}, marks=pytest.mark.slow),
+        pytest.param("floating-bodies", {"calls": 120, "readbacks": 32, "launches": 450}, marks=pytest.mark.slow),
+    ],
+)
+def test_graphs_of_a_step_give_the_same_bits_with_few_calls(name: str, most: dict[str, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host waits for the device at each readback, and graphs hold no allocations."""
+    from benchmarks.emulated_cuda import meter
+
+    states, counts = [], []
+    for on_device in (False, True):
+        monkeypatch.setattr(LaunchGraph, "on_device", on_device)
+        simulation = made(name, 16 if name == "column-collapse" else 32)
+        for _ in range(4):
+            meter.clear()
+            row = simulation.step(min(simulation.stable_dt(), DT))
+            counts.append({what: meter[what] for what in ("calls", "readbacks", "launches", "allocations")})
+        states.append({key: np.asarray(value).tobytes() for key, value in simulation.state().items()} | {"row": repr(row)})
+    assert [key for key in states[0] if states[0][key] != states[1][key]] == []
+    for what, number in most.items():  # of the last step: the first ones load kernels and capture graphs
+        assert counts[-1][what] <= number, what
+        assert counts[-1][what] > number // 2, f"{what}: lower the bound"
+    assert counts[-1]["calls"] < counts[3]["calls"] // 2  # graphs, in place of launches
+    assert name != "dam-break" or counts[-1]["allocations"] == 0
 
 
 @EMULATED

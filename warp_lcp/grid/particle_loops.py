@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.rows import KernelFile, RowPass, Rows
-from warp_lcp.rows.memory import DeviceRows, RowsMemory, Scalar, Slot
+from warp_lcp.rows.memory import Scalar, Slot, rows_memory
 from warp_lcp.rows.program import is_recording
 from warp_lcp.rows.team import get_threads
 
@@ -44,7 +44,7 @@ class ListMemory:
 
     def __init__(self, device: wp.Device) -> None:
         self.device, self.count = device, Scalar()
-        self.rows = DeviceRows(LIST_ROOM) if device.is_cuda else RowsMemory()
+        self.rows = rows_memory(device, LIST_ROOM)
         self._slots: dict[str, Slot] = {}
         self._entries = ctypes.c_int64()
         self.entries = ctypes.addressof(self._entries)

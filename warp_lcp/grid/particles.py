@@ -4,18 +4,20 @@ import itertools
 import math
 import typing
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.particle_loops import CPU_GRAIN, MARGIN, ListMemory, launch
+from warp_lcp.grid.particle_loops import CPU_GRAIN, LIST_ROOM, MARGIN, ListMemory, launch
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.memory import RowsMemory, Scalar
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.rows.memory import RowsMemory, Scalar, rows_memory
+from warp_lcp.rows.program import LaunchGraph, call
+from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Tally
 
@@ -130,16 +132,17 @@ class Particles:
         self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device) if indexed else None
         self._names = ["position", "velocity", *(f"affine_{c}" for c in range(grid.dimension if affine else 0))]
         self._names += ["kept"] * (kept is not None)
-        self._tally, columns = None, len(kernels.TOTAL.found)
-        if grid.device.is_cuda:
-            self._tally = Tally(kernels.TOTAL, grid.device, CUDA_THREADS)
+        self._tally, columns, device = None, len(kernels.TOTAL.found), grid.device
+        launches = self._launch_totals, self._launch_numbers, self._launch_sort
+        self._totals, self._numbering, self._sorting = (LaunchGraph(device, launch) for launch in launches)
+        self._total_rows = rows_memory(device, LIST_ROOM)
+        if device.is_cuda:
+            self._tally = Tally(kernels.TOTAL, device, CUDA_THREADS)
         else:
-            self._partials = wp.zeros(columns * THREADS, dtype=wp.float64, device=grid.device)
-            self._found, self._total_rows, self._places = Reading(grid.device, columns), RowsMemory(), Scalar()
-            self._totals = LaunchGraph(grid.device, self._launch_totals)
-            self._numbering = LaunchGraph(grid.device, self._launch_numbers)
-            self._sorting, self._sort_rows, self._sort_pieces = LaunchGraph(grid.device, self._launch_sort), RowsMemory(), Scalar()
-            self._counts = wp.zeros(0, dtype=wp.int32, device=grid.device)
+            self._partials = wp.zeros(columns * THREADS, dtype=wp.float64, device=device)
+            self._found, self._places = Reading(device, columns), Scalar()
+            self._sort_rows, self._sort_pieces = RowsMemory(), Scalar()
+            self._counts = wp.zeros(0, dtype=wp.int32, device=device)
         self._last: ParticleTotals | None = None
         self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
@@ -247,9 +250,8 @@ class Particles:
     def move_to(self, grid: StaggeredGrid) -> None:
         """Sort the particles by the cells of another grid from now on."""
         self.grid = grid
-        if self._tally is None:
-            for graph in (self._totals, self._numbering, self._sorting):
-                graph.forget()
+        for graph in (self._totals, self._numbering, self._sorting):
+            graph.forget()
         if self.offsets is not None:
             self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
 
@@ -274,10 +276,10 @@ class Particles:
 
     def _publish(self) -> None:
         """Tell recorded launches how many particles there are, and where."""
+        if self.count != self._memory.count.value:
+            self._total_rows.take(self._rows_of_totals().summed)
         if self._tally is None and self.count != self._memory.count.value:
-            rows = self._rows_of_totals()
-            self._total_rows.take(rows.summed)
-            self._places.value = rows.places
+            self._places.value = self._rows_of_totals().places
             pieces = _rows_of_sort(self.count, self.grid.device)
             self._sort_rows.take(pieces.single)
             self._sort_pieces.value = pieces.places
@@ -295,8 +297,7 @@ class Particles:
         self._spare = Column(self._capacity, self.count, device)
         self.key = zeros(2 * self._capacity, wp.int32, device)
         self._order = zeros(2 * self._capacity, wp.int32, device)
-        if self._tally is None:
-            self._sorting.forget()  # which knows the halves of both
+        self._sorting.forget()  # which knows the halves of both
 
     def arrange(self, step: int) -> None:
         """Number the particles by cell; sort every SORT_EVERY-th step if order allows.
@@ -315,10 +316,7 @@ class Particles:
 
     def number(self) -> None:
         """Find the cell of each particle."""
-        if self._tally is None:
-            self._numbering.run()
-        else:
-            self._launch_numbers()
+        self._numbering.run()
 
     def _launch_numbers(self) -> None:
         grid = self.grid
@@ -339,20 +337,35 @@ class Particles:
                 self._sorting.forget()
             self._sorting.run(variant=grid.size.bit_length())
         else:
-            self._launch_sort()
+            self._sorting.run(self._keys_to_sort())
         for name, column in self._columns.items():  # each lies where the one before it was
             self._columns[name], self._spare = self._spare, column
         self._publish()
-        if self.offsets is not None:
+        if self.offsets is not None and self._tally is None:
             wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)
 
-    def _launch_sort(self) -> None:
-        """Launch the numbering, the sort of the numbers, and the move of each column to where the one before it was."""
-        device, bits = self.grid.device, self.grid.size.bit_length()
+    def _keys_to_sort(self) -> int:
+        """Return how many keys a GPU sorts: at most a quarter more than particles.
+
+        So one graph serves many numbers of particles.
+        """
+        step = 1 << max(self.count.bit_length() - 3, 0)
+        return min(-(-self.count // step) * step, self._capacity)
+
+    def _launch_sort(self, keys: int = 0) -> None:
+        """Launch the numbering, the sort of the numbers, and the move of each column to where the one before it was.
+
+        Args:
+            keys: how many a GPU sorts: those behind the particles' have the largest number, and stay behind them.
+        """
+        device, size, count = self.grid.device, self.grid.size, self._memory.count
+        bits = size.bit_length()
         self._launch_numbers()
         if device.is_cuda:
-            wp.launch(kernels.count_up_kernel, self.count, [self._order], device=device)
-            wp.utils.radix_sort_pairs(self.key, self._order, self.count, end_bit=bits)
+            launch_recorded(kernels.count_up_kernel, keys, [self._order, self.key, count, (1 << bits) - 1], device=device)
+            call(partial(wp.utils.radix_sort_pairs, self.key, self._order, keys, end_bit=bits))
+            if self.offsets is not None:
+                launch_recorded(kernels.offset_kernel, size + 1, [self.key, count, self.offsets], device=device)
         else:
             rows = replace(_rows_of_sort(self.count, device), memory=self._sort_rows)
             sort_keys(_halves(self.key), _halves(self._order), self._counts, rows, self._sort_pieces, bits)
@@ -367,7 +380,8 @@ class Particles:
         if self.count == 0:
             return ParticleTotals()
         if self._tally is not None:
-            self._tally.take(self._rows_of_totals(), self.grid.placement, position=self.position, velocity=self.velocity)
+            self._totals.run()
+            self._tally.changed()
             total = self._tally.read()
         else:
             self._totals.run()
@@ -394,6 +408,9 @@ class Particles:
     def _launch_totals(self) -> None:
         """Launch the sums over the particles, and those of the threads' sums."""
         rows = replace(self._rows_of_totals(), memory=self._total_rows)
+        if self._tally is not None:
+            self._tally.take(rows, self.grid.placement, position=self.position, velocity=self.velocity)
+            return
         kernels.TOTAL.bind(rows, self.grid.placement, position=self.position, velocity=self.velocity, out=self._partials).launch()
         columns = Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True)
         kernels.ADD_IN_ORDER.bind(

@@ -21,10 +21,12 @@ SORT_PLACE = KERNELS.kernel("warp_lcp.grid.particles.sort_place", constants=_SOR
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
-def count_up_kernel(order: wp.array(dtype=wp.int32)):
-    """Write 0, 1, 2, ..."""
+def count_up_kernel(order: wp.array(dtype=wp.int32), key: wp.array(dtype=wp.int32), count: int, last: int):
+    """Write 0, 1, 2, ..., and a key beyond all others behind those of the particles."""
     p = wp.tid()
     order[p] = p
+    if p >= count:
+        key[p] = last
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")

@@ -21,7 +21,7 @@ from warp_lcp.grid.particle_loops import GridPlacement
 from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
 from warp_lcp.rows.layout import grain
-from warp_lcp.rows.memory import DeviceRows, RowsMemory, Scalar, Slot, larger
+from warp_lcp.rows.memory import DeviceRows, RowsMemory, Scalar, Slot, larger, rows_memory
 from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch_ranges
 from warp_lcp.settings import renamed_names
 
@@ -297,8 +297,8 @@ class ActiveWindow(Window):
     _now: Window
 
     def __init__(self, window: Window) -> None:
-        rows = DeviceRows if window.device.is_cuda else RowsMemory
-        memory = {"_rows": (rows(), rows()), "_sums": {}, "_ranges": (_RangeMemory(), _RangeMemory()), "hulls": Slot()}
+        rows = tuple(rows_memory(window.device) for _ in range(2))
+        memory = {"_rows": rows, "_sums": {}, "_ranges": (_RangeMemory(), _RangeMemory()), "hulls": Slot()}
         numbers = {"first": (Scalar(), Scalar()), "sizes": (Scalar(), Scalar()), "pieces": Scalar()}
         for name, value in {"device": window.device, **memory, **numbers, "_now": None}.items():
             object.__setattr__(self, name, value)  # which a dataclass that is frozen does not allow otherwise

@@ -21,6 +21,7 @@ from warp_lcp.operators.padded_stencil import PaddedStencil, coarsen_spans_kerne
 from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.program import Launch, Program, Task
+from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.sequence import CUDA_THREADS
 from warp_lcp.rows.vectors import convert
 
@@ -258,10 +259,15 @@ class Hierarchy:
         ours, theirs = self.finest.stencil.weights, self._source.weights
         for w, source in zip(ours or (), theirs or (), strict=True):
             if w is not source:
-                convert(source, w)
-        if self.finest.stencil.spans is None or self.finest.stencil.pattern is not None:
+                convert(source, w, launch=launch_recorded)
+        if not self.knows_changes:
             self.finest.changed.fill_(1)
         self._renewal.run()
+
+    @property
+    def knows_changes(self) -> bool:
+        """Whether `refresh` finds the changed rows by launches that can be recorded."""
+        return self.finest.stencil.spans is not None and self.finest.stencil.pattern is None
 
     @cached_property
     def _renewal(self) -> Program:

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_lcp.problem.protocol import FLUID
 from warp_lcp.rows import KernelFile
-from warp_lcp.rows.program import Launch, together
+from warp_lcp.rows.program import Launch, clear, together
 from warp_lcp.rows.readings import Reading
 
 options: dict[str, Any] = {"enable_backward": False, "module": "warp_lcp.components"}
@@ -276,14 +276,23 @@ class ComponentFinder:
     def look(self, scratch: Scratch | None = None) -> Callable[[], bool]:
         """Launch the search; return what tells whether there are none, and waits for the device; `scratch` as of `find`."""
         if self.wanted():
-            self._scratch = self._grow(scratch, self._A.cells_around)
+            self.search(scratch)
         return self.none
+
+    def search(self, scratch: Scratch | None) -> None:
+        """Launch a search, which is `wanted`; `scratch` as of `find`."""
+        self._scratch = self._grow(scratch, self._A.cells_around)
+
+    def changed(self) -> None:
+        """Say that a recorded `search` has run."""
+        self._count.changed()
 
     def wanted(self) -> bool:
         """Return whether there must be a search: the cells have changed since there were none. It counts from 0 then."""
         if self._none_at == self._A.version:
             return False
-        self._count.array.zero_()
+        if self._A.device.is_cpu:  # else `search` does
+            self._count.array.zero_()
         return True
 
     def none(self) -> bool:
@@ -299,7 +308,7 @@ class ComponentFinder:
 
     def _grow(self, scratch: Scratch | None, joined: wp.array[Any]) -> Scratch:
         """Search now; returns what `_search` does."""
-        self._count.array.zero_()
+        clear(self._count.array)
         with together(self._A.device) as launch:
             found = self._search(scratch, joined, launch)
         self._count.changed()

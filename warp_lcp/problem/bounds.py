@@ -118,6 +118,11 @@ class Bounds:
         lower, upper = self.fields
         self._others.launch(ENCODE, launch=launch, lower=lower, upper=upper, least=least, most=most, code=self._memory)
 
+    def changed(self) -> None:
+        """Say that a recorded `encode` has run."""
+        if self.in_place and self._memory is not None:
+            self._others.reading.changed()
+
     @property
     def stays(self) -> bool:
         """Whether there is a code now if there was one before, and none if there was none."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property, singledispatch
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layo
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
 from warp_lcp.rows.program import Launch
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
@@ -138,13 +138,13 @@ class LCP(Pickled):
         """Return the number of unknowns of a stored field that are not finite."""
         return self._faults(field, Bounds(self.layout, *INFINITE))[0]
 
-    def look_at(self, field: wp.array[Any], launch: Launch = wp.launch) -> Callable[[], int]:
-        """Launch the check of `not_finite`; return a function that reads its result.
+    def look_at(self, field: wp.array[Any], launch: Launch = wp.launch) -> Reading:
+        """Launch the check of `not_finite`; return the reading of its result.
 
-        For a problem in one process.
+        Its first number counts the values that are not finite. For a problem in one process.
         """
         self._counts.launch(CHECK, launch=launch, bounds=Bounds(self.layout, *INFINITE).operands, b=field, unknown=self.unknown)
-        return lambda: int(self._counts.reading.numpy()[0])
+        return self._counts.reading
 
     def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
         """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""

@@ -22,7 +22,7 @@ import warp as wp
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_newton import ContactNewton
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.memory import RowsMemory, Scalar
+from warp_lcp.rows.memory import Scalar, rows_memory
 from warp_lcp.rows.program import LaunchGraph
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class SweepWorkspace(threading.local):
     def __init__(self) -> None:
         self._room = [0, 0, 0]
         self._q, self._dim, self._contacts, self._rtol, self._most = (Scalar() for _ in range(5))
-        self._rows, self._islands = RowsMemory(), 0
+        self._rows, self._islands = rows_memory(wp.get_device("cpu")), 0
 
     def run(
         self, fields: Sequence[np.ndarray], work: int, indices: Sequence[np.ndarray], shape: tuple[int, int, int],

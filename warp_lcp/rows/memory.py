@@ -146,6 +146,7 @@ class DeviceRows(RowsMemory):
     __slots__ = ("extent", "places", "room", "spare")
 
     def __init__(self, spare: float = 1.0) -> None:
+        """Begin with one thread; where `room` must grow, it does so by the factor `spare` more."""
         super().__init__()
         self.extent: tuple[int, ...] = (1, 1, 1)
         self.room: tuple[int, ...] = (1, 1, 1)
@@ -157,6 +158,11 @@ class DeviceRows(RowsMemory):
         self.extent = -(-layout.planes // max(layout.slab, 1)), layout.rows, layout.chunks
         self.room = larger(self.room, self.extent, self.spare)
         self.places.value = self.tasks.value
+
+
+def rows_memory(device: wp.Device, spare: float = 1.0) -> Any:
+    """Return memory of rows for recorded launches of a device; `spare` as of `DeviceRows`."""
+    return DeviceRows(spare) if device.is_cuda else RowsMemory()
 
 
 def larger(room: tuple[int, ...], extent: tuple[int, ...], spare: float = 1.0) -> tuple[int, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
@@ -92,6 +93,18 @@ class Conditional:
         wp.capture_if(self.condition, self.program._launch)
 
 
+@dataclass(frozen=True)
+class Loop:
+    """A program that is repeated on CUDA while a number on the device is not 0, within a graph."""
+
+    condition: wp.array[Any]
+    program: Program
+
+    def launch(self) -> None:
+        """Repeat it now, or record that in the graph that is being captured."""
+        wp.capture_while(self.condition, self.program._launch)
+
+
 def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
     """Call a function, or have the team do an operation, now if `launch` launches now; else record it among the launches."""
     program = getattr(launch, "__self__", None)
@@ -107,9 +120,9 @@ def perform(what: Callable[[], object] | Operation, launch: Launch) -> None:
 
 @contextmanager
 def together(device: wp.Device) -> Iterator[Launch]:
-    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches at once."""
+    """Give what records launches, which the team works through as one table afterwards; on CUDA, what launches now or records."""
     if device.is_cuda or team() is None:
-        yield wp.launch
+        yield launch
         return
     program = Program(device)
     yield program.launch
@@ -218,6 +231,23 @@ class DeviceCopy:
             wp.copy(self.to, self.source)
 
 
+@dataclass(frozen=True)
+class DeviceCall:
+    """What Warp launches by a function of its own on CUDA, a sort or a scan: nodes of a graph."""
+
+    function: Callable[[], object]
+
+    def launch(self) -> None:
+        """Do it now, or while a graph is captured."""
+        self.function()
+
+
+def call(function: Callable[[], object]) -> None:
+    """Do on CUDA what Warp launches by a function of its own, now or among recorded launches."""
+    program = RECORDING.program
+    function() if program is None else program.record(DeviceCall(function))
+
+
 def _bytes_of(array: wp.array[Any]) -> int:
     return int(array.size * wp.types.type_size_in_bytes(array.dtype))
 
@@ -272,6 +302,10 @@ class Program:
         """Whether the team works through all of it, and none of it waits for other ranks."""
         return all(isinstance(command, Operation) and command.check is None for command in self._commands)
 
+    def fits(self) -> bool:
+        """Return whether its launches have room for the rows as they are now."""
+        return True
+
     @property
     def has_run(self) -> bool:
         """Whether all of its kernels are loaded: it has run, or they were loaded as they were recorded, on the CPU."""
@@ -307,7 +341,9 @@ class Program:
         Args:
             condition: shape (1,), wp.int32.
         """
-        if self._loops_here():
+        if RECORDING.program is not None and self.device.is_cuda:
+            RECORDING.program.record(Loop(condition, self))
+        elif self._loops_here():
             if condition.ptr not in self._loops:
                 self._loops[condition.ptr] = self._captured_loop(condition)
             self._loops[condition.ptr]()
@@ -402,7 +438,7 @@ class LaunchGraph:
         at_once: whether to launch in each run instead.
     """
 
-    on_device: ClassVar[bool] = False  # whether CUDA graphs are captured: rehearsed on the CPU, not yet run on a GPU
+    on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"  # whether CUDA graphs are captured: not yet run on a GPU
     verify: ClassVar[bool] = False  # whether each run records again and compares with the first recording, for tests
 
     def __init__(self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False) -> None:
@@ -420,44 +456,44 @@ class LaunchGraph:
         if self.at_once or RECORDING.program is not None or not (self.on_device if self.device.is_cuda else team()):
             self._record(*arguments)
             return
-        if self.device.is_cuda:
-            self._run_on_device(arguments, variant)
-            return
-        if self._threads != get_threads():
+        if not self.device.is_cuda and self._threads != get_threads():
             self._programs, self._threads = {}, get_threads()
         key = (variant, *map(_identity, arguments))
         program = self._programs.get(key)
-        if program is None:
+        if program is None or not program.fits():
             if len(self._programs) >= MOST_RECORDED:
                 self._programs.clear()
-            program = self._programs[key] = self._recorded(arguments)
-        elif LaunchGraph.verify and (other := self._recorded(arguments).differs(program)):
-            raise AssertionError(f"a recorded launch differs: {other}")
-        program.run()
-
-    def _run_on_device(self, arguments: tuple[Any, ...], variant: Hashable) -> None:
-        """Launch the graph of a CUDA device; what it cannot hold is launched in each run."""
-        from warp_lcp.rows.device_graph import DeviceProgram, NotRecordable
-
-        program = self._programs.get(variant)
-        if not isinstance(program, DeviceProgram) or not program.fits():
-            try:
-                self._programs[variant] = program = DeviceProgram(self.device)
-                with recording(program):
-                    self._record(*arguments)
-                program.finish()
-            except NotRecordable:
+            program = self._recorded(arguments)
+            if program is None:  # on CUDA
                 self.at_once = True
                 self._record(*arguments)
                 return
+            self._programs[key] = program
+        elif LaunchGraph.verify and not self.device.is_cuda:
+            other = self._recorded(arguments)
+            assert other is not None
+            if difference := other.differs(program):
+                raise AssertionError(f"a recorded launch differs: {difference}")
         program.run()
 
     def forget(self) -> None:
         """Record again in the next run, since arrays have been replaced."""
         self._programs = {}
 
-    def _recorded(self, arguments: tuple[Any, ...]) -> Program:
-        program = Program(self.device)
-        with recording(program):
-            self._record(*arguments)
-        return program
+    def _recorded(self, arguments: tuple[Any, ...]) -> Program | None:
+        """Return the program of some arguments; None where a graph of CUDA cannot hold it, so that it is launched in each run."""
+        if not self.device.is_cuda:
+            program = Program(self.device)
+            with recording(program):
+                self._record(*arguments)
+            return program
+        from warp_lcp.rows.device_graph import DeviceProgram, NotRecordable
+
+        on_device = DeviceProgram(self.device)
+        try:
+            with recording(on_device):
+                self._record(*arguments)
+        except NotRecordable:
+            return None
+        on_device.finish()
+        return on_device

@@ -17,7 +17,7 @@ from warp_lcp.problem.solve import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Rows
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Conditional, Launch, Program, loops_on_device
+from warp_lcp.rows.program import Conditional, Launch, LaunchGraph, Program, copy, launch, loops_on_device
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import CONVERT
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
@@ -83,20 +83,23 @@ class RunAhead:
         loop, work, r = self._loop(), self._work, self._work.residual
         if loop is None:
             return None
-        p = work.problem
-        r.renew()
+        p, hierarchy = work.problem, work.hierarchy
+        renewed = r.has_new_operator()
+        if renewed and not (work.A.device.is_cuda and hierarchy.knows_changes):
+            hierarchy.refresh()
+            renewed = False
         counted = criteria.counted if isinstance(criteria, MeanCriteria) else None
         numbers = int(r.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, work.descent.noise
         if self._beginning is None or not self._beginning.fits(guess, counted):
             self._beginning = Beginning(work, guess, counted, self._found, self._judge_first)
         for number, value in zip(self._numbers, numbers, strict=True):
             number.value = value
-        self._beginning.run()
         if work.A.device.is_cuda:
-            *given, noise = numbers
-            memory = [r.scalars, self._found.array, self._judged.array, self._going, self._stale]
-            self._launch(kernels.begin_kernel, memory, [*given, counted, noise])
-        self._run(loop)
+            self._beginning.run_with(loop, self._going, renewed=renewed)
+        else:
+            self._beginning.run()
+            loop.run_while(self._going)
+        self._take_rows()
         reference, first = (math.sqrt(row[int(kernels.NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
         usual = p.bounds.stays and self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
@@ -128,6 +131,10 @@ class RunAhead:
     def _run(self, loop: Program) -> None:
         """Launch the loop, and take over the rows that there are then."""
         loop.run_while(self._going)
+        self._take_rows()
+
+    def _take_rows(self) -> None:
+        """Take over the rows that a loop has left; waits for the device."""
         for reading in (self._found, self._judged):
             reading.changed()
         count = int(self._judged.numpy()[int(kernels.TAKEN)])
@@ -158,7 +165,7 @@ class Beginning:
         guess: stored field, read each time.
         counted: of the criteria, see `MeanCriteria`.
         found: receives the first evaluation, see `projected_multigrid_kernels.keep_row`.
-        judge: records what decides whether the guess is good enough; on CUDA the caller launches it.
+        judge: launches or records what decides whether the guess is good enough.
     """
 
     def __init__(
@@ -167,6 +174,7 @@ class Beginning:
     ) -> None:  # fmt: skip
         self._work, self._guess, self._counted, self._found, device = work, guess, counted, found, work.A.device
         self._key, self._finder = work.program_key(), work.problem.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
+        self._judge, self._graph = judge, LaunchGraph(device, self._launch)  # on CUDA
         self._program = None if device.is_cuda else Program(device)
         if self._program is not None:
             self._searches, search = wp.zeros(1, dtype=wp.int32, device=device), Program(device)
@@ -179,21 +187,45 @@ class Beginning:
         return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.program_key()
 
     def run(self) -> None:
-        """Launch everything."""
-        wanted = self._finder.wanted()
-        if self._program is None:
-            self._record(wp.launch, None)
-        else:
-            self._searches.numpy()[0] = wanted
-            self._program.run()
+        """Launch everything, on the CPU."""
+        assert self._program is not None
+        self._searches.numpy()[0] = self._finder.wanted()
+        self._program.run()
         self._work.residual.classify = True
+
+    def run_with(self, loop: Program, going: wp.array[Any], *, renewed: bool) -> None:
+        """Launch everything on CUDA, and the steps that follow: one graph.
+
+        Args:
+            loop: a step, which is repeated while
+            going: is not 0.
+            renewed: whether the hierarchy reads the operator again first.
+        """
+        self._graph.run(loop, going, renewed, self._finder.wanted())
+        r, p = self._work.residual, self._work.problem
+        for changed in (p.bounds, r.square_of_b, self._finder, self._faults):
+            changed.changed()
+        r.classify = True
+
+    def _launch(self, loop: Program, going: wp.array[Any], renewed: bool, searches: bool) -> None:
+        """Launch or record everything, with arguments as of `run_with`; `searches`: for floating components."""
+        if renewed:
+            self._work.hierarchy.refresh()
+        self._record(launch, self._finder.search if searches else None)
+        self._judge(self._counted, launch)
+        loop.run_while(going)
 
     def is_plain(self) -> bool:
         """Return whether no component floats and the guess is finite; waits for the device."""
-        return self._finder.none() and not self._faults()
+        return self._finder.none() and not self._faults.numpy()[0]
 
-    def _record(self, launch: Launch, search: Conditional | None) -> None:
-        """Record the launches, or launch them; the search for floating components where it is None and due."""
+    def _record(self, launch: Launch, search: Conditional | Callable[[Any], object] | None) -> None:
+        """Record the launches, or launch them.
+
+        Args:
+            launch: launches or records.
+            search: of floating components: on the CPU a part of the program, on CUDA what launches it; None: it is not due.
+        """
         work, r, x = self._work, self._work.residual, self._work.x
         p, device = work.problem, work.A.device
         p.bounds.encode(launch)
@@ -204,14 +236,14 @@ class Beginning:
         r.classify = False
         r.assess(x, launch=launch)
         launch(kernels.keep_row_kernel, 1, [r.scalars, self._found.array, 0], device=device)
-        if search is None:
-            self._finder.look(work.scratch)
-        else:
+        if isinstance(search, Conditional):
             assert self._program is not None
             self._program.record(search)
+        elif search is not None:
+            search(work.scratch)
         self._faults = p.look_at(self._guess, launch)
-        if search is None:
-            p.layout.copy(x, self._guess)
+        if device.is_cuda:
+            copy(x, self._guess)
         else:
             CONVERT.bind(Rows.of_fields(p.layout), a=self._guess, b=x).launch(launch)
         r.project(x, keep=True, launch=launch)

@@ -71,9 +71,15 @@ class AssessedResidual(NaturalResidual):
 
     def renew(self) -> None:
         """Take the operator again if it has changed."""
-        if self._version != self._A.version:
-            self._version, self.stale = self._A.version, True
+        if self.has_new_operator():
             self._hierarchy.refresh()
+
+    def has_new_operator(self) -> bool:
+        """Return whether the operator has changed; the caller then refreshes the hierarchy."""
+        if self._version == self._A.version:
+            return False
+        self._version, self.stale = self._A.version, True
+        return True
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
