@@ -13,7 +13,7 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers.projected_multigrid_kernels import ZAP, ZAZ
+from warp_lcp.solvers.projected_multigrid_kernels import ENERGY, ZAP, ZAZ
 
 I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
@@ -56,6 +56,16 @@ def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
             zp += uz[i] * w * up[j]
     scalars[ZAZ] += zz
     scalars[ZAP] += zp
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
+def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64):
+    """From u = U'x and W u: x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x."""
+    beyond = wp.float64(0.0)
+    for i in range(n):
+        beyond += u[i] * weighed[i]
+    scalars[ENERGY] -= beyond
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/low_rank_correction.h")
@@ -114,7 +124,7 @@ class LowRankCorrection:
     @property
     def key(self) -> tuple[int, ...]:
         """What recorded launches depend on."""
-        return self.slots, self._Z.ptr or 0, self._columns.rows.ptr
+        return self.slots, self._Z.ptr or 0
 
     def renew(self, *, begins: bool) -> bool:
         """Take the free set as it is now: choose the columns to correct for, and make potentials, a cycle each.
