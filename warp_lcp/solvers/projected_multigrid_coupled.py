@@ -11,7 +11,8 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Step
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.program import Launch, LaunchGraph, Program
+from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import CONVERT, rows_of
 from warp_lcp.solvers import principal_system_low_rank as coupling
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
@@ -74,6 +75,7 @@ class CoupledWorkspace(MultigridWorkspace):
         super().__init__(problem, A, settings)
         self.correction = LowRankCorrection(low, self.hierarchy)
         self._ahead = RunAhead(self, rebuilds=False) if RunAhead.suits(self) else None
+        self._evaluation = LaunchGraph(problem.device, self._launch_evaluation, at_once=problem.layout.across is not None)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self._newton: Inner | None = None
@@ -136,9 +138,12 @@ class CoupledWorkspace(MultigridWorkspace):
             return
         begins, self._fresh = self._fresh, False
         if self.correction.renew(begins=begins):  # its right-hand side was overwritten
-            self.residual.assess(self.x)
+            self._evaluation.run(self.x, variant=(self.residual.classify, *self.problem_key()))
             if self.floating is not None:
                 self._project()
+
+    def _launch_evaluation(self, x: wp.array[Any]) -> None:
+        self.residual.assess(x, launch=launch_recorded)
 
     def _cycle(self) -> None:
         """Run a cycle on the residual."""
