@@ -363,7 +363,7 @@ class Motions:
         placed = _applied((R, t), _corners(boxes))
         low = np.where(limited, np.maximum(0.0, placed.min(axis=-2)), 0.0)
         high = np.where(limited, np.minimum(size, placed.max(axis=-2)), size)
-        corners, inside = _corners(np.stack([low, high], axis=-2)), (low <= high).all(axis=-1)
+        corners, inside = _corners(np.stack([low, high], axis=-2)), np.all(low <= high, axis=-1)
         way = _after((R[1:], t[1:]), _inverse((R[:-1], t[:-1])))
         fastest = 0.0
         for step, ends in ((way, slice(None, -1)), (_inverse(way), slice(1, None))):  # it may be in the domain at one end only

@@ -147,14 +147,20 @@ class ContactProblem:
     joints: JointPart | None = None
 
     def at(self, b: np.ndarray) -> ContactProblem:
-        """Return the problem of the same contacts with other velocities b; what is known of their order is kept."""
+        """Return the problem of the same contacts with other velocities b.
+
+        The sorted rows are taken over.
+        """
         other = replace(self, b=b)
         other.__dict__["sorted_rows"] = self.sorted_rows
         return other
 
     @cached_property
     def sorted_rows(self) -> tuple[np.ndarray, ...]:
-        """Order and starts of `islands`; in that order J of both bodies, the diagonal of B besides J J', that of B, and the friction."""
+        """Rows of the contacts, sorted by islands.
+
+        Order and starts as of `islands`; in that order J of both bodies, the diagonal of B besides J J', that of B, and the friction.
+        """
         k, rows, _ = self.one.shape
         order, starts = self.islands()
         diagonal, yields = (values.reshape(k, rows)[order] for values in self.yields())
