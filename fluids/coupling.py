@@ -68,6 +68,7 @@ class BodyCoupling:
         self._beside, self._enclosing = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
         self._counting = LaunchGraph(grid.device, self._launch_count)
         self._entering = LaunchGraph(grid.device, self._launch_entries)
+        self._gathering = LaunchGraph(grid.device, self._launch_gather)
         self._holding = LaunchGraph(grid.device, self._launch_enclosed)
 
     def join(self, A: wl.GridPoisson) -> wl.SumOperator:
@@ -76,6 +77,7 @@ class BodyCoupling:
         `take` updates it in place.
         """
         self._low = wl.LowRankOperator.of_blocks(A, self.columns, self._weights())
+        self._gathering.at_once = self.columns.across is not None
         return wl.SumOperator(A, self._low)
 
     def take(self, kind: wp.array) -> None:
@@ -124,8 +126,11 @@ class BodyCoupling:
 
     def push(self, x: wp.array) -> None:
         """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""
-        sums = self.columns.gather(x.flatten()).numpy()
-        self.bodies.bodies.apply_impulses(self._scale * sums.reshape(-1, self.width))
+        self._gathering.run(x.flatten(), variant=self.columns.rows.ptr)
+        self.bodies.bodies.apply_impulses(self._scale * self.columns.sums.numpy().reshape(-1, self.width))
+
+    def _launch_gather(self, x: wp.array) -> None:
+        self.columns.gather(x, launch=launch)
 
     def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Move particles buried by a body with it.

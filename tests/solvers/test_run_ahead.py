@@ -19,8 +19,11 @@ emulated = pytest.mark.skipif("emulated_cuda" not in sys.modules, reason="the pl
 SOLVER = wl.ProjectedMultigrid()
 
 
-def random_problem(rng: np.random.Generator) -> tuple[wl.LCP, wp.array[Any]]:
-    """Return a problem in place, as simulators have them, of any shape, cells, bounds and size, and its right-hand side."""
+def random_problem(rng: np.random.Generator, bodies: int = 0) -> tuple[wl.LCP, wp.array[Any]]:
+    """Return a problem in place, as simulators have them, of any shape, cells, bounds and size, and its right-hand side.
+
+    With bodies A has a term U W U' more, of three columns each, light or heavy.
+    """
     shape = tuple(int(n) for n in rng.integers(3, 24, rng.integers(2, 4)))
     cells = rng.choice([FLUID, FLUID, FLUID, AIR, SOLID], shape)
     if rng.random() < 0.5:
@@ -28,11 +31,23 @@ def random_problem(rng: np.random.Generator) -> tuple[wl.LCP, wp.array[Any]]:
         cells[-1] = AIR
     cells.flat[: shape[-1]] = FLUID, *rng.choice([FLUID, AIR], shape[-1] - 1)
     shift = rng.choice([0.0, 1e-3, 1.0]) if (cells == AIR).any() else 1e-3
-    A = wl.GridPoisson(cells, shift=shift or None, device="cpu")
+    A: Any = wl.GridPoisson(cells, shift=shift or None, device="cpu")
     b, lower = A.layout.zeros(wp.float64), A.layout.zeros(wp.float64)
     lower.fill_(-np.inf if rng.random() < 0.3 else 0.0)
     stored = A.layout.stored_shape
+    if bodies:
+        U = rng.standard_normal((*shape, 3 * bodies)) * (rng.random(shape) < 0.2)[..., None] * (cells == FLUID)[..., None]
+        A = wl.SumOperator(A, wl.LowRankOperator(U, random_weights(rng, bodies), device="cpu"))
     return wl.LCP(A, b.reshape(stored), lower.reshape(stored), np.inf), b
+
+
+def random_weights(rng: np.random.Generator, bodies: int) -> np.ndarray:
+    """Return W of bodies, each with a symmetric block that may be singular: held by a wall."""
+    W = np.zeros((3 * bodies, 3 * bodies))
+    for block in range(0, 3 * bodies, 3):
+        root = rng.standard_normal((3, int(rng.integers(1, 4))))
+        W[block : block + 3, block : block + 3] = 10.0 ** rng.integers(-3, 3) * root @ root.T
+    return W
 
 
 def change(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator) -> None:
@@ -68,6 +83,42 @@ def test_solves_are_those_of_the_host(seed: int, precision: Any, monkeypatch: py
         if rng.random() < 0.3:
             guess.assign(rng.standard_normal(guess.size) * (problem.unknown.numpy() == 1))
     assert begun == 5 * (ahead.problem.layout.across is None)
+
+
+def solved_in_turn(problem: wl.LCP, b: wp.array[Any], rng: np.random.Generator, works: tuple[Any, ...], bodies: int) -> None:
+    """Solve problems with bodies one after another from both workspaces; compare bits, and the energy with that of A x found apart."""
+    guess, A, stored = problem.layout.zeros(wp.float64), problem.A, problem.layout.stored_shape
+    for _ in range(4):
+        change(problem, b, rng)
+        A.low.update(random_weights(rng, bodies))
+        found = []
+        for work in works:
+            stopping = wl.StoppingCriteria(rtol=1e-6, max_iterations=25)
+            result = wl.solve(problem, SOLVER, stopping=stopping, x0=guess, workspace=work)
+            rows = [(r.iteration, r.residual, r.active, r.step) for r in result.history]
+            found.append((rows, result.status, result.residual, work.residual.energy, work.x.numpy().tobytes()))
+        assert found[0] == found[1]
+        residual, x = works[1].residual, wp.clone(works[1].x)
+        residual.evaluate(x)
+        y = A.apply(x.reshape(stored)).numpy().ravel()
+        terms = x.numpy() * (0.5 * y + b.numpy())
+        assert abs(residual.energy - terms.sum()) <= 1e-11 * np.abs(x.numpy() * y).sum() + 1e-11 * np.abs(terms).sum() + 1e-300
+        wp.copy(guess, works[0].x)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_solves_with_bodies_are_those_of_the_host(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As above with a term of low rank: the host follows the free set, the device takes the steps between."""
+    rng = np.random.default_rng(4600 + seed)
+    bodies = int(rng.integers(1, 4))
+    problem, b = random_problem(rng, bodies)
+    ahead = SOLVER.init(problem)
+    with monkeypatch.context() as patch:
+        patch.setattr(RunAhead, "suits", lambda work: False)
+        alone = SOLVER.init(problem)
+    assert alone._ahead is None
+    assert ahead._ahead is not None
+    solved_in_turn(problem, b, rng, (alone, ahead), bodies)
 
 
 @emulated

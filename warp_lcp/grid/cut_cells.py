@@ -316,8 +316,8 @@ def _ring(grid: StaggeredGrid, open_sides: int) -> np.ndarray:
 
 def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
     """Return the box around boxes of nodes; None: there are none."""
-    if not boxes:
-        return None
+    if len(boxes) < 2:
+        return boxes[0] if boxes else None
     return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
 
 

@@ -360,16 +360,16 @@ class Motions:
         limited = np.array([box is not None for box in bounds])[:, None]
         boxes = np.array([np.zeros((2, 3)) if box is None else np.where(size > 0.0, box, 0.0) for box in bounds])
         R, t = self.poses(np.linspace(time, time + span, SPEED_SAMPLES + 1))
-        before, after = (R[:-1], t[:-1]), (R[1:], t[1:])
-        way = _after(after, _inverse(before))
+        placed = _applied((R, t), _corners(boxes))
+        low = np.where(limited, np.maximum(0.0, placed.min(axis=-2)), 0.0)
+        high = np.where(limited, np.minimum(size, placed.max(axis=-2)), size)
+        corners, inside = _corners(np.stack([low, high], axis=-2)), np.all(low <= high, axis=-1)
+        way = _after((R[1:], t[1:]), _inverse((R[:-1], t[:-1])))
         fastest = 0.0
-        for place, step in ((before, way), (after, _inverse(way))):  # it may be in the domain at one end of the way only
-            placed = _applied(place, _corners(boxes))
-            low = np.where(limited, np.maximum(0.0, placed.min(axis=-2)), 0.0)
-            high = np.where(limited, np.minimum(size, placed.max(axis=-2)), size)
-            corners = _corners(np.stack([low, high], axis=-2))
-            speeds = np.linalg.norm(_applied(step, corners) - corners, axis=-1).max(axis=-1) * SPEED_SAMPLES / span
-            fastest = max(fastest, float(speeds.max(initial=0.0, where=(low <= high).all(axis=-1))))
+        for step, ends in ((way, slice(None, -1)), (_inverse(way), slice(1, None))):  # it may be in the domain at one end only
+            ways = _applied(step, corners[ends]) - corners[ends]
+            speeds = np.sqrt(np.square(ways).sum(axis=-1)).max(axis=-1) * SPEED_SAMPLES / span
+            fastest = max(fastest, float(speeds.max(initial=0.0, where=inside[ends])))
         return fastest
 
 

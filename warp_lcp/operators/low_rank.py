@@ -172,6 +172,7 @@ class LowRankOperator(Pickled):
         columns: the rows of U that are not 0, `warp_lcp.operators.low_rank.BlockColumns`.
         weights: W, float64, shape (k, k); `update` changes it.
         version: how often columns and weights have been taken.
+        weighed: W U'x of the last product, float64, shape (k,).
 
     Raises:
         ValueError: shapes do not match, there is no column, or a value is not finite.
@@ -273,8 +274,8 @@ class LowRankOperator(Pickled):
         Other rows of `out` keep their values. `mask` is uint8; all are flat stored fields.
         """
         W = self._transposed if transposed else self.weights
-        launch(weigh_kernel, self.rank, [W, self.columns.gather(x, launch=launch), self._weighed], device=self.device)
-        self.columns.scatter(self._weighed, base, out, mask=mask, launch=launch)
+        launch(weigh_kernel, self.rank, [W, self.columns.gather(x, launch=launch), self.weighed], device=self.device)
+        self.columns.scatter(self.weighed, base, out, mask=mask, launch=launch)
 
     def stored_diagonal(self, out: wp.array[Any]) -> None:
         """Add the diagonal to a flat stored field of type wp.float64."""
@@ -313,7 +314,7 @@ class LowRankOperator(Pickled):
         self._weights.host[:], self._turned.host[:] = W, W.T
         self._weights.send()
         self._turned.send()
-        self._weighed = wp.zeros(self.rank, dtype=wp.float64, device=self.device)
+        self.weighed = wp.zeros(self.rank, dtype=wp.float64, device=self.device)
 
     def _checked_weights(self, weights: Any) -> np.ndarray:
         """Return W as a host matrix."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warp_lcp.grid.solids import Geometry
-from warp_lcp.rigid.body import STATE, BodyMotion, BodyStates, RigidBody
+from warp_lcp.rigid.body import STATE, BodyMotion, BodyStates, RigidBody, lengths
 from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import Contacts, ContactSolve, ImpulseSolver, sweeps_and_newton
@@ -229,7 +229,7 @@ class RigidBodies:
             gravity: its size [m/s^2].
         """
         six, there = self.bodies.velocities(), ~self.gone()
-        speeds = np.linalg.norm(six[:, :3], axis=1) + np.linalg.norm(six[:, 3:], axis=1) * self._solve.reach
+        speeds = lengths(six[:, :3]) + lengths(six[:, 3:]) * self._solve.reach
         return float(speeds[there].max()) + span * gravity if there.any() else 0.0
 
     def kinetic_energy(self) -> float:

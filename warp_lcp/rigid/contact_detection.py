@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.rigid.body import BodyStates, RigidBody
+from warp_lcp.rigid.body import BodyStates, RigidBody, lengths
 from warp_lcp.rigid.box_contacts import OrientedBox, box_box
 from warp_lcp.rigid.contact_shape import ON_SURFACE, ContactShape
 from warp_lcp.rigid.obstacles import Obstacle
@@ -181,8 +181,8 @@ def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
         return points
     above = points.gap - points.gap.min()
     chosen = [int(points.gap.argmin())]
-    way = np.linalg.norm(points.point - points.point[chosen[0]], axis=1)
-    side = np.linalg.norm(points.normal - points.normal[chosen[0]], axis=1)
+    way = lengths(points.point - points.point[chosen[0]])
+    side = lengths(points.normal - points.normal[chosen[0]])
     for lower, flat in ((LOWER, FLAT[dimension]), (MUCH_LOWER, FLAT[dimension] + MORE)):
         allowed = above < (above[chosen].max() - LEVEL * size if lower == MUCH_LOWER else np.inf)
         while len(chosen) < MOST[dimension]:
@@ -191,8 +191,8 @@ def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
                 break
             following = int(np.where(usable, way + size * side - lower * above, -np.inf).argmax())
             chosen.append(following)
-            way = np.minimum(way, np.linalg.norm(points.point - points.point[following], axis=1))
-            side = np.minimum(side, np.linalg.norm(points.normal - points.normal[following], axis=1))
+            way = np.minimum(way, lengths(points.point - points.point[following]))
+            side = np.minimum(side, lengths(points.normal - points.normal[following]))
     return points.where(np.array(chosen))
 
 
@@ -317,7 +317,7 @@ class ContactDetection:
         ]
         first, second = close_pairs(middle, half + ways[:, None] + 0.5 * near)
         margins = near + ways[first] + ways[second]
-        way = np.linalg.norm(middle[first] - middle[second], axis=1)
+        way = lengths(middle[first] - middle[second])
         balls = self._ball[first] & self._ball[second] & (way > ON_SURFACE * self._radius[second])
         touching = self._balls(first[balls], second[balls], middle, margins[balls])
         if not balls.all():
@@ -332,7 +332,7 @@ class ContactDetection:
     def _balls(self, i: np.ndarray, j: np.ndarray, centers: np.ndarray, margins: np.ndarray) -> FoundContacts:
         """Return the contacts of balls i with balls j: the points between them on the lines of their centers."""
         way = centers[i] - centers[j]
-        length = np.linalg.norm(way, axis=1)
+        length = lengths(way)
         gap = length - self._radius[j] - self._radius[i]
         near = gap <= margins
         i, j, gap = i[near], j[near], gap[near]

@@ -13,6 +13,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -145,6 +146,27 @@ class ContactProblem:
     bodies: int
     joints: JointPart | None = None
 
+    def at(self, b: np.ndarray) -> ContactProblem:
+        """Return the problem of the same contacts with other velocities b.
+
+        The sorted rows are taken over.
+        """
+        other = replace(self, b=b)
+        other.__dict__["sorted_rows"] = self.sorted_rows
+        return other
+
+    @cached_property
+    def sorted_rows(self) -> tuple[np.ndarray, ...]:
+        """Rows of the contacts, sorted by islands.
+
+        Order and starts as of `islands`; in that order J of both bodies, the diagonal of B besides J J', that of B, and the friction.
+        """
+        k, rows, _ = self.one.shape
+        order, starts = self.islands()
+        diagonal, yields = (values.reshape(k, rows)[order] for values in self.yields())
+        J = np.concatenate([self.one[order], self.other[order]], axis=2)
+        return order, starts, J, yields, diagonal, self.friction[order]
+
     def yields(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the diagonal of B and its part besides J J', shape (k rows,) each."""
         own = np.square(self.one).sum(axis=2) + np.square(self.other).sum(axis=2)
@@ -188,11 +210,9 @@ class ContactProblem:
         if self.joints is not None:
             raise ValueError("joints: the default solver (NNCG sweeps and Newton) handles only contacts; give RigidBodies another solver")
         k, rows, q = self.one.shape
-        order, starts = self.islands()
-        diagonal, yields = (values.reshape(k, rows)[order] for values in self.yields())
-        J = np.concatenate([self.one[order], self.other[order]], axis=2)
+        order, starts, J, *others = self.sorted_rows
         x = np.zeros((k, rows)) if start is None else start[order]
-        fields = (x, J, self.b[order], yields, diagonal, self.friction[order])
+        fields = (x, J, self.b[order], *others)
         work, indices = 3 * k * rows + (self.bodies + 1) * q, (self.first[order], self.second[order], starts)
         x, residual, rounds = SWEEPS.run(fields, work, indices, (k, rows, q), stopping)
         for island in np.flatnonzero(residual > unsolved):

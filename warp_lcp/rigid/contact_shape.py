@@ -10,6 +10,7 @@ import warp as wp
 from scipy.spatial import ConvexHull
 
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh
+from warp_lcp.rigid.body import lengths
 from warp_lcp.rigid.box_contacts import OrientedBox
 from warp_lcp.rigid.outline import mesh_outline
 
@@ -117,7 +118,7 @@ class ContactShape:
         """
         signed = self.signed or (lambda points: self.distance(points)[0])
         start, way = edges[:, 0], edges[:, 1] - edges[:, 0]
-        near = signed(start + 0.5 * way) - 0.5 * np.linalg.norm(way, axis=1) <= margin
+        near = signed(start + 0.5 * way) - 0.5 * lengths(way) <= margin
         start, way = start[near], way[near]
         low, high, each = np.zeros(len(start)), np.ones(len(start)), np.arange(len(start))
         for _ in range(ROUNDS if len(start) else 0):
@@ -129,7 +130,7 @@ class ContactShape:
 
     def reach(self, center: np.ndarray) -> float:
         """Return the largest distance of a surface point from a center [m]."""
-        return float(np.linalg.norm(self.points - center, axis=1).max(initial=0.0)) + self.radius
+        return float(lengths(self.points - center).max(initial=0.0)) + self.radius
 
 
 def _box(shape: Box, dimension: int) -> ContactShape:
@@ -151,7 +152,7 @@ def _box(shape: Box, dimension: int) -> ContactShape:
         local = ((points - center) @ R)[:, :dimension]
         beyond = np.abs(local) - flat
         out, deepest = np.maximum(beyond, 0.0), beyond.argmax(axis=1)
-        length = np.linalg.norm(out, axis=1)
+        length = lengths(out)
         inside = length <= ON_SURFACE * flat.max()
         each = np.arange(len(local))
         direction = np.where(inside[:, None], np.eye(dimension)[deepest], out / np.where(inside, 1.0, length)[:, None])
@@ -186,7 +187,7 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         share = np.clip((points - start) @ axis / square, 0.0, 1.0) if square else np.zeros(len(points))
         way = points - start - share[:, None] * axis
-        length = np.linalg.norm(way, axis=1)
+        length = lengths(way)
         middle = length <= ON_SURFACE * radius
         direction = np.where(middle[:, None], other / np.linalg.norm(other), way / np.where(middle, 1.0, length)[:, None])
         return length - radius, direction
@@ -213,11 +214,11 @@ def _polygon(shape: TriangleMesh) -> ContactShape:
         from_start = points[:, None, :2] - start
         share = np.clip((from_start * way).sum(axis=2) / squares, 0.0, 1.0)
         ways = from_start - share[..., None] * way
-        lengths = np.linalg.norm(ways, axis=2)
-        each, nearest = np.arange(len(points)), lengths.argmin(axis=1)
+        away = np.linalg.norm(ways, axis=2)
+        each, nearest = np.arange(len(points)), away.argmin(axis=1)
         a, b = from_start, from_start - way  # the outline winds around the points inside by 2 pi
         turns = np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(axis=2)).sum(axis=1)
-        length, sign = lengths[each, nearest], np.where(np.abs(turns) > np.pi, -1.0, 1.0)
+        length, sign = away[each, nearest], np.where(np.abs(turns) > np.pi, -1.0, 1.0)
         on = length <= ON_SURFACE * size
         direction = np.where(on[:, None], normals[nearest], sign[:, None] * ways[each, nearest] / np.where(on, 1.0, length)[:, None])
         return sign * length, np.column_stack([direction, np.zeros(len(points))])
@@ -246,11 +247,11 @@ def _surface(shape: TriangleMesh) -> ContactShape:
         around = points[None] + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
         values = signed(around.reshape(-1, 3)).reshape(7, -1)
         slope = (values[1:4] - values[4:]).T
-        length = np.linalg.norm(slope, axis=1)
+        length = lengths(slope)
         return values[0], slope / np.where(length > 0.0, length, 1.0)[:, None]
 
     ends = vertices[_edges_of(triangles)]
-    long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > LONG * size
+    long = lengths(ends[:, 1] - ends[:, 0]) > LONG * size
     return ContactShape(points=_spread(vertices, triangles), radius=0.0, distance=distance, size=size, signed=signed, edges=ends[long])
 
 

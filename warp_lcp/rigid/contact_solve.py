@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rigid.body import AXES, PLANAR, BodyStates, cross, in_space, rotation_by
+from warp_lcp.rigid.body import AXES, PLANAR, BodyStates, cross, in_space, lengths, rotation_by
 from warp_lcp.rigid.contact_detection import NONE, ContactDetection, FoundContacts, Place, between
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, JointPart
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
@@ -74,6 +74,7 @@ class ContactSolve:
         self._friction = np.array([body.friction for body in bodies])
         self._bounce = np.array([body.restitution for body in bodies])
         self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # and the rotations that they are of
+        self._last: tuple[Contacts, np.ndarray, ContactProblem] | None = None  # contacts, roots and problem of `push_apart`
         self._roots_of_inertias = np.linalg.cholesky(bodies.inverse_inertia)
 
     def check_start(self, time: float) -> None:
@@ -106,7 +107,7 @@ class ContactSolve:
         """
         falls = float(np.linalg.norm(gravity)) * dt
         six = self.bodies.velocities()
-        speeds, spins = np.linalg.norm(six[:, :3], axis=1), np.linalg.norm(six[:, 3:], axis=1)
+        speeds, spins = lengths(six[:, :3]), lengths(six[:, 3:])
         ways = AHEAD * dt * (speeds + spins * self.reach + falls)
         brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
         near = NEAR * float(self._size.min())
@@ -192,7 +193,7 @@ class ContactSolve:
         found = between(shapes[0], places[0], shapes[1], places[1], margin, self.dimension)
         point, normal = contacts.point[k] + (at - now).mean(axis=0), contacts.frames[k, 0]
         if len(found):
-            nearest = int(np.linalg.norm(found.point - point, axis=1).argmin())
+            nearest = int(lengths(found.point - point).argmin())
             point, normal = found.point[nearest], found.normal[nearest]
         arms = point - at
         speeds = six[:, :3] + cross(six[:, 3:], arms)
@@ -235,7 +236,7 @@ class ContactSolve:
         b = contacts.velocities(self._velocities())
         b[:, 0] -= contacts.target
         start = self.memory.recall(contacts, self.bodies) if start is None else start
-        problem = self._problem(contacts, b, contacts.friction)
+        problem = self._problem_of_step(contacts, b)
         if self.joints:
             impulses, pushes = self._hold_joints(problem, contacts, start, dt, kick_dt)
         else:
@@ -349,6 +350,14 @@ class ContactSolve:
                 reached = firm.spread(contacts, number, G, G - G @ V @ V.T)
                 waiting += [other for other in reached if other not in waiting and self.bodies[other].hold is None]
 
+    def _problem_of_step(self, contacts: Contacts, b: np.ndarray) -> ContactProblem:
+        """Return the problem of the contacts of a step, which is solved twice: before and after the material's impulses."""
+        roots = self._roots()
+        if self._last is None or self._last[0] is not contacts or self._last[1] is not roots:
+            self._last = contacts, roots, self._problem(contacts, b, contacts.friction)
+            return self._last[2]
+        return self._last[2].at(b)
+
     def _problem(self, contacts: Contacts, b: np.ndarray, friction: np.ndarray) -> ContactProblem:
         """Return the problem of the first rows of each contact, as many as b has, shape (k, rows)."""
         one, other = (rows[:, : b.shape[1]] for rows in (contacts.one, contacts.other))
@@ -399,7 +408,7 @@ class ContactSolve:
         """Return how far points near the bodies go with an obstacle in a step [m]."""
         if motion is None:
             return 0.0
-        return dt * float(np.linalg.norm(_carried(motion, self.bodies.position, time, dt), axis=1).max())
+        return dt * float(lengths(_carried(motion, self.bodies.position, time, dt)).max())
 
     def _answer(self, pushes: np.ndarray) -> np.ndarray:
         """Return M^-1 times what acts on the bodies, shape (n, q) both."""

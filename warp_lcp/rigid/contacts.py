@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
 
-from warp_lcp.rigid.body import BodyStates, cross
+from warp_lcp.rigid.body import BodyStates, cross, lengths
 
 SAME_PLACE = 0.05  # of a body's size: a contact this close to one of the last step starts from its impulse
 KEPT = 32  # contacts remembered for each body, at most
@@ -118,9 +118,11 @@ class ContactMemory:
         low, high = (np.searchsorted(before[order], keys, side=side) for side in ("left", "right"))
         fresh = np.repeat(np.arange(len(keys)), high - low)  # each contact beside each old one of the same two
         known = order[np.arange(len(fresh)) - np.repeat(np.cumsum(high - low) - high, high - low)]
-        way = np.linalg.norm(places[fresh] - old[known, 2:5], axis=1)
+        way = lengths(places[fresh] - old[known, 2:5])
         mine, theirs = _least(fresh, known, way), _least(known, fresh, way)
-        both = np.intersect1d(mine, theirs, assume_unique=True)
+        nearest = np.zeros((2, len(way)), dtype=bool)
+        nearest[0, mine] = nearest[1, theirs] = True
+        both = np.flatnonzero(nearest[0] & nearest[1])
         both = both[way[both] < SAME_PLACE * contacts.size[fresh[both]]]
         start[fresh[both]] = (contacts.frames[fresh[both]] @ old[known[both], 5:, None])[:, :, 0]
         return start
@@ -166,6 +168,6 @@ def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.n
     u = cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     for way, least in ways:
         along = way - (way * normal).sum(axis=1)[:, None] * normal
-        u = np.where((np.linalg.norm(along, axis=1) > least)[:, None], along, u)
+        u = np.where((lengths(along) > least)[:, None], along, u)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     return np.stack([normal, u, cross(normal, u)], axis=1)

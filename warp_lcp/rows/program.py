@@ -270,6 +270,7 @@ class Program:
         self._runs = 0
         self._stretches: list[Callable[[], object]] | None = None
         self._loops: dict[int, Callable[[], object]] = {}  # what launches their graph, by the address of their condition
+        self._native: bool | None = None  # None: not known
 
     def __len__(self) -> int:
         """Return the number of launches."""
@@ -294,13 +295,19 @@ class Program:
             self._commands += [operation.only_if(what.condition) for operation in what.program._commands]
         else:
             self._commands.append(Task(what) if callable(what) else what)
-        self._stretches = None
+        self._forget_prepared()
+
+    def _forget_prepared(self) -> None:
+        """Prepare again what is run, since there are other commands."""
+        self._stretches = self._native = None
         self._loops.clear()
 
     @property
     def is_native(self) -> bool:
         """Whether the team works through all of it, and none of it waits for other ranks."""
-        return all(isinstance(command, Operation) and command.check is None for command in self._commands)
+        if self._native is None:
+            self._native = all(isinstance(command, Operation) and command.check is None for command in self._commands)
+        return self._native
 
     def fits(self) -> bool:
         """Return whether its launches have room for the rows as they are now."""
@@ -315,8 +322,7 @@ class Program:
         """Append the launches of another program."""
         self._commands += other._commands
         self._arguments += other._arguments
-        self._stretches = None
-        self._loops.clear()
+        self._forget_prepared()
 
     def run(self) -> None:
         """Launch everything once, or record that among the launches of another program."""
@@ -352,11 +358,11 @@ class Program:
 
     def _loops_here(self) -> bool:
         """Return whether `run_while` can do without the host now."""
+        if not self.device.is_cuda and team() is not None:
+            return self.is_native and not is_collective()
         if self._has_tasks or not loops_on_device(self.device):
             return False
-        if self.device.is_cuda or team() is None:
-            return self._runs > 0  # the first run loads the kernels
-        return self.is_native and not is_collective()
+        return self._runs > 0  # the first run loads the kernels
 
     def _captured_loop(self, condition: wp.array[Any]) -> Callable[[], object]:
         """Return what launches a graph, or has the team work through a table, that repeats the launches."""

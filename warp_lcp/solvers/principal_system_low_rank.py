@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
@@ -11,9 +11,10 @@ import warp as wp
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy
+from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers.projected_multigrid_kernels import ZAP, ZAZ
+from warp_lcp.solvers.projected_multigrid_kernels import ENERGY, ZAP, ZAZ
 
 I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
@@ -56,6 +57,16 @@ def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
             zp += uz[i] * w * up[j]
     scalars[ZAZ] += zz
     scalars[ZAP] += zp
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
+def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64):
+    """From u = U'x and W u: x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x."""
+    beyond = wp.float64(0.0)
+    for i in range(n):
+        beyond += u[i] * weighed[i]
+    scalars[ENERGY] -= beyond
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/low_rank_correction.h")
@@ -105,6 +116,12 @@ class LowRankCorrection:
         self._dots: Reduction | None = None
         self._slot_columns = list[int]()
         self._seen = np.zeros(n)  # U_q' U_q when a potential was made
+        self._products = wp.zeros(0, dtype=wp.float64, device=device)  # U'Z, a slot after another
+        at_once = low.layout.across is not None
+        self._squaring, self._exciting, self._multiplying = (
+            LaunchGraph(device, record, at_once=at_once)
+            for record in (self._launch_squares, self._launch_unit_force, self._launch_products)
+        )
 
     @property
     def slots(self) -> int:
@@ -114,7 +131,7 @@ class LowRankCorrection:
     @property
     def key(self) -> tuple[int, ...]:
         """What recorded launches depend on."""
-        return self.slots, self._Z.ptr or 0, self._columns.rows.ptr
+        return self.slots, self._Z.ptr or 0
 
     def renew(self, *, begins: bool) -> bool:
         """Take the free set as it is now: choose the columns to correct for, and make potentials, a cycle each.
@@ -125,9 +142,8 @@ class LowRankCorrection:
         Returns:
             Whether the finest right-hand side was lost.
         """
-        low, finest, W = self._low, self._hierarchy.finest, self._low.weights.numpy()
-        one = Rows.flat(1, low.device)
-        SQUARES.bind(one, self._columns.entry_fields, rank=low.rank, d=finest.stencil.d, squares=self._squares).launch()
+        low, W = self._low, self._low.weights.numpy()
+        self._squaring.run(variant=self._columns.rows.ptr)
         found, width, across = self._squares.numpy().copy(), self._columns.width, low.layout.across
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
@@ -193,19 +209,21 @@ class LowRankCorrection:
         """Make the potentials B U_q of columns."""
         finest, n = self._hierarchy.finest, self._size
         for q in columns:
-            finest.b.zero_()
             unit = np.zeros(self._low.rank)
             unit[q] = 1.0
             self._force.assign(unit)
-            self._spread(1.0, wp.launch)
+            self._exciting.run(variant=self._columns.rows.ptr)
             self._hierarchy.cycle.run()
             wp.copy(self._Z, finest.x, dest_offset=self._slot_columns.index(q) * n, count=n)
             self._seen[q] = squares[q]
 
     def _invert(self, W: np.ndarray) -> bool:
         """Write the inverses of S and E on the modes that are felt; return whether S is as symmetric as it should be."""
-        d, m, n = self._hierarchy.finest.stencil.d, self.slots, self._size
-        G = np.stack([self._columns.gather(self._Z[s * n : (s + 1) * n], mask=d, fused=False).numpy().copy() for s in range(m)], axis=1)
+        m = self.slots
+        if self._products.size < m * self._low.rank:
+            self._products = wp.zeros(m * self._low.rank, dtype=wp.float64, device=self._low.device)
+        self._multiplying.run(self._products, variant=(*self.key, self._columns.rows.ptr))
+        G = np.ascontiguousarray(self._products.numpy()[: m * self._low.rank].reshape(m, -1).T)
         S = G[self._slot_columns]
         even, odd = 0.5 * (S + S.T), 0.5 * (S - S.T)
         values, vectors = np.linalg.eigh(W[np.ix_(self._slot_columns, self._slot_columns)])
@@ -221,6 +239,23 @@ class LowRankCorrection:
             target[: m * m].assign(inverse.ravel())
         self._force.zero_()
         return bool(skew <= SKEW and ratios.min(initial=0.0) > -SKEW)
+
+    def _launch_squares(self) -> None:
+        """Launch the sums U_q' U_q over the free set, and the rows that each body touches there."""
+        one, d = Rows.flat(1, self._low.device), self._hierarchy.finest.stencil.d
+        SQUARES.bind(one, self._columns.entry_fields, rank=self._low.rank, d=d, squares=self._squares).launch()
+
+    def _launch_unit_force(self) -> None:
+        """Make U f the finest right-hand side."""
+        clear(self._hierarchy.finest.b)
+        self._spread(1.0, launch_recorded)
+
+    def _launch_products(self, products: wp.array[Any]) -> None:
+        """Launch U'Z, a slot after another."""
+        d, rank, n = self._hierarchy.finest.stencil.d, self._low.rank, self._size
+        for s in range(self.slots):
+            along = self._columns.gather(self._Z[s * n : (s + 1) * n], mask=d, fused=False, launch=launch_recorded)
+            copy(products[s * rank : (s + 1) * rank], along)
 
     def _spread(self, sign: float, launch: Launch) -> None:
         """Add U f to the finest right-hand side."""

@@ -40,13 +40,14 @@ class RunAhead:
 
     Args:
         work: whose steps they are; its operator is a grid's, in one process.
+        rebuilds: whether the device follows the free set, too; else steps end where that changes, and the host rebuilds.
 
     Attributes:
         rows: evaluations that the host has not looked at, see `projected_multigrid_kernels.keep_row`.
     """
 
-    def __init__(self, work: MultigridWorkspace) -> None:
-        self._work, device = work, work.A.device
+    def __init__(self, work: MultigridWorkspace, *, rebuilds: bool = True) -> None:
+        self._work, self._rebuilds, device = work, rebuilds, work.A.device
         self.rows = deque[np.ndarray]()
         self._found, self._judged = Reading(device, ROWS * int(kernels.ROW)), Reading(device, kernels.JUDGED)
         self._going, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
@@ -58,18 +59,21 @@ class RunAhead:
     @staticmethod
     def suits(work: MultigridWorkspace) -> bool:
         """Return whether the device can do without its host: where loops run on it, on a grid in one process."""
-        plain = type(work.hierarchy) is Hierarchy and isinstance(work.problem.A, GridPoisson)
+        plain = type(work.hierarchy) is Hierarchy and isinstance(work.A, GridPoisson)
         return plain and work.problem.layout.across is None and loops_on_device(work.A.device)
 
     def steps(self, tolerance: float, left: int) -> bool:
         """Take a step and what follows it, at most `left`; return False, with nothing done, where kernels have yet to be loaded."""
+        work, r = self._work, self._work.residual
+        if not self._rebuilds:
+            work.rebuild()
         loop = self._loop()
         if loop is None:
             return False
-        work, r = self._work, self._work.residual
         given = [int(r.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
         self._launch(kernels.resume_kernel, [self._judged.array, self._going, self._stale], given)
-        self._run(loop)
+        loop.run_while(self._going)
+        self._take_rows()
         return True
 
     def begin(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria, left: int) -> float | None:
@@ -80,8 +84,9 @@ class RunAhead:
             criteria: when steps are done.
             left: steps at most.
         """
-        loop, work, r = self._loop(), self._work, self._work.residual
-        if loop is None:
+        work, r = self._work, self._work.residual
+        loop = self._loop() if self._rebuilds else None
+        if loop is None and self._rebuilds:
             return None
         p, hierarchy = work.problem, work.hierarchy
         renewed = r.has_new_operator()
@@ -98,7 +103,8 @@ class RunAhead:
             self._beginning.run_with(loop, self._going, renewed=renewed)
         else:
             self._beginning.run()
-            loop.run_while(self._going)
+            if loop is not None:
+                loop.run_while(self._going)
         self._take_rows()
         reference, first = (math.sqrt(row[int(kernels.NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
@@ -128,11 +134,6 @@ class RunAhead:
                 made.set_param_at_index(place, value)
         made.launch()
 
-    def _run(self, loop: Program) -> None:
-        """Launch the loop, and take over the rows that there are then."""
-        loop.run_while(self._going)
-        self._take_rows()
-
     def _take_rows(self) -> None:
         """Take over the rows that a loop has left; waits for the device."""
         for reading in (self._found, self._judged):
@@ -148,12 +149,13 @@ class RunAhead:
             return None
         if id(step) not in self._loops:
             loop = self._loops[id(step)] = Program(work.A.device)
-            loop.record(Conditional(self._stale, rebuild))
+            if self._rebuilds:
+                loop.record(Conditional(self._stale, rebuild))
             if work.precision is Precision.SINGLE:  # rounding cannot be taken back: x, the best iterate, is stored before each step
                 CONVERT.bind(Rows.of_fields(work.problem.layout), a=work.x, b=work.best()).launch(loop.launch)
             loop.extend(step)
             memory = [work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-            loop.launch(kernels.judge_kernel, 1, memory, device=work.A.device)
+            loop.launch(kernels.judge_kernel, 1, [*memory, self._rebuilds], device=work.A.device)
         return self._loops[id(step)]
 
 
@@ -173,7 +175,7 @@ class Beginning:
         judge: Callable[[wp.array[Any] | None, Launch], None],
     ) -> None:  # fmt: skip
         self._work, self._guess, self._counted, self._found, device = work, guess, counted, found, work.A.device
-        self._key, self._finder = work.program_key(), work.problem.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
+        self._key, self._finder = work.problem_key(), work.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
         self._judge, self._graph = judge, LaunchGraph(device, self._launch)  # on CUDA
         self._program = None if device.is_cuda else Program(device)
         if self._program is not None:
@@ -184,7 +186,7 @@ class Beginning:
 
     def fits(self, guess: wp.array[Any], counted: wp.array[Any] | None) -> bool:
         """Return whether the launches are of this guess and count, and of the bounds as they are."""
-        return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.program_key()
+        return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.problem_key()
 
     def run(self) -> None:
         """Launch everything, on the CPU."""
@@ -193,12 +195,12 @@ class Beginning:
         self._program.run()
         self._work.residual.classify = True
 
-    def run_with(self, loop: Program, going: wp.array[Any], *, renewed: bool) -> None:
+    def run_with(self, loop: Program | None, going: wp.array[Any], *, renewed: bool) -> None:
         """Launch everything on CUDA, and the steps that follow: one graph.
 
         Args:
-            loop: a step, which is repeated while
-            going: is not 0.
+            loop: a step; None: no step follows.
+            going: steps are repeated while it is not 0.
             renewed: whether the hierarchy reads the operator again first.
         """
         self._graph.run(loop, going, renewed, self._finder.wanted())
@@ -207,13 +209,14 @@ class Beginning:
             changed.changed()
         r.classify = True
 
-    def _launch(self, loop: Program, going: wp.array[Any], renewed: bool, searches: bool) -> None:
+    def _launch(self, loop: Program | None, going: wp.array[Any], renewed: bool, searches: bool) -> None:
         """Launch or record everything, with arguments as of `run_with`; `searches`: for floating components."""
         if renewed:
             self._work.hierarchy.refresh()
         self._record(launch, self._finder.search if searches else None)
         self._judge(self._counted, launch)
-        loop.run_while(going)
+        if loop is not None:
+            loop.run_while(going)
 
     def is_plain(self) -> bool:
         """Return whether no component floats and the guess is finite; waits for the device."""

@@ -11,13 +11,15 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Step
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.program import Launch, LaunchGraph, Program
+from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import CONVERT, rows_of
 from warp_lcp.solvers import principal_system_low_rank as coupling
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.phases import Inner
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
+from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 
 if TYPE_CHECKING:
@@ -38,25 +40,24 @@ class CoupledResidual(AssessedResidual):
         self._low, self._b = low, wp.zeros_like(problem.b)  # in the place of the problem's
         self._low_version = -1
 
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
-        """Set x to its start; take b."""
-        wp.copy(self._b, self.problem.b)
+    def renew(self) -> None:
+        """Take operator and bodies again if they have changed."""
+        super().renew()
         if self._low_version != self._low.version:
             self._low_version, self.stale = self._low.version, True
-        super().start(x, keep=keep)
+
+    def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = wp.launch) -> None:
+        """Launch the projection of x, or of 0, onto the bounds; take b, off U's rows."""
+        CONVERT.bind(rows_of(self._b), a=self.problem.b, b=self._b).launch(launch)
+        super().project(x, keep=keep, launch=launch)
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the evaluation, of b + U W U' x first."""
-        self._low.add(x, self.problem.b, self._b, launch=launch)
-        self._at = x
+        """Launch the evaluation, of b + U W U' x first, and correct the energy for that."""
+        low = self._low
+        low.add(x, self.problem.b, self._b, launch=launch)
         super().assess(x, launch=launch)
-
-    def read(self) -> float:
-        """Read what the evaluation found; x'(y + b + U W U' x) is more than twice the energy by x'U W U' x."""
-        norm = super().read()
-        along = self._low.columns.gather(self._at).numpy()
-        self.energy -= 0.5 * float(along @ self._low.weights.numpy().reshape(along.size, along.size) @ along)
-        return norm
+        inputs = [low.columns.sums, low.weighed, low.rank, self.scalars]
+        launch(coupling.subtract_energy_kernel, 1, inputs, device=low.device)
 
     def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the step and the evaluation where it ends; U'x is needed between them."""
@@ -73,6 +74,8 @@ class CoupledWorkspace(MultigridWorkspace):
         self._low = low
         super().__init__(problem, A, settings)
         self.correction = LowRankCorrection(low, self.hierarchy)
+        self._ahead = RunAhead(self, rebuilds=False) if RunAhead.suits(self) else None
+        self._evaluation = LaunchGraph(problem.device, self._launch_evaluation, at_once=problem.layout.across is not None)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self._newton: Inner | None = None
@@ -127,22 +130,29 @@ class CoupledWorkspace(MultigridWorkspace):
         self.residual.evaluate(self.x)
         return done
 
-    def _rebuild(self) -> None:
+    def rebuild(self) -> None:
         """Follow the free set, with the correction too."""
         stale = self.residual.stale
-        super()._rebuild()
+        super().rebuild()
         if not (stale or self._fresh) or self._cycles_left > 0:
             return
         begins, self._fresh = self._fresh, False
         if self.correction.renew(begins=begins):  # its right-hand side was overwritten
-            self.residual.assess(self.x)
+            self._evaluation.run(self.x, variant=(self.residual.classify, *self.problem_key()))
             if self.floating is not None:
                 self._project()
+
+    def _launch_evaluation(self, x: wp.array[Any]) -> None:
+        self.residual.assess(x, launch=launch_recorded)
 
     def _cycle(self) -> None:
         """Run a cycle on the residual."""
         self.correction.begin()
         super()._cycle()
+
+    def problem_key(self) -> tuple[Any, ...]:
+        """Return what launches depend on of the problem's data; where the columns' entries lie, too."""
+        return (*super().problem_key(), self._low.columns.rows.ptr)
 
     def program_key(self) -> tuple[Any, ...]:
         """Return what the launches of a truncated cycle depend on; the correction's too."""

@@ -202,10 +202,13 @@ def resume_kernel(
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
-def judge_kernel(scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32)):
+def judge_kernel(
+    scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), rebuilds: bool,
+):  # fmt: skip
     """Keep what a truncated step has led to; go on if the host would take another one without a thought.
 
-    That is where the residual and the energy are the least yet, the tolerance is missed, and the free set does not creep.
+    That is where the residual and the energy are the least yet, the tolerance is missed, and the free set does not creep; nor changes,
+    unless the device rebuilds what depends on it.
     """
     zero = wp.float64(0.0)
     n = int(judged[TAKEN])
@@ -217,7 +220,7 @@ def judge_kernel(scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.
     go = n + 1 < int(judged[MOST]) and wp.isfinite(scalars[STEP])
     go = go and norm > judged[TOLERANCE] * SAFELY and norm < judged[BEST] and judged[LOWEST] - energy > margin * SAFELY
     if scalars[MOVED] > zero:
-        go = go and fell * SAFELY < CREEPS * judged[FELL] and norm * SAFELY < STALLS * judged[LAST_NORM]
+        go = go and rebuilds and fell * SAFELY < CREEPS * judged[FELL] and norm * SAFELY < STALLS * judged[LAST_NORM]
     judged[TAKEN] = wp.float64(n + 1)
     judged[BEST] = wp.min(judged[BEST], norm)
     judged[LAST_NORM] = norm

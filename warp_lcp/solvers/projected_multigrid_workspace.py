@@ -326,7 +326,7 @@ class MultigridWorkspace(IterateMemory):
     def monotone_step(self) -> Step:
         """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
         p, finest, descent = self.problem, self.hierarchy.finest, self.descent
-        self._rebuild()
+        self.rebuild()
         self._leave()
         fields = {"x": self.x, "unknown": p.unknown, "lo": finest.lower, "hi": finest.upper, "scalars": self.residual.scalars}
         kernels.GAPS.bind(self.flat, bounds=p.bounds.operands, **fields).launch(wp.launch)
@@ -355,7 +355,7 @@ class MultigridWorkspace(IterateMemory):
         self.residual.classify = True
         self._allowed -= 1
         if not self._has_run_ahead():
-            self._rebuild()
+            self.rebuild()
             if self.floating is None:
                 self.step_program().run()
             else:
@@ -407,10 +407,14 @@ class MultigridWorkspace(IterateMemory):
             self.residual.classify = before
         return program
 
-    def program_key(self) -> tuple[Any, ...]:
-        """Return what the launches of a truncated cycle depend on."""
+    def problem_key(self) -> tuple[Any, ...]:
+        """Return what launches depend on of the problem's data."""
         lower, least, upper, most, code = self.problem.bounds.operands
         return lower.ptr, float(least), upper.ptr, float(most), code.ptr
+
+    def program_key(self) -> tuple[Any, ...]:
+        """Return what the launches of a truncated cycle depend on."""
+        return self.problem_key()
 
     def _correct(self, program: Program) -> None:
         """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
@@ -460,7 +464,8 @@ class MultigridWorkspace(IterateMemory):
         self._round(self.x, launch=launch)
         self.residual.assess(self.x, launch=launch)
 
-    def _rebuild(self) -> None:
+    def rebuild(self) -> None:
+        """Let the hierarchy follow the free set, if that has changed."""
         if self.residual.stale:
             self.hierarchy.rebuild_changed()
             self.residual.stale = False
