@@ -68,7 +68,7 @@ class SweepWorkspace(threading.local):
     def __init__(self) -> None:
         self._room = [0, 0, 0]
         self._q, self._dim, self._contacts, self._rtol, self._most = (Scalar() for _ in range(5))
-        self._rows, self._islands = rows_memory(wp.get_device("cpu")), 0
+        self._islands = 0
 
     def run(
         self, fields: Sequence[np.ndarray], work: int, indices: Sequence[np.ndarray], shape: tuple[int, int, int],
@@ -115,6 +115,7 @@ class SweepWorkspace(threading.local):
         self._residual, self._rounds = np.zeros(islands), np.zeros(islands)
         self._arrays = [_warp(values) for values in (self._reals, self._indices, self._residual, self._rounds)]
         self._device = wp.get_device("cpu")
+        self._rows, self._islands = rows_memory(self._device), 0  # not before: an import must not start Warp
         self._graph = LaunchGraph(self._device, self._launch)
 
 
