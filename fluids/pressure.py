@@ -17,7 +17,7 @@ from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.advection import FaceVelocity
-from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window, three_components
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary import Boundary
@@ -262,7 +262,7 @@ class PressureProjection:
     @property
     def _faces(self) -> LiquidBoundary:
         b = self.boundary
-        return LiquidBoundary(self.kind, self._phi, self.grid.planes, *three(b.open), *three(b.velocity))
+        return LiquidBoundary(self.kind, self._phi, self.grid.planes, *three_components(b.open), *three_components(b.velocity))
 
     def solve(self, speed: float) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
@@ -425,8 +425,3 @@ class PressureProjection:
         """Return how many cells the last projection released, and the largest outflow of the others."""
         released, worst = self._contacts.read()
         return released, worst
-
-
-def three(fields: Sequence[wp.array]) -> list[wp.array | None]:
-    """Return three fields, padded with None."""
-    return [*fields, None, None, None][:3]

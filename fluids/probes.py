@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.fluids.tables import Probe
 from warp_lcp.grid.cell_kernel import F32, F64, I8, interpolated
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, three_components
 from warp_lcp.material.particle_log import Row
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
@@ -171,7 +171,7 @@ class Probes:
 
     def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
         """Return x [m/s], velocity [m/s] and level [cells] of each probe."""
-        grid, projection, velocity = simulation.grid, simulation.projection, [*simulation.velocity, None][:3]
+        grid, projection, velocity = simulation.grid, simulation.projection, three_components(simulation.velocity)
         points = wp.array((grid.to_grid(self._points) - grid.origin).astype(np.float32), dtype=wp.vec3, device=grid.device)
         reach = wp.array(self._reach(grid).astype(np.float32), dtype=wp.vec2, device=grid.device)
         values = wp.zeros((len(self.probes), VALUES), dtype=wp.float64, device=grid.device)

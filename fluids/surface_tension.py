@@ -10,12 +10,12 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.fluids import surface_tension_kernels as kernels
-from warp_lcp.fluids.pressure import LiquidBoundary, three
+from warp_lcp.fluids.pressure import LiquidBoundary
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.level_set import REACH as REACH_OF_PHI
 from warp_lcp.grid.level_set_kernels import BINOMIAL
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import SOLID
@@ -205,7 +205,7 @@ class SurfaceTension:
 
     def _faces(self, kind: wp.array) -> LiquidBoundary:
         """Return the cells, the surface and the walls, which rest."""
-        return LiquidBoundary(kind, self._phi, self.grid.planes, *three(self.boundary.open), *three(()))
+        return LiquidBoundary(kind, self._phi, self.grid.planes, *three_components(self.boundary.open), *three_components(()))
 
     def _smoothed(self, window: Window, source: wp.array, free: Sequence[wp.array], passes: int, before: int) -> wp.array:
         """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""

@@ -11,9 +11,9 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids import unilateral_kernels as kernels
-from warp_lcp.fluids.pressure import PressureProjection, Projection, three
+from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.grid.level_set import LevelSet
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
@@ -142,7 +142,7 @@ class UnilateralPressure(PressureProjection):
     def _at(self, velocity: Sequence[wp.array]) -> Any:
         """Return the setting with velocities, open fractions and solids' velocities as they are."""
         s = self._setting
-        s.u, s.v, s.w = three(velocity)
-        s.open_x, s.open_y, s.open_z = three(self.boundary.open)
-        s.solid_x, s.solid_y, s.solid_z = three(self.boundary.velocity)
+        s.u, s.v, s.w = three_components(velocity)
+        s.open_x, s.open_y, s.open_z = three_components(self.boundary.open)
+        s.solid_x, s.solid_y, s.solid_z = three_components(self.boundary.velocity)
         return s

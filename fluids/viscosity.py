@@ -37,7 +37,7 @@ from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
 from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
-from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window, three_components
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
@@ -343,8 +343,8 @@ class Viscosity:
                 planes=planes,
                 walls=self._walls,
             )
-        (vx, vy, vz), (dx, dy, dz) = _three(fine.volume), _three(distance)
-        (hx, hy, hz), (mx, my, mz) = _three(slip), _three(self.relative)
+        (vx, vy, vz), (dx, dy, dz) = three_components(fine.volume), three_components(distance)
+        (hx, hy, hz), (mx, my, mz) = three_components(slip), three_components(self.relative)
         self._above.run(
             passes.weights,
             cell=fine.cell,
@@ -446,8 +446,3 @@ def _numbers(array: wp.array) -> wp.array:
     """Return vectors or matrices as the numbers that they lie in memory as."""
     size = array.size * array.strides[0] // 4
     return wp.array(ptr=array.ptr, dtype=wp.float32, shape=(size,), device=array.device, capacity=4 * size)
-
-
-def _three(fields: Sequence[Any]) -> list[Any]:
-    """Return fields of three components; in 2-D the third is None."""
-    return [*fields, None, None, None][:3]

@@ -14,7 +14,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.fluids.viscosity_passes import viscous_passes
-from warp_lcp.grid.staggered import CLEAR, ActiveWindow, StaggeredGrid, Window
+from warp_lcp.grid.staggered import CLEAR, ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.program import Launch, Program
 
@@ -127,7 +127,7 @@ class VectorLevel:
 
     def find_spans(self, window: Window) -> None:
         """Find where the rows' unknowns lie."""
-        dx, dy, dz = [*self.diagonal, None][:3]
+        dx, dy, dz = three_components(self.diagonal)
         window.run(self.passes.span, whole=True, dx=dx, dy=dy, dz=dz, span=self.span, ends=None)
 
     def smooth(self, forth: bool, launch: Launch) -> None:

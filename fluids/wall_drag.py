@@ -9,9 +9,9 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.fluids.forces import WallSums
-from warp_lcp.fluids.pressure import PressureProjection, three
+from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.wall_drag_kernels import Drag, drag_kernel
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, clear, copy
@@ -97,8 +97,8 @@ class WallDrag:
         for before, field in zip(self._before, velocity, strict=True):
             copy(before, field)
         D.walls, D.kind, D.contact, D.phi = sums.walls, projection.kind, projection.contact, phi
-        D.u, D.v, D.w = three(self._before)
-        D.known_u, D.known_v, D.known_w = three(projection.known)
+        D.u, D.v, D.w = three_components(self._before)
+        D.known_u, D.known_v, D.known_w = three_components(projection.known)
         clear(self._losses)
         faces = enumerate(zip(velocity, projection.known, strict=True))
         return [[D, axis, self._dt, self._mass, int(apply), field, known, self._losses] for axis, (field, known) in faces]

@@ -1,6 +1,5 @@
 """Structs of fields that the kernels of stresses take; components along z, and the second and third shear, are None in 2-D."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import warp as wp
@@ -106,8 +105,3 @@ class WallFaces:
     sides: wp.array
     walls: wp.array
     friction: wp.array
-
-
-def three(fields: Sequence[wp.array]) -> list[wp.array | None]:
-    """Return three fields, padded with None."""
-    return [*fields, None, None][:3]

@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.granular import packing_kernels as kernels
-from warp_lcp.granular.fields import SandFields, three
+from warp_lcp.granular.fields import SandFields
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.sides import PeriodicSides
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.rows.layout import put
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch
@@ -161,5 +161,5 @@ class Packing:
     @property
     def fields(self) -> SandFields:
         """Return the fields as kernels take them."""
-        components = [c for f in (self.share, self.mass, self.inverse, self.start) for c in three(f)]
+        components = [c for f in (self.share, self.mass, self.inverse, self.start) for c in three_components(f)]
         return SandFields(*[self.flags, self.drive, self.stiff, self.fraction, self.spans, *components])

@@ -12,11 +12,12 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.cut_walls import WALL_FACE
-from warp_lcp.granular.fields import StressFields, VelocityFields, three
+from warp_lcp.granular.fields import StressFields, VelocityFields
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, momentum_kernel, stress_passes
 from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
+from warp_lcp.grid.staggered import three_components
 from warp_lcp.rows import Rows
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy
@@ -72,7 +73,7 @@ class Velocity:
     @property
     def fields(self) -> VelocityFields:
         """Return the fields as kernels take them."""
-        return VelocityFields(*[*three(self.u), *three(self.edge), self.openings])
+        return VelocityFields(*[*three_components(self.u), *three_components(self.edge), self.openings])
 
     def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
         """Compute velocity and rates of strain under a field of stresses.

@@ -17,7 +17,7 @@ import warp as wp
 from warp_lcp.distributed.hierarchy import GATHERED
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.viscosity_multigrid import LEAST, LevelShift, VectorLevel, VectorMultigrid
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.rows.program import Launch, perform
 
 KNOWN = 3  # layers of ghost cells that sweeps need: rows of the second color look at those of the first, where odd cells look at even ones
@@ -80,7 +80,7 @@ class SharedVectorLevel(VectorLevel):
         domain, device = grid.domain, grid.device
         mine = Window.of([*domain.low[:2], owned.low[2]], [*domain.high[:2], owned.high[2]], device)
         span, ends = (wp.zeros(n * grid.shape[0] * grid.shape[1], dtype=wp.int32, device=device) for n in (4, 2))
-        dx, dy, dz = [*self.diagonal, None][:3]
+        dx, dy, dz = three_components(self.diagonal)
         mine.run(self.passes.span, whole=True, dx=dx, dy=dy, dz=dz, span=span, ends=ends)
         begin, end, offset = owned.low[2], owned.high[2], grid.origin[0]
         row = np.column_stack([span.numpy().reshape(-1, 4)[:, 2:], ends.numpy().reshape(-1, 2)]).astype(np.int32)

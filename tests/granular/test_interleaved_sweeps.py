@@ -6,7 +6,8 @@ import warp as wp
 from test_sand_stress import make
 
 from warp_lcp.granular.coupled import APART, colors, interleaved_passes
-from warp_lcp.granular.fields import VelocityFields, three
+from warp_lcp.granular.fields import VelocityFields
+from warp_lcp.grid.staggered import three_components
 from warp_lcp.rows import Rows
 
 
@@ -35,7 +36,7 @@ def test_a_sweep_over_a_list_of_all_cells_is_that_over_the_grid(dimension: int) 
     for listed in (False, True):
         passes, now = interleaved_passes(dimension, listed=listed), wp.clone(stress.now)
         moved = [wp.array(field, dtype=wp.float32, device=grid.device) for field in u]
-        structs = (p.fields, VelocityFields(*three(moved), *three(stress.velocity.edge), None))
+        structs = (p.fields, VelocityFields(*three_components(moved), *three_components(stress.velocity.edge), None))
         rows = Rows.entries(cells.size, grid.device) if listed else Rows.box(grid.domain.low, grid.domain.high, grid.device)
         given = {"now": now, "numbers": stress.numbers} | ({"cells": cells} if listed else {})
         passes.pressure.bind(rows, *structs, omega=1.5, **given).launch()

@@ -179,7 +179,7 @@ def test_readings_come_together_and_their_places_are_used_again() -> None:
     held = weakref.ref(circle[0])
     del circle
     many = [Reading(device, LINE) for _ in range(BYTES // LINE // 8 + 4)]  # more than there is room for: a second board has the rest
-    assert held() is None  # what nobody has any more is given back before
+    assert held() is None  # garbage was collected first
     assert many[-1]._board is many[-2]._board is not board
     assert Reading(device, 2 * BYTES).numpy().size == 2 * BYTES  # larger than a board is by default
     for value in (3.0, 4.0):  # what is read is what is there, however often

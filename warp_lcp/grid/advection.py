@@ -29,7 +29,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.particle_loops import MARGIN, launch
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import KernelFile, RowPass
 from warp_lcp.rows.memory import Scalar, scaled
@@ -117,7 +117,7 @@ class FaceVelocity:
     @classmethod
     def of(cls, components: Sequence[wp.array]) -> "FaceVelocity":
         """Return the velocity of two or three components."""
-        u, v, w = [*components, None][:3]
+        u, v, w = three_components(components)
         return cls(u, v, w)
 
 

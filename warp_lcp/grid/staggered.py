@@ -10,6 +10,7 @@ of the larger grid, so that a point has the same in all parts, and lies in store
 import ctypes
 import struct
 import typing
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -590,3 +591,8 @@ class StaggeredGrid:
 
 
 __getattr__ = renamed_names(__name__, Trail="DirtyRegion")
+
+
+def three_components(fields: Iterable[typing.Any]) -> list[typing.Any]:
+    """Return fields of three components; in 2-D the third is None."""
+    return [*fields, None, None, None][:3]

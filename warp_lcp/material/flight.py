@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import PARTICLE
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.material import flight_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.rows.program import LaunchGraph, clear
@@ -71,7 +71,7 @@ class Flights:
     def _launch_growth(self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
         """Launch what grows the trees, and numbers the bodies."""
         parent, held, several = self._parent, self._held, self._several
-        u, v, w = [*weights, None][:3]
+        u, v, w = three_components(weights)
         around.run(kernels.ALONE, kind=kind, parent=parent, held=held, several=several)
         window.run(kernels.UNITE, u=u, v=v, w=w, parent=parent)
         window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, parent=parent, held=held, several=several)
@@ -120,7 +120,7 @@ class Flights:
         spin = np.zeros_like(drift) if self._flight.straight else _turning(before, had)[0]
         self._take(particles)
         end = wp.empty_like(self._start)
-        fields, wall = [*velocity, None][:3], self.boundary
+        fields, wall = three_components(velocity), self.boundary
         motion = self._motion(drift * dx / dt, spin / dt, center * dx)
         came = [wp.empty_like(end), wp.empty(len(end), dtype=wp.uint8, device=self.grid.device)]
         self._carry(kernels.fly_kernel, [*fields, motion, wall.base, wall.touch, self._start, end, *came])
@@ -165,7 +165,7 @@ class Flights:
         """Point the kernels at the particles, and at sums of nothing."""
         flight = self._flight
         flight.velocity = particles.velocity
-        flight.gradient_u, flight.gradient_v, flight.gradient_w = [*particles.affine, None, None, None][:3]
+        flight.gradient_u, flight.gradient_v, flight.gradient_w = three_components(particles.affine)
         flight.sums = wp.zeros(self._before.shape, dtype=wp.int64, device=self.grid.device)
         # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
         flight.quanta = 2.0 ** math.floor(60.0 - math.log2(self._everyone(particles) * max(self.grid.domain_counts) ** 2))

@@ -36,7 +36,7 @@ import warp as wp
 
 from warp_lcp.grid.advection import CENTERS, carry_field
 from warp_lcp.grid.particles import Particles, ParticleTotals
-from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.grid.transfer import faces_to_particles
 from warp_lcp.material import narrow_band_kernels as kernels
 from warp_lcp.material.boundary import Boundary
@@ -374,7 +374,7 @@ class NarrowBand:
 
     def _launch_sums(self, box: Window) -> None:
         """Launch the sums over a box's cells without particles."""
-        u, v, w = [*self.velocity, None][:3]
+        u, v, w = three_components(self.velocity)
         box.launch_rows(kernels.sum_kernel, [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums])
 
     def _summed(self, window: Window, *, launched: bool = False) -> ParticleTotals:

@@ -27,7 +27,7 @@ from warp_lcp.grid.advection import FaceVelocity
 from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
-from warp_lcp.grid.staggered import Window
+from warp_lcp.grid.staggered import Window, three_components
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
@@ -180,7 +180,7 @@ class WallFields:
     @classmethod
     def of(cls, cut: CutCells, known: Sequence[wp.array]) -> "WallFields":
         """Return the fields of walls, with the marks of each component's faces."""
-        components = [field for of in (known, cut.wall, cut.velocity or ()) for field in [*of, None, None, None][:3]]
+        components = [field for of in (known, cut.wall, cut.velocity or ()) for field in three_components(of)]
         nearest = cut.nearest or [None, None, None]
         return cls(*[*components, *nearest, cut.distance, cut.turn, cut.shift, cut.separating])
 

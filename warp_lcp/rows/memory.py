@@ -160,7 +160,7 @@ class DeviceRows(RowsMemory):
         self.places.value = self.tasks.value
 
 
-def rows_memory(device: wp.Device, spare: float = 1.0) -> Any:
+def rows_memory(device: wp.Device, spare: float = 1.0) -> RowsMemory:
     """Return memory of rows for recorded launches of a device; `spare` as of `DeviceRows`."""
     return DeviceRows(spare) if device.is_cuda else RowsMemory()
 

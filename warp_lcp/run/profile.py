@@ -130,7 +130,7 @@ class Profile:
             self.stages.setdefault(name, Stage(beside=True)).add(time.perf_counter() - begun)
 
     def wrote(self, name: str, *files: Path) -> None:
-        """Add the sizes of files to a stage, of those that nobody has moved since."""
+        """Add the sizes of files to a stage; a file that is missing by now counts as 0."""
         for file in files:
             with suppress(FileNotFoundError):
                 self.stages[name].bytes += file.stat().st_size

@@ -259,8 +259,9 @@ class MultigridWorkspace(IterateMemory):
     def _undo(self, out: wp.array[Any]) -> None:
         """Write where the last step began."""
         p, scalars = self.problem, self.residual.scalars
-        fields = {"x": self.x, "q": self._p, "unknown": p.unknown, "before": out}
-        kernels.UNDO.bind(self.flat, bounds=p.bounds.operands, scalars=scalars, **fields).launch(wp.launch)
+        kernels.UNDO.bind(self.flat, bounds=p.bounds.operands, scalars=scalars, x=self.x, q=self._p, unknown=p.unknown, before=out).launch(
+            wp.launch
+        )
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; the operator may have changed."""
@@ -328,8 +329,8 @@ class MultigridWorkspace(IterateMemory):
         p, finest, descent = self.problem, self.hierarchy.finest, self.descent
         self.rebuild()
         self._leave()
-        fields = {"x": self.x, "unknown": p.unknown, "lo": finest.lower, "hi": finest.upper, "scalars": self.residual.scalars}
-        kernels.GAPS.bind(self.flat, bounds=p.bounds.operands, **fields).launch(wp.launch)
+        lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
+        kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(wp.launch)
         (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
         self._plan_monotone_step()
         self._cycles_left -= 1
@@ -439,9 +440,10 @@ class MultigridWorkspace(IterateMemory):
         _, lines, cells = s.padding.counts
         for (k0, j0, _), (k1, j1, _) in beside_cuts(s, 2):
             rows = Rows.part(s.padding, self.A.device, (k0, j0, 0), (k1, j1, cells))
-            given: dict[str, Any] = {"stencil": s, "z": finest.x, "q": self._p, "g": finest.b, "sums": sums}
-            numbers: dict[str, Any] = {"place": k0 * lines + j0, "lines": lines, "places": s.rows.places}
-            kernels.MEASURE_AGAIN.bind(rows, **given, **numbers).launch(launch)
+            place, places = k0 * lines + j0, s.rows.places
+            kernels.MEASURE_AGAIN.bind(
+                rows, stencil=s, z=finest.x, q=self._p, g=finest.b, sums=sums, place=place, lines=lines, places=places
+            ).launch(launch)
 
     def _measure(self, *, launch: Launch = wp.launch) -> None:
         """Measure the cycle's correction and plan the step."""
