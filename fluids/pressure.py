@@ -180,7 +180,7 @@ class PressureProjection:
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._count, self._contacts = WindowTally(COUNT, grid), WindowTally(self._passes.contact, grid)
         self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)  # those that are solved for
-        self._rhs, self._guess = self._b, self._start
+        self._rhs, self._guess = self._b, self._start.flatten()
         self._ratio_cell, self._adhesion, self._threshold, self._limit = (Scalar() for _ in range(4))
         self._counting = LaunchGraph(grid.device, lambda: self._count.take(self._cells, kind=self._unknown))
         self._preparation = LaunchGraph(grid.device, self._launch_preparation)
@@ -332,11 +332,11 @@ class PressureProjection:
         self._last = self._kick
         self._limit.value = self._gravity * self._last
         variant = window.near is None, self._cells.near is None, self.jump is None
-        self._projection.run(velocity, window, self._kept_solution(result.x), variant=variant)
+        self._projection.run(velocity, window, result.x, variant=variant)
         self._contacts.changed()
         return Projection(result, unknowns, self._found)
 
-    def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array | None) -> None:
+    def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
         """Launch the projection: the gradient, the support of spray, the contact of wall cells."""
         self._accept(x)
         for axis, field in enumerate(velocity):
@@ -404,17 +404,9 @@ class PressureProjection:
                 axis=axis, limit=self._limit,
             )  # fmt: skip
 
-    def _kept_solution(self, x: wp.array) -> wp.array | None:
-        """Return a solution that lies where the last one did; another, of a method in single precision, is taken here."""
-        if x.dtype is wp.float64:
-            return x
-        self._take(x)
-        return None
-
-    def _accept(self, x: wp.array | None) -> None:
+    def _accept(self, x: wp.array) -> None:
         """Take the solution of the problem, and show its cells."""
-        if x is not None:
-            self._take(x)
+        self._take(x)
         copy(self.cells, self.kind)
 
     def _take(self, x: wp.array) -> None:

@@ -121,6 +121,24 @@ def test_in_place_problem_follows_changed_cells_and_b(name):
         np.testing.assert_allclose(result.x.numpy()[1, 1:-1, 1:-1], new.x.numpy(), atol=1e-5)
 
 
+@pytest.mark.parametrize("precision", ["single", "mixed"])
+def test_an_in_place_problem_has_its_solution_in_one_array(precision):
+    """x lies where the last one did, of the method's precision; another workspace has another array."""
+    A, _ = poisson()
+    b = wp.array(np.random.default_rng(7).standard_normal(A.layout.stored_shape), dtype=wp.float64, device="cpu")
+    problem, solver = wl.LCP(A, b), wl.ProjectedMultigrid(precision=precision)
+    work, other = solver.init(problem), solver.init(problem)
+    first = wl.solve(problem, solver, workspace=work).x
+    before = first.numpy().copy()
+    b.assign(-b.numpy())
+    second = wl.solve(problem, solver, workspace=work).x
+    assert first is second
+    assert np.abs(before - second.numpy()).max() > 0.01
+    assert second.numpy().dtype == (np.float32 if precision == "single" else np.float64)
+    np.testing.assert_array_equal(second.numpy().ravel(), work.x.numpy())
+    assert wl.solve(problem, solver, workspace=other).x.ptr != second.ptr
+
+
 def test_the_workspace_s_own_iterate_may_be_the_guess(method):
     A, _ = poisson()
     b = wp.array(np.random.default_rng(7).standard_normal(A.layout.stored_shape), dtype=wp.float64, device="cpu")

@@ -145,7 +145,7 @@ def test_criteria_of_the_mean_are_known_once_unknowns_are_counted() -> None:
 
     result = solve(problem, SOLVER, stopping=mean)
     plain = wl.solve(problem, SOLVER, stopping=wl.StoppingCriteria(rtol=0.0, atol=1e-3 * n**0.5, max_iterations=50))
-    assert asked
+    assert len(asked) == 1
     assert (result.status, result.iterations, result.residual) == (plain.status, plain.iterations, plain.residual)
 
 

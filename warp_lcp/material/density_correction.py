@@ -232,21 +232,13 @@ class DensityCorrection:
             self.x.zero_()
             return Correction(result, over_full, most)
         self._way.value = share * self.grid.spacing
-        self._displacing.run(self._kept_solution(result.x))
+        self._displacing.run(result.x)
         self._displace_particles(particles)
         return Correction(result, over_full, most)
 
-    def _kept_solution(self, x: wp.array) -> wp.array | None:
-        """Return a solution that lies where the last one did; another, of a method in single precision, is taken here."""
-        if x.dtype is wp.float64:
-            return x
-        self._take(x)
-        return None
-
-    def _launch_displacement(self, x: wp.array | None) -> None:
+    def _launch_displacement(self, x: wp.array) -> None:
         """Launch the computation of the displacement on all faces."""
-        if x is not None:
-            self._take(x)
+        self._take(x)
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None
@@ -307,7 +299,7 @@ class DensityCorrection:
 
     def _make_problem(self) -> wl.LCP:
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
-        self._cells, self._guess = self._kind, self.x
+        self._cells, self._guess = self._kind, self.x.flatten()
         self._operator = wl.GridPoisson(self.grid.interior(self._kind.numpy()), shift=self._shift, device=self.grid.device, **faces)
         return wl.LCP(self._operator, self._b, 0.0 if self._lower is None else self._lower, np.inf)
 

@@ -20,7 +20,7 @@ from warp_lcp.problem.merits import Merits, merits_at
 from warp_lcp.problem.protocol import NamesComponents, asks_beyond_storage, has, version_of
 from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria, limit_of_steps
 from warp_lcp.rows.fields import Array
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import convert
@@ -166,6 +166,7 @@ class IterateMemory:
 
     floating: Any = None
     _best: wp.array[Any] | None = None
+    _solution: wp.array[Any] | None = None
 
     def __init__(
         self, problem: LCP, precision: str = Precision.DOUBLE, *, x: wp.array[Any] | None = None, residual: NaturalResidual | None = None
@@ -189,6 +190,18 @@ class IterateMemory:
     def round_iterate(self, *, launch: Launch = wp.launch) -> None:
         """Round x to its precision."""
         self._round(self.x, launch=launch)
+
+    def solution(self) -> wp.array[Any]:
+        """Return x in its precision and of the stored shape: the same array after each solve."""
+        single = self._rounded is not None
+        if self._solution is None:
+            memory = self.problem.layout.zeros(wp.float32) if single else self.x
+            self._solution = memory.reshape(self.problem.layout.stored_shape)
+        if single and self.x.device.is_cuda:
+            convert(self.x, self._solution.flatten())
+        elif single:
+            np.copyto(self._solution.numpy().reshape(-1), self.x.numpy(), casting="same_kind")
+        return self._solution
 
     def _finish_move(self, x: wp.array[Any]) -> None:
         """Choose the constants that a move of x left open on floating components, and round."""
@@ -278,7 +291,7 @@ class _Loop:
         callback: Callable[[Record], None] | None,
     ) -> None:  # fmt: skip
         self.problem, self.solver, self.criteria, self.work, self.callback = problem, solver, stopping, work, callback
-        self.stopping = stopping if isinstance(stopping, StoppingCriteria) else StoppingCriteria(max_iterations=stopping.max_iterations)
+        self.stopping = stopping if isinstance(stopping, StoppingCriteria) else limit_of_steps(stopping.max_iterations)
         self.deadline = deadline
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
@@ -511,6 +524,8 @@ class _LoopInBox(_Loop):
     def _found(self) -> wp.array[Any]:
         """Return x in the layout that the problem was given in, rounded to its precision."""
         layout, x = self.problem.layout, self.work.x
+        if self.problem.in_place and isinstance(self.work, IterateMemory):
+            return self.work.solution()
         if self.problem.in_place:
             out = x.reshape(layout.stored_shape)
         else:

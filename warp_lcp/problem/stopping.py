@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Annotated, Any
 
 import warp as wp
@@ -93,8 +94,18 @@ class MeanCriteria:
     counted: wp.array[Any] | None = None
 
     def known(self) -> StoppingCriteria:
-        """Return the criteria for the unknowns as counted."""
+        """Return the criteria for the unknowns as counted, once."""
+        return self._known
+
+    @cached_property
+    def _known(self) -> StoppingCriteria:
         return StoppingCriteria(rtol=self.rtol, atol=self.atol * self.count() ** 0.5, max_iterations=self.max_iterations)
+
+
+@cache
+def limit_of_steps(max_iterations: int) -> StoppingCriteria:
+    """Return criteria that say only how many steps are allowed."""
+    return StoppingCriteria(max_iterations=max_iterations)
 
 
 def check_criteria(stopping: object) -> None:
