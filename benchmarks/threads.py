@@ -28,7 +28,9 @@ TITLE = "All cores in one process"
 SIZES = (128, 256)
 SCENES = {"dam-break": (96, 1.7), "floating-bodies": (96, 1.6), "column-collapse": (64, 1.7)}  # cells along the longest side; target
 STEPS, LONGEST = 8, 0.005  # of a scene before it is measured; the longest one [s]
-KERNELS, TURNS = ("x += z (what memory allows)", "product", "sweep", "restriction", "cycle"), 20
+STEP = "whole step"
+# of what is done at once by as many copies as there are cores, each on one thread: how often each copy does it
+TURNS = dict.fromkeys(("x += z (what memory allows)", "product", "sweep", "restriction", "cycle"), 20) | {STEP: 3}
 STOPPING = wl.StoppingCriteria(rtol=1e-6)
 TARGETS = {"product": 1.85, "sweep": 1.85, "restriction": 1.85, "steps of a solve": 1.85, "solve, cold": 1.7}
 Work = dict[str, Callable[[], object]]
@@ -44,15 +46,15 @@ def measure(options: Options, out: Path) -> Results:
         for label, group in _groups(options.sizes or SIZES):
             options.say(label)
             made = {count: group(count) for count in counts}
-            others = [made[1], *(group(1) for _ in range(counts[-1] - 1))] if label.endswith("^3") else []
+            others = [made[1], *(group(1) for _ in range(counts[-1] - 1))]
             for name in made[1]:
                 work = {str(count): _on(count, made[count][name]) for count in counts}
-                if others and name in KERNELS:
-                    work["apart"] = _on(1, partial(_at_once, [other[name] for other in others]))
+                if name in TURNS:
+                    work["apart"] = _on(1, partial(_at_once, [other[name] for other in others], TURNS[name]))
                 times = in_turns(work, options.repeat)
                 figures = {f"speed_{count}": ratios(times["1"], times[str(count)]) for count in counts[1:]}
                 if "apart" in times:
-                    figures["apart"] = ratios([len(others) * TURNS * t for t in times["1"]], times["apart"])
+                    figures["apart"] = ratios([len(others) * TURNS[name] * t for t in times["1"]], times["apart"])
                 records.append(Record(f"{label}: {name}", figures, {"what": name, "group": label, "seconds": min(times["1"])}))
     finally:
         wl.set_threads(before)
@@ -78,15 +80,15 @@ def _on(count: int, work: Callable[[], object]) -> Callable[[], object]:
     return run
 
 
-def _at_once(copies: list[Callable[[], object]]) -> None:
+def _at_once(copies: list[Callable[[], object]], turns: int) -> None:
     """Run each of the copies some times, all of them at once."""
+
+    def several(run: Callable[[], object]) -> None:
+        for _ in range(turns):
+            run()
+
     with ThreadPoolExecutor(len(copies)) as pool:
-        list(pool.map(_several, copies))
-
-
-def _several(run: Callable[[], object]) -> None:
-    for _ in range(TURNS):
-        run()
+        list(pool.map(several, copies))
 
 
 def _groups(sizes: tuple[int, ...]) -> Iterator[tuple[str, Callable[[int], Work]]]:
@@ -141,10 +143,10 @@ def _scene(name: str, resolution: int, count: int) -> Work:
 
     for _ in range(STEPS):
         step()
-    return {"whole step": step}
+    return {STEP: step}
 
 
 def _targets(records: list[Record]) -> list[Target]:
-    limits = {f"{name}, {resolution} cells: whole step": limit for name, (resolution, limit) in SCENES.items()}
+    limits = {f"{name}, {resolution} cells: {STEP}": limit for name, (resolution, limit) in SCENES.items()}
     found = [(r, limits.get(r.name, TARGETS.get(str(r.facts.get("what"))))) for r in records[1:]]
     return [Target(r.name, limit, r.figures.get("speed_2"), " x", at_least=True) for r, limit in found if limit is not None]
