@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -55,34 +54,18 @@ def make_tension(
     given = scene.surface_tension
     if given is None or surface.phi is None:
         return None
-    settings = {"coefficient": given.coefficient, "contact_angle": given.contact_angle, "density": scene.physics.density}
-    return make(grid, boundary, surface.phi, **settings)
-
-
-def pressure_settings(scene: LiquidScene, surface: FreeSurface, weights: list[wp.array]) -> dict[str, Any]:
-    """Return the arguments of `PressureProjection` that a scene sets.
-
-    Includes the particle weights on the faces of each component.
-    """
-    settings, gravity = scene.solver, float(np.linalg.norm(scene.physics.gravity))
-    resting = {"lets_go": scene.lets_go, "weights": weights if scene.short_steps else None, "phi": surface.phi}
-    return {"tolerance": settings.tolerance, "max_iterations": settings.max_iterations, "gravity": gravity} | resting
-
-
-def unilateral_settings(scene: LiquidScene, surface: GhostFluidSurface, weights: list[wp.array]) -> dict[str, Any]:
-    """Return the arguments of `UnilateralPressure` that a scene sets.
-
-    Arguments as in `pressure_settings`.
-    """
-    settings = pressure_settings(scene, surface, weights)
-    shared = {name: settings[name] for name in ("tolerance", "max_iterations", "gravity")}
-    return shared | {"level_set": surface.level_set, "weights": weights}
+    angle, density = given.contact_angle, scene.physics.density
+    return make(grid, boundary, surface.phi, coefficient=given.coefficient, contact_angle=angle, density=density)
 
 
 def make_pressure(
-    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array], bodies: RigidBodies | None
-) -> PressureProjection:
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array],
+    coupling: BodyCoupling | None, make: Callable[..., PressureProjection] = PressureProjection,
+    make_unilateral: Callable[..., PressureProjection] = UnilateralPressure,
+) -> PressureProjection:  # fmt: skip
     """Return the pressure solver of a scene, for the liquid and its rigid bodies.
+
+    `make` and `make_unilateral` are called with the arguments of `PressureProjection` and `UnilateralPressure`.
 
     Args:
         scene: the scene.
@@ -90,16 +73,36 @@ def make_pressure(
         boundary: its solids.
         surface: the free surface.
         weights: of the particles on the faces of each component.
-        bodies: rigid bodies among the solids; None: there are none.
+        coupling: coupling with rigid bodies among the solids; None: there are none.
+        make: makes the projection.
+        make_unilateral: makes that of a unilateral pressure.
     """
     solver = wl.METHODS[scene.solver.method](precision=scene.solver.precision)
-    coupling, settings = None, pressure_settings(scene, surface, weights)
-    if bodies is not None:
-        assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
-        coupling = BodyCoupling(grid, boundary, bodies, scene.physics.density)
+    tolerance, most = scene.solver.tolerance, scene.solver.max_iterations
+    gravity = float(np.linalg.norm(scene.physics.gravity))
     if scene.pressure.model == "unilateral" and isinstance(surface, GhostFluidSurface):
-        return UnilateralPressure(grid, boundary, solver, coupling=coupling, **unilateral_settings(scene, surface, weights))
-    return PressureProjection(grid, boundary, solver, coupling=coupling, **settings)
+        return make_unilateral(
+            grid, boundary, solver, tolerance=tolerance, max_iterations=most, gravity=gravity, coupling=coupling,
+            level_set=surface.level_set, weights=weights,
+        )  # fmt: skip
+    return make(
+        grid, boundary, solver, tolerance=tolerance, max_iterations=most, gravity=gravity, coupling=coupling, phi=surface.phi,
+        lets_go=scene.lets_go, weights=weights if scene.short_steps else None,
+    )  # fmt: skip
+
+
+def make_coupling(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, bodies: RigidBodies | None,
+    make: Callable[..., BodyCoupling] = BodyCoupling,
+) -> BodyCoupling | None:  # fmt: skip
+    """Return the coupling of a scene's liquid with its rigid bodies, None without bodies.
+
+    `make` is called with the arguments of `BodyCoupling`.
+    """
+    if bodies is None:
+        return None
+    assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
+    return make(grid, boundary, bodies, scene.physics.density)
 
 
 def make_viscosity(
@@ -113,7 +116,8 @@ def make_viscosity(
     if scene.viscosity is None:
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
-    settings: dict[str, Any] = {"viscosity": scene.viscosity.value, "density": scene.physics.density, "slip_lengths": scene.slip_lengths}
     kept = scene.kept([*scene.liquid, *scene.source])
-    settings["thickest"] = None if kept is None else max(*kept, 1.0)
-    return make(grid, boundary, phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies, **settings)
+    return make(
+        grid, boundary, viscosity=scene.viscosity.value, density=scene.physics.density, slip_lengths=scene.slip_lengths,
+        thickest=None if kept is None else max(*kept, 1.0), phi=surface.phi, tolerance=tolerance, sources=bool(scene.source), bodies=bodies,
+    )  # fmt: skip

@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids.forces import SolidForces, WallSums
-from warp_lcp.fluids.models import make_pressure, make_surface, make_tension, make_viscosity
+from warp_lcp.fluids.models import make_coupling, make_pressure, make_surface, make_tension, make_viscosity
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
@@ -122,7 +122,8 @@ class LiquidSimulation(ParticleSimulation):
         return make_viscosity(self.scene, self.grid, self.boundary, self.surface, self.bodies)
 
     def _pressure(self) -> PressureProjection:
-        return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
+        coupling = make_coupling(self.scene, self.grid, self.boundary, self.bodies)
+        return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, coupling)
 
     def _probes(self) -> Probes | None:
         return Probes(self.scene.probe, self.gravity, self.grid.dimension) if self.scene.probe else None

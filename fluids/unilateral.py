@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids import unilateral_kernels as kernels
+from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
@@ -63,15 +64,19 @@ class UnilateralPressure(PressureProjection):
         solver: settings of the method.
         level_set: of the liquid's surface, whose density is used.
         weights: of the particles on each component's faces: faces without keep nothing.
-        settings: `tolerance`, `max_iterations`, `coupling` and `gravity` as of `PressureProjection`; without gravity nothing settles.
+        tolerance: as of `PressureProjection`.
+        max_iterations: likewise.
+        coupling: likewise.
+        gravity: likewise; without gravity nothing settles.
 
     Attributes: as of `PressureProjection`; `kind` says where the level set lies in the liquid.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, level_set: LevelSet, weights: Sequence[wp.array], **settings: Any
-    ) -> None:
-        super().__init__(grid, boundary, solver, **settings)
+        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, level_set: LevelSet, weights: Sequence[wp.array],
+        tolerance: float | Literal["auto"], max_iterations: int, coupling: BodyCoupling | None = None, gravity: float = 0.0,
+    ) -> None:  # fmt: skip
+        super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, coupling=coupling, gravity=gravity)
         self._weights = list(weights)
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         self._unknown, self._least = grid.field(wp.int8), 0.0

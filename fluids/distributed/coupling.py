@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.coupling import BodyCoupling
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.rigid.bodies import RigidBodies
 
@@ -22,8 +23,8 @@ class SharedBodyCoupling(BodyCoupling):
         density: of the liquid [kg/m^3].
     """
 
-    def __init__(self, part: Subdomain, boundary: CutBoundary, bodies: RigidBodies, density: float) -> None:
-        super().__init__(part.grid, boundary, bodies, density, solved=part.owned)
+    def __init__(self, part: Subdomain, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float) -> None:
+        super().__init__(grid, boundary, bodies, density, solved=part.owned)
         self._part = part
 
     def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:

@@ -14,7 +14,6 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.grid.staggered import Window
-from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.rows.vectors import convert
 
@@ -28,23 +27,22 @@ class DistributedPressure(PressureProjection):
 
     Args:
         part: where this rank works.
-        boundary: solids and walls.
-        solver: settings of the method.
-        settings: others, as of `PressureProjection`.
+        settings: as of `PressureProjection`, the part's grid among them.
+        more: likewise.
     """
 
     shares_pockets = False  # whether pockets between solids add to the diagonal
 
-    def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
-        super().__init__(part.grid, boundary, solver, **settings)
+    def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
+        super().__init__(*settings, **more)
         self.part = part
         self._cells.move_to(part.owned)
         self._projection.at_once = True  # ranks exchange halos in it
-        if self._phi is None and not (self.shares_pockets or part.ranks.any(bool(boundary.open_sides & ~part.cuts))):
+        if self._phi is None and not (self.shares_pockets or part.ranks.any(bool(self.boundary.open_sides & ~part.cuts))):
             self._shift = None  # sides at cuts are open, but not the domain's
         self._boxes: list[Any] = [None if f is None else self.part.box_like(f) for f in self._shared]
         _, self._rhs, self._guess, _, _ = self._boxes
-        if settings["tolerance"] == "auto":
+        if self.tolerance == "auto":
             self.automatic = TimeErrorTolerance(self._rhs.size, part.grid.device, part.ranks)
 
     @property

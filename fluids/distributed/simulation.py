@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 
-import warp_lcp as wl
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.fluids.distributed.coupling import SharedBodyCoupling
@@ -16,16 +15,15 @@ from warp_lcp.fluids.distributed.surface import SharedSurface
 from warp_lcp.fluids.distributed.tension import SharedSurfaceTension
 from warp_lcp.fluids.distributed.unilateral import SharedUnilateralPressure
 from warp_lcp.fluids.distributed.viscosity import SharedViscosity
-from warp_lcp.fluids.models import make_surface, make_tension, make_viscosity, pressure_settings, unilateral_settings
+from warp_lcp.fluids.models import make_coupling, make_pressure, make_surface, make_tension, make_viscosity
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation
-from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface
+from warp_lcp.fluids.surface import FreeSurface
 from warp_lcp.fluids.surface_tension import SurfaceTension
 from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.grid.staggered import Window
-from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.material.particle_log import Row
 from warp_lcp.simulation import Part
 
@@ -46,16 +44,10 @@ class DistributedLiquid(LiquidSimulation, SharedParticleSimulation):
         return make_tension(self.scene, self.grid, self.boundary, self.surface, partial(SharedSurfaceTension, self.part))
 
     def _pressure(self) -> PressureProjection:
-        solver = wl.METHODS[self.scene.solver.method](precision=self.scene.solver.precision)
-        coupling = None
-        if self.bodies is not None:
-            assert isinstance(self.boundary, CutBoundary), "a scene with bodies has cut cells"
-            coupling = SharedBodyCoupling(self.part, self.boundary, self.bodies, self.scene.physics.density)
-        if self.scene.pressure.model == "unilateral" and isinstance(self.surface.surface, GhostFluidSurface):
-            settings = unilateral_settings(self.scene, self.surface.surface, self.weights)
-            return SharedUnilateralPressure(self.part, self.boundary, solver, coupling=coupling, **settings)
-        settings = pressure_settings(self.scene, self.surface, self.weights)
-        return DistributedPressure(self.part, self.boundary, solver, coupling=coupling, **settings)
+        scene, grid, boundary, part = self.scene, self.grid, self.boundary, self.part
+        coupling = make_coupling(scene, grid, boundary, self.bodies, partial(SharedBodyCoupling, part))
+        makers = partial(DistributedPressure, part), partial(SharedUnilateralPressure, part)
+        return make_pressure(scene, grid, boundary, self.surface.surface, self.weights, coupling, *makers)
 
     def _probes(self) -> Probes | None:
         return SharedProbes(self.part, self.scene.probe, self.gravity, self.part.dimension) if self.scene.probe else None

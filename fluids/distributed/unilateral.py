@@ -9,6 +9,7 @@ import numpy as np
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed.pressure import DistributedPressure
 from warp_lcp.fluids.unilateral import UnilateralPressure
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import FLUID
 
@@ -26,9 +27,9 @@ class SharedUnilateralPressure(DistributedPressure, UnilateralPressure):
         settings: others, as of `UnilateralPressure`.
     """
 
-    def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
+    def __init__(self, part: Subdomain, grid: StaggeredGrid, boundary: Boundary, *settings: Any, **more: Any) -> None:
         self.shares_pockets = bool(boundary.open)
-        super().__init__(part, boundary, solver, **settings)
+        super().__init__(part, grid, boundary, *settings, **more)
 
     def fluid_cells(self) -> np.ndarray:
         """Return where in the box there was liquid or pressure in the last projection, as (k, j, i) in the part's stored shape."""
