@@ -11,7 +11,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.fluids import coupling_kernels as kernels
 from warp_lcp.fluids.forces import walls_of
-from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns
 from warp_lcp.rigid.bodies import RigidBodies
@@ -41,14 +41,10 @@ class BodyCoupling:
         bodies: the bodies.
         density: of the liquid [kg/m^3].
         share: factor on U V in the outflow, where the problem is one of masses, see `fluids.unilateral`.
-        solved: cells of the problem, whose fields have a ring around them; None: all of the grid's domain.
     """
 
-    def __init__(
-        self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, *, share: float = 1.0,
-        solved: Window | None = None,
-    ) -> None:  # fmt: skip
-        self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, solved or grid.domain
+    def __init__(self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, *, share: float = 1.0) -> None:
+        self.grid, self.boundary, self.bodies, self._solved = grid, boundary, bodies, grid.part.owned
         self._scale, self._share = density * grid.cell_volume, share
         self.width = 3 if grid.dimension == 2 else 6
         low, high = np.array(self._solved.low) - 1, np.array(self._solved.high) + 1
@@ -133,7 +129,7 @@ class BodyCoupling:
         self.columns.gather(x, launch=launch)
 
     def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Move particles buried by a body with it.
+        """Move particles buried by a body with it; collective.
 
         Below a body that rests on a floor, gravity alone would act on them.
 
@@ -142,10 +138,10 @@ class BodyCoupling:
             known: int8, > 0 where the velocity has been continued to.
         """
         block = self.boundary.cut.moving_block()
-        if block is None:
-            return
-        self._enclosing.move_to(self.grid.window(*block, grow=1))
-        self._holding.run(velocity, known)
+        if block is not None:
+            self._enclosing.move_to(self.grid.window(*block, grow=1))
+            self._holding.run(velocity, known)
+        self.grid.part.fill(*velocity)  # those know what is continued there whose cells they are
 
     def _launch_enclosed(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         for fields in zip(self.boundary.open, self.boundary.velocity, known, velocity, strict=True):

@@ -27,7 +27,6 @@ from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, copy
-from warp_lcp.rows.vectors import convert
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
 THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
@@ -51,6 +50,7 @@ def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) 
     return SimpleNamespace(**{name: KERNELS.kernel(f"fluids.pressure.{name}", module=module, constants=flags) for name in names})
 
 
+FACES = "face_x", "face_y", "face_z"  # of an operator
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of an outflow, relative to the speeds it is the difference of (float32 faces)
 RELEASE_FACTOR = 10.0  # a wall cell lets go if its outflow exceeds this multiple of the accepted residual: resting ceilings are degenerate
 
@@ -165,7 +165,6 @@ class PressureProjection:
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self._weights, self._gravity = list(weights or ()), gravity
         self.tolerance, self.max_iterations = tolerance, max_iterations
-        self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
         self.jump: wp.array | None = None
         self.adhesion = 0.0
         self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
@@ -177,14 +176,18 @@ class PressureProjection:
         self._b, self._start = (grid.field(wp.float64) for _ in range(2))
         self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
         self._least: Any = -np.inf if self._lower is None else self._lower
-        self._shift = grid.field() if phi is not None or boundary.open_sides else None
+        part = grid.part
+        opens = part.ranks.any(bool(boundary.open_sides & ~part.cuts))
+        self._shift = grid.field() if phi is not None or opens else None
         self._count, self._contacts = WindowTally(COUNT, grid), WindowTally(self._passes.contact, grid)
         self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)  # those that are solved for
-        self._rhs, self._guess = self._b, self._start.flatten()
+        self._cells.move_to(part.owned)
+        self._rhs, self._guess = part.box_like(self._b), part.box_like(self._start).flatten()
+        self.automatic = TimeErrorTolerance(self._rhs.size, grid.device, part.across) if tolerance == "auto" else None
         self._ratio_cell, self._adhesion, self._threshold, self._limit = (Scalar() for _ in range(4))
         self._counting = LaunchGraph(grid.device, lambda: self._count.take(self._cells, kind=self._unknown))
         self._preparation = LaunchGraph(grid.device, self._launch_preparation)
-        self._projection = LaunchGraph(grid.device, self._launch_projection)
+        self._projection = LaunchGraph(grid.device, self._launch_projection, at_once=part.shared)  # ranks exchange halos in it
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
 
@@ -227,8 +230,9 @@ class PressureProjection:
         )  # fmt: skip
 
     def _look(self, window: Window | None) -> None:
-        """Solve for the cells of a window, and undo what is left of the last one."""
-        self._cells.move_to(self._trail.through(window))
+        """Solve for the cells of a window, and undo what is left of the last one; ranks solve for all of their cells."""
+        part = self.grid.part
+        self._cells.move_to(part.owned if part.shared else self._trail.through(window))
 
     def leave(self) -> Projection:
         """Record a step without liquid cells: all liquid is spray."""
@@ -243,10 +247,18 @@ class PressureProjection:
         self._kick, self._ratio = kick_dt, kick_dt / self._last if self._last > 0.0 else 0.0
 
     def _make_problem(self) -> None:
-        faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
-        cells = self.grid.interior(self._unknown.numpy())
-        self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._joined(), self._b, self._least, np.inf)
+        part, least, opened = self.grid.part, self._least, self.boundary.open
+        fields = [self._unknown, least if isinstance(least, wp.array) else None, self._shift]
+        kind, lower, shift = boxes = [None if field is None else part.box_like(field) for field in fields]
+        faces = [part.box_like(field) for field in opened]
+        pairs = [*zip(fields, boxes, strict=True), (self._b, self._rhs), (self._start, self._guess.reshape(self._rhs.shape))]
+        self._copied = [(field, box) for field, box in pairs if field is not None and part.shared]
+        self._copied_faces = [(field, box) for field, box in zip(opened, faces, strict=True) if part.shared]
+        self._copy_to_boxes(whole=True)
+        assert kind is not None
+        self._operator = part.poisson(self.grid.interior(kind.numpy()), shift=shift, **dict(zip(FACES, faces, strict=False)))
+        self._kinds = kind
+        self._problem = wl.LCP(self._joined(), self._rhs, least if lower is None else lower, np.inf)
         self._work = self.solver.init(self._problem)
 
     def _joined(self) -> wl.GridPoisson | wl.SumOperator:
@@ -255,7 +267,8 @@ class PressureProjection:
 
     def _update(self) -> None:
         """Take the cells, and where bodies meet them."""
-        self._operator.update(self._unknown)
+        self._copy_to_boxes(whole=self.boundary.moves)
+        self._operator.update(self._kinds)
         if self.coupling is not None:
             self.coupling.take(self._unknown)
 
@@ -263,6 +276,11 @@ class PressureProjection:
     def _faces(self) -> LiquidBoundary:
         b = self.boundary
         return LiquidBoundary(self.kind, self._phi, self.grid.planes, *three_components(b.open), *three_components(b.velocity))
+
+    def _copy_to_boxes(self, *, whole: bool) -> None:
+        """Give a rank's problem what the fields of its part hold; `whole`: open fractions, too."""
+        for field, box in [*self._copied, *(self._copied_faces if whole else ())]:
+            self.grid.part.copy_to_box(field, box)
 
     def solve(self, speed: float) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
@@ -334,6 +352,7 @@ class PressureProjection:
         variant = window.near is None, self._cells.near is None, self.jump is None
         self._projection.run(velocity, window, result.x, variant=variant)
         self._contacts.changed()
+        self.grid.part.fill(*velocity, *self.known, self.contact)
         return Projection(result, unknowns, self._found)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
@@ -350,23 +369,25 @@ class PressureProjection:
         )  # fmt: skip
 
     def counted(self) -> int:
-        """Return the number of unknowns of the prepared problem."""
-        return int(self._count.read()[0])
+        """Return the number of unknowns of the prepared problem; collective."""
+        return int(self.grid.part.ranks.sum(int(self._count.read()[0])))
 
     def not_finite(self) -> np.ndarray:
-        """Return the cells whose right-hand side is not finite, shape (n, 3).
+        """Return the cells whose right-hand side is not finite, shape (n, 3); collective.
 
-        Indices (x, y, z) from 0.
+        Indices (x, y, z) from 0 in the whole domain.
         """
-        bad = ~np.isfinite(self.grid.interior(self._b.numpy()))
-        return np.argwhere(bad)[:, ::-1]
+        part = self.grid.part
+        mine = np.argwhere(~np.isfinite(part.box_of(self._b.numpy())))[:, ::-1] + np.array(part.first)
+        return np.concatenate(part.ranks.collect(mine))
 
     def fluid_cells(self) -> np.ndarray:
-        """Return the FLUID cells of the last projection, shape (n, 3).
+        """Return this process's FLUID cells of the last projection, shape (n, 3).
 
         Indices (k, j, i) in the stored shape.
         """
-        return np.argwhere(self.cells.numpy() == FLUID)
+        part = self.grid.part
+        return np.argwhere(part.box_of(self.cells.numpy()) == FLUID) + np.array(part.owned.low)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the state: first guess of the next solve and frame data."""
@@ -397,7 +418,8 @@ class PressureProjection:
         return self.pressure.numpy() * scale
 
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
-        """Let the pressure act on what rests on the surface; its faces become known after the projected ones."""
+        """Let the pressure act on what rests on the surface; its faces become known after the projected ones, also those of others."""
+        self.grid.part.fill(*velocity, *self.known)
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
             window.run(
                 self._passes.support, self._faces, x=self.pressure, field=field, known=known, weight=weight, jump=self.jump,
@@ -411,9 +433,14 @@ class PressureProjection:
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure."""
-        convert(x.flatten(), self.pressure.flatten())
+        self.grid.part.store(x, self.pressure, self._guess)
 
     def _found(self) -> tuple[float, float]:
-        """Return how many cells the last projection released, and the largest outflow of the others."""
+        """Return how many cells the last projection released, and the largest outflow of the others; collective."""
+        every = self.grid.part.ranks.gather(np.array(self._found_here()))
+        return float(every[:, 0].sum()), float(every[:, 1].max())
+
+    def _found_here(self) -> tuple[float, float]:
+        """Return the same of this process's cells."""
         released, worst = self._contacts.read()
         return released, worst

@@ -129,7 +129,7 @@ def probe_kernel(
 
 
 class Probes:
-    """Measure at points that stay where they are.
+    """Measure at points that stay where they are; `row` is collective.
 
     Pressure is interpolated trilinearly from the liquid's cells; air and solids among the eight around a point are left out, and what the
     others have is continued to the point by the pressure at rest's gradient rho g. Velocity is trilinear on each component's faces. Where
@@ -139,11 +139,11 @@ class Probes:
     Args:
         probes: of the scene.
         gravity: [m/s^2], shape (3,).
-        dimension: 2 or 3.
+        grid: the grid.
     """
 
-    def __init__(self, probes: Sequence[Probe], gravity: np.ndarray, dimension: int) -> None:
-        self.probes, self.gravity, self.dimension = tuple(probes), gravity, dimension
+    def __init__(self, probes: Sequence[Probe], gravity: np.ndarray, grid: StaggeredGrid) -> None:
+        self.probes, self.gravity, self.dimension = tuple(probes), gravity, grid.dimension
         size = math.hypot(*gravity)  # not 0 where the squares are
         self._up = -gravity / size if size > 0.0 else np.zeros(3)
         self._points = np.array([[*probe.position, 0.0][:3] for probe in probes])
@@ -165,18 +165,52 @@ class Probes:
         """Return between which distances from each probe the surface is looked for [cells], shape (probes, 2); 0 and 0: nowhere."""
         if not self._up.any():  # no direction is up, and no probe asks for a level: nothing would end the search
             return np.zeros((len(self.probes), 2))
+        if grid.part.shared:
+            return self._ways_through(grid)
         cells = grid.to_grid(self._points)[:, : grid.dimension] - grid.origin[: grid.dimension]
         inside = np.all((cells >= 1.0) & (cells <= np.array(grid.counts[: grid.dimension]) + 1.0), axis=1, keepdims=True)
         return np.where(inside, [0.0, FAR], 0.0)
+
+    def _ways_through(self, grid: StaggeredGrid) -> np.ndarray:
+        """Return between which distances the way up from each probe leads through this rank's box, by whole steps of the search."""
+        axes = slice(grid.dimension)
+        start, up = grid.to_grid(self._points)[:, axes], self._up[axes]
+        first_cell, window = np.array(grid.part.first)[axes], grid.part.owned
+        size = (np.array(window.high) - np.array(window.low))[::-1][axes]
+        low, high = first_cell + 1.0, first_cell + size + 1.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ways = np.stack([(low - start) / up, (high - start) / up])
+        inside = (start >= low) & (start <= high)
+        first = np.where(up == 0.0, np.where(inside, -np.inf, np.inf), ways.min(axis=0)).max(axis=1)
+        last = np.where(up == 0.0, np.where(inside, np.inf, -np.inf), ways.max(axis=0)).min(axis=1)
+        begin, end = STEP * np.floor(np.maximum(first, 0.0) / STEP), STEP * np.ceil(last / STEP)
+        meets = (last >= 0.0) & (last >= first) & np.isfinite(begin)
+        return np.where(meets[:, None], np.stack([begin, np.maximum(end, begin + STEP)], axis=1), 0.0)
+
+    def _joined(self, mine: np.ndarray, reach: np.ndarray, grid: StaggeredGrid) -> np.ndarray:
+        """Return what all ranks have found: at a point the one whose box has it, of a level those over whose boxes the way up leads."""
+        cells = np.floor(grid.to_grid(self._points)).astype(np.int64) - 1
+        owner = grid.part.owners(np.clip(cells, 0, np.array(grid.domain_counts) - 1))
+        everyone = grid.part.ranks.gather(np.concatenate([mine, reach], axis=1))
+        found = np.asarray(everyone[owner, np.arange(len(owner)), : mine.shape[1]])
+        for probe, values in enumerate(found):
+            ways = [rank for rank in everyone[:, probe] if rank[-1] > rank[-2]]
+            for rank in sorted(ways, key=lambda rank: float(rank[-2])):
+                values[4] = rank[4]
+                if rank[5] == 0.0:  # the surface, or a solid
+                    break
+        return found
 
     def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
         """Return x [m/s], velocity [m/s] and level [cells] of each probe."""
         grid, projection, velocity = simulation.grid, simulation.projection, three_components(simulation.velocity)
         points = wp.array((grid.to_grid(self._points) - grid.origin).astype(np.float32), dtype=wp.vec3, device=grid.device)
-        reach = wp.array(self._reach(grid).astype(np.float32), dtype=wp.vec2, device=grid.device)
+        ways = self._reach(grid)
+        reach = wp.array(ways.astype(np.float32), dtype=wp.vec2, device=grid.device)
         values = wp.zeros((len(self.probes), VALUES), dtype=wp.float64, device=grid.device)
         fields = [projection.kind, projection.pressure, simulation.surface.phi, *velocity]
         kick = wp.vec3(*(self.gravity * simulation.kick_dt))
         inputs = [points, wp.vec3i(*grid.counts), grid.planes, *fields, kick, wp.vec3(*self._up), reach, values]
         wp.launch(probe_kernel, len(self.probes), inputs, device=grid.device)
-        return np.asarray(values.numpy())
+        mine = np.asarray(values.numpy())
+        return self._joined(mine, ways, grid) if grid.part.shared else mine

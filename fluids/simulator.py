@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids.forces import SolidForces, WallSums
-from warp_lcp.fluids.models import make_coupling, make_pressure, make_surface, make_tension, make_viscosity
+from warp_lcp.fluids.models import make_pressure, make_surface, make_tension, make_viscosity
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
@@ -122,11 +122,10 @@ class LiquidSimulation(ParticleSimulation):
         return make_viscosity(self.scene, self.grid, self.boundary, self.surface, self.bodies)
 
     def _pressure(self) -> PressureProjection:
-        coupling = make_coupling(self.scene, self.grid, self.boundary, self.bodies)
-        return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, coupling)
+        return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
 
     def _probes(self) -> Probes | None:
-        return Probes(self.scene.probe, self.gravity, self.grid.dimension) if self.scene.probe else None
+        return Probes(self.scene.probe, self.gravity, self.grid) if self.scene.probe else None
 
     def particles_to_grid(self, window: Window) -> None:
         """Transfer velocity (and viscosity) of particles to the faces; apply gravity."""
@@ -134,6 +133,7 @@ class LiquidSimulation(ParticleSimulation):
         if self.viscosity is not None and self.viscosity.relative:
             p, fields = self.particles, (self.viscosity.relative, self.weights)  # which stay what they are
             particles_to_faces(self.grid, p.position, p.kept, [], *fields, window=window, offsets=p.offsets, runs=p.runs)
+            self.grid.part.fill(*self.viscosity.relative, *self.weights)  # ghost particles' own ghosts would have a share
 
     def stable_dt(self) -> float:
         """Return the longest stable time step for advection and surface tension [s]."""
@@ -143,7 +143,7 @@ class LiquidSimulation(ParticleSimulation):
     def mark(self) -> None:
         """Mark the liquid cells."""
         self.surface.begin(self.grid.everywhere)
-        self.surface.mark(self.particles, self.grid.everywhere, self.projection.kind)
+        self._mark_cells(self.grid.everywhere)
         self.projection.show()
 
     def step(self, dt: float) -> Row:
@@ -207,6 +207,7 @@ class LiquidSimulation(ParticleSimulation):
             with self.watch.stage("probes", *self.velocity, self.projection.pressure):
                 self.measured["probes"] = clock | self.probes.row(self)
         if self.forces is not None and self.scene.output.forces:
+            self.forces.impulses = np.asarray(self.grid.part.ranks.sum(self.forces.impulses))
             self.measured["forces"] = clock | self.forces.row(self.kick_dt)
 
     def _meet_walls(self, window: Window, dt: float) -> Row:
@@ -215,8 +216,8 @@ class LiquidSimulation(ParticleSimulation):
         Returns:
             What the log says of it.
         """
-        sums, forces = self.wall_sums, self.forces
-        row: Row = {}
+        sums, forces, part = self.wall_sums, self.forces, self.grid.part
+        window, row = part.faces(window), Row()
         if sums is None:
             return row
         with self.watch.stage("walls", *self.velocity, self.projection.pressure, self.boundary.touch):
@@ -229,13 +230,10 @@ class LiquidSimulation(ParticleSimulation):
                 if forces is not None and dragged is not None:
                     forces.add(dragged)
                 if self.bodies is not None and dragged is not None:
-                    SolidForces.push(self.bodies, self._of_all(dragged))
+                    SolidForces.push(self.bodies, np.asarray(part.ranks.sum(dragged)))
                     self.boundary.begin_step(self.time, dt)  # their velocities are others now
-        return row
-
-    def _of_all(self, impulses: np.ndarray) -> np.ndarray:
-        """Return what all parts of the liquid have given the solids, of what this one has."""
-        return impulses
+                part.fill(*self.velocity)
+        return {name: float(part.ranks.sum(value)) for name, value in row.items()}
 
     def known_density(self) -> wp.array | None:
         """Return the density from which the surface was computed, or None."""
@@ -305,9 +303,14 @@ class LiquidSimulation(ParticleSimulation):
             with self.watch.stage("surface tension", *self.velocity, self.tension.jump):
                 self.tension.act(self.velocity, window, projection.kind, self.kick_dt)
 
+    def _mark_cells(self, window: Window) -> None:
+        """Mark the liquid's cells, ghost cells as other processes do."""
+        self.surface.mark(self.particles, window, self.projection.kind)
+        self.grid.part.fill(self.projection.kind, *([] if self.surface.phi is None else [self.surface.phi]))
+
     def _launch_surface(self, window: Window) -> None:
         """Launch the marking of the liquid's cells, and the velocity of their faces."""
-        self.surface.mark(self.particles, window, self.projection.kind)
+        self._mark_cells(window)
         self.surface.complete(window, self.velocity, self.weights, self.projection.known)
 
     def _rub(self, viscosity: Viscosity, window: Window, dt: float, speed: float) -> Row:
@@ -403,7 +406,7 @@ class LiquidSimulation(ParticleSimulation):
         """
         cells = self.projection.not_finite() if result.status is wl.SolveStatus.NON_FINITE else np.zeros((0, 3))
         if len(cells):
-            where = tuple(int(c) + before for c, before in zip(cells[0], self.grid.origin, strict=True))
+            where = tuple(int(c) for c in cells[0])
             raise SimulationFailed(
                 f"step {self.step_count}: the velocity on the faces of cell (x, y, z) = {where} is not finite ({len(cells)} cells)"
             )

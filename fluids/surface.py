@@ -128,15 +128,15 @@ class NoSurface:
 
     phi = density = None
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, counted: Window | None = None) -> None:
-        """Find the cells, and the volume of those in a window, of all if None."""
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary) -> None:
+        """Find the cells, and the volume of this process's."""
         kind = boundary.base.numpy().copy()
         kind[kind == wl.AIR] = wl.FLUID
         self._kind = wp.array(kind, dtype=wp.int8, device=grid.device)
-        box = counted or grid.domain
-        cells = tuple(slice(low - 1, high - 1) for low, high in zip(box.low, box.high, strict=True))
+        owned = grid.part.owned
+        cells = tuple(slice(low - 1, high - 1) for low, high in zip(owned.low, owned.high, strict=True))
         filled = (grid.interior(kind) == wl.FLUID)[cells]
-        self._volume = float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume
+        self._volume, self._ranks = float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume, grid.part.ranks
 
     def begin(self, window: Window) -> None:
         """Do nothing: all cells are marked in each step."""
@@ -154,7 +154,7 @@ class NoSurface:
 
     def volume(self, cells: int) -> float:
         """Return the volume outside of solids."""
-        return self._volume
+        return float(self._ranks.sum(self._volume))
 
 
 class GhostFluidSurface:
@@ -168,18 +168,14 @@ class GhostFluidSurface:
         particles_a_cell: of liquid at rest.
         smoothing: binomial passes over the density: quieter, and less accurate in thin sheets.
         fill: adds the density of liquid without particles.
-        counted: cells whose volume is asked for; None: all.
     """
 
-    def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None,
-        counted: Window | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None) -> None:
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi
         self.density: wp.array | None = self.level_set.density
-        self._window, self._counted, self._measured = grid.everywhere, counted or grid.domain, False
+        self._window, self._measured = grid.everywhere, False
 
     def begin(self, window: Window) -> None:
         """Clear what the last step has left elsewhere."""
@@ -198,14 +194,14 @@ class GhostFluidSurface:
 
     def measure(self) -> None:
         """Compute the volume inside the surface."""
-        self.level_set.measure(self.boundary.distance, self._window.common(self._counted))
+        self.level_set.measure(self.boundary.distance, self._window.common(self.grid.part.owned))
         self._measured = True
 
     def volume(self, cells: int) -> float:
         """Return the volume inside the surface."""
         if not self._measured:
             self.measure()
-        return self.level_set.measured
+        return float(self.grid.part.ranks.sum(self.level_set.measured))
 
 
 def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:

@@ -90,13 +90,14 @@ class SurfaceTension:
         self.jump, self._fields = grid.field(), [grid.field() for _ in range(3)]
         self._passes = kernels.push_pass(bool(boundary.open))
         self._energy = WindowTally(self._passes.energy, grid)
-        self._blocked, self._counted = grid.field(wp.int8), grid.domain
+        self._blocked = grid.field(wp.int8)
         self._capacity, self._lean = boundary.capacity, grid.field()
         self._scale, self._factor = Scalar(), Scalar()  # kick_dt sigma / (rho dx^2); by which gradients are multiplied
         self._measured: ActiveWindow | None = None  # cells whose energy has been measured; None: none have liquid
         self._cells = ActiveWindow(grid.domain)
-        self._pushing = LaunchGraph(grid.device, self._push, at_once=boundary.moves)  # the lists of wall cells are rebuilt
-        self._calming = LaunchGraph(grid.device, self._calm)
+        shared = grid.part.shared  # then ranks exchange halos, and their particles are others
+        self._pushing = LaunchGraph(grid.device, self._push, at_once=shared or boundary.moves)  # the lists of wall cells are rebuilt
+        self._calming = LaunchGraph(grid.device, self._calm, at_once=shared)
         self._measuring = LaunchGraph(grid.device, lambda kind: self._energy.take(self._cells, self._faces(kind), self._shares))
         self._find_walls()
 
@@ -147,10 +148,10 @@ class SurfaceTension:
             shares = [s.linear, s.cubic, s.once, s.twice]
             inputs = [*self._walls, self._raised, planes, bending, self._cosine, *shares, bend, self._lean.flatten()]
             launch_list(kernels.lean_kernel, len(self._walls[0]), inputs, device=grid.device)
-            self._join(self._lean)
+            self.grid.part.fill(self._lean)
             self._find_curvature(window, passes)
         window.run(kernels.JUMP, self._shares, planes=planes, bend=bend, jump=self.jump, kind=kind, scale=self._scale)
-        self._join(self.jump)
+        self.grid.part.fill(self.jump)
         for axis, field in enumerate(velocity):
             window.run(self._passes.push, self._faces(kind), jump=self.jump, field=field, axis=axis)
 
@@ -163,7 +164,7 @@ class SurfaceTension:
         once = self._smoothed(window, first, free, passes, 0)
         self._smoothed(window, once, [field for field in self._fields if field is not once], passes, passes)
         window.run(kernels.CURVATURE, self._shares, planes=self.grid.planes, bend=self._bend, limit=self._most)
-        self._join(self._bend)
+        self.grid.part.fill(self._bend)
         self._continue(self._bend, 0, 0.0)
 
     def calm(self, particles: Particles, dt: float) -> None:
@@ -187,7 +188,7 @@ class SurfaceTension:
 
     def measure(self, window: Window, kind: wp.array) -> None:
         """Find the energy, for `energy` to tell."""
-        box = window.common(self._counted)
+        box = window.common(self.grid.part.owned)
         self._measured = None if box is None else self._cells
         if box is not None:
             self._cells.move_to(box)
@@ -196,12 +197,9 @@ class SurfaceTension:
 
     def energy(self) -> float:
         """Return the energy of surface and wet walls when it was last measured [J; J/m in 2-D]: sigma (area - cos(angle) wet area)."""
-        area, wetted = self._areas()
+        mine = self._energy.read() if self._measured is not None else [0.0, 0.0]
+        area, wetted = self.grid.part.ranks.sum(np.array(mine)).tolist()
         return self.coefficient * (area - self._cosine * wetted) * self.grid.spacing ** (self.grid.dimension - 1)
-
-    def _areas(self) -> list[float]:
-        """Return the areas of surface and wet walls, in faces of cells."""
-        return self._energy.read() if self._measured is not None else [0.0, 0.0]
 
     def _faces(self, kind: wp.array) -> LiquidBoundary:
         """Return the cells, the surface and the walls, which rest."""
@@ -211,18 +209,15 @@ class SurfaceTension:
         """Return the source after binomial passes, in one of two free fields; so many passes are `before` them."""
         self._continue(source, before, self._cosine)
         if before == 0 and self._cosine != 0.0:  # `begin_kernel` looks farther than others' cells are known
-            self._join(source)
+            self.grid.part.fill(source)
         for done in range(1, passes + 1):
             out = free[done % 2]
             window.run(BINOMIAL, planes=self.grid.planes, source=source, out=out)
             if done % 2 == 0 or done == passes:  # a pass looks a cell far, and what goes on into walls three
-                self._join(out)
+                self.grid.part.fill(out)
             self._continue(out, before + done, self._cosine)
             source = out
         return source
-
-    def _join(self, field: wp.array) -> None:
-        """Take what others know of a field, before it is looked at beside a cell."""
 
     def _continue(self, field: wp.array, passes: int, cosine: float) -> None:
         """Continue a share into walls, after so many passes; with a cosine of 0 whatever a field has."""

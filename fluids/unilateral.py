@@ -120,6 +120,7 @@ class UnilateralPressure(PressureProjection):
         """
         self._last = self._kick
         self._projection.run(velocity, window, result.x, variant=(result.x.ptr, window.near is None))
+        self.grid.part.fill(*velocity, *self.known, self.contact)
         return Projection(result, self.counted(), self._found)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
@@ -133,16 +134,18 @@ class UnilateralPressure(PressureProjection):
         inputs = [self._at(velocity), self._rate, self._settling, self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
         self._cells.launch_rows(kernels.contact_kernel, inputs)
 
-    def _found(self) -> tuple[float, float]:
+    def _found_here(self) -> tuple[float, float]:
         rows = self._cells.rows_of(self._sums)
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
     def fluid_cells(self) -> np.ndarray:
-        """Return the cells with liquid or pressure in the last projection, shape (n, 3).
+        """Return this process's cells with liquid or pressure in the last projection, shape (n, 3).
 
         Indices (k, j, i) in the stored shape.
         """
-        return np.argwhere((self.cells.numpy() == FLUID) | (self.pressure.numpy() > 0.0))
+        part = self.grid.part
+        cells, pressure = (part.box_of(field.numpy()) for field in (self.cells, self.pressure))
+        return np.argwhere((cells == FLUID) | (pressure > 0.0)) + np.array(part.owned.low)
 
     def _at(self, velocity: Sequence[wp.array]) -> Any:
         """Return the setting with velocities, open fractions and solids' velocities as they are."""

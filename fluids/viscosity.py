@@ -34,7 +34,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
-from warp_lcp.fluids.viscosity_multigrid import VectorMultigrid
+from warp_lcp.fluids.viscosity_multigrid import make_multigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
 from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window, three_components
@@ -47,7 +47,6 @@ from warp_lcp.rigid.body import PLANAR
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy
-from warp_lcp.rows.vectors import Across
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a force, relative to the diagonal times the speed
 STIFF = 1.0  # of nu dt / dx^2: where it is less, faces without mass, which nobody reads, would decide by their error when a solve ends
@@ -94,7 +93,10 @@ class ViscousResult:
 
 
 class Viscosity:
-    """Take implicit steps of viscosity.
+    """Take implicit steps of viscosity; `solve` and `push_bodies` are collective.
+
+    Velocity, kinds of cells, contacts, surface and the liquid's own viscosities must be right in ghost cells; velocity and change then are.
+    `impulses` are those of this process's faces.
 
     Args:
         grid: the grid.
@@ -108,8 +110,6 @@ class Viscosity:
         max_iterations: of conjugate gradients in a step; 200 unless given, 1000 where viscosities differ.
         bodies: those that the liquid moves, among the solids; None: there are none.
         sources: whether cells may turn SOLID, as those of sources do.
-        solved: cells whose faces have unknowns here; None: all of the grid's domain.
-        across: who has the other faces, for whom `solve` and `push_bodies` are collective then; None: nobody.
 
     Attributes:
         change: what the last step changed of each component [m/s].
@@ -120,7 +120,7 @@ class Viscosity:
     def __init__(
         self, grid: StaggeredGrid, boundary: Boundary, *, viscosity: float, density: float, slip_lengths: Sequence[float],
         phi: wp.array | None, tolerance: float, thickest: float | None = None, max_iterations: int | None = None, sources: bool = False,
-        bodies: RigidBodies | None = None, solved: Window | None = None, across: Across | None = None,
+        bodies: RigidBodies | None = None,
     ) -> None:  # fmt: skip
         self.grid, self.boundary, self.tolerance, self.max_iterations = (
             grid,
@@ -129,14 +129,14 @@ class Viscosity:
             max_iterations or (200 if thickest is None else 1000),
         )
         self._viscosity, self._density, self._phi = viscosity, density, phi
-        self._inner, self._across = solved or grid.domain, across
+        self._inner, self._across = grid.part.owned, grid.part.across
         self._passes = viscous_passes(grid.dimension, bool(boundary.open), phi is not None, bool(boundary.velocity), thickest is not None)
         self._thickest = thickest or 1.0
         slips = np.asarray(slip_lengths, dtype=np.float32) / np.float32(grid.spacing)
         self._slips = wp.array(slips, dtype=wp.float32, device=grid.device)
         self._walls = ~open_sides_of(grid, boundary.open_sides) & (1 << 2 * grid.dimension) - 1
         self._walls_change, self._placed = boundary.moves or sources, False
-        self.multigrid = self._multigrid()
+        self.multigrid = make_multigrid(grid)
         self._fine = self.multigrid.levels[0]
         size = grid.dimension * grid.size
         self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)
@@ -147,7 +147,7 @@ class Viscosity:
         self._bodies: BodyDrag | None = None
         if bodies is not None:
             assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
-            self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes, self._inner, across)
+            self._bodies = BodyDrag(grid, boundary, bodies, density, self._passes, self._inner, self._across)
         self._solver = self._krylov()
         self._trail, self._sums = (
             DirtyRegion(grid.everywhere),
@@ -156,7 +156,8 @@ class Viscosity:
         self._box, self._above = ActiveWindow(grid.everywhere), ActiveWindow(grid.everywhere)
         self._unknowns, self._tau = ActiveWindow(self._inner), Scalar()
         launches = (self._keep, self._set_up, self._residual, self._take_solution, self._cover, self._keep_change, self._undo)
-        self._graphs = {function.__name__: LaunchGraph(grid.device, function) for function in launches}
+        shared = grid.part.shared  # then ranks exchange halos in some
+        self._graphs = {function.__name__: LaunchGraph(grid.device, function, at_once=shared) for function in launches}
 
     def solve(
         self, velocity: Sequence[wp.array], window: Window, kind: wp.array, contact: wp.array, dt: float, speed: float, *, last: bool = True
@@ -202,7 +203,7 @@ class Viscosity:
                 break
         if last:
             self._graphs["_cover"].run(velocity, kind)
-        self._share(self.change)
+        self.grid.part.fill(*self.change)
         energy = self._density * self.grid.cell_volume
         residual = norm / first if first > 0.0 else 0.0
         if norm <= least:
@@ -226,7 +227,7 @@ class Viscosity:
         """Add the solution of conjugate gradients to the velocity and its change."""
         for u, total, more in zip(velocity, self.change, self.multigrid.components(x), strict=True):
             self._unknowns.run(self._passes.add, u=u, total=total, more=more)
-        self._share(velocity)
+        self.grid.part.fill(*velocity)
 
     def _cover(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
         """Give faces in walls their velocity."""
@@ -243,19 +244,14 @@ class Viscosity:
                 axis=axis,
             )
 
-    def _multigrid(self) -> VectorMultigrid:
-        return VectorMultigrid(self.grid)
-
     def _krylov(self) -> ConjugateGradient:
         return ConjugateGradient(self._product, self.multigrid, across=self._across)
 
     def _boxes(self, window: Window) -> tuple[Window, Window | None]:
         """Return where something may differ from what the last step left, and which cells of these have unknowns; None: none has."""
-        box = replace(self._trail.through(window), near=None)
-        return box, box.common(self.grid.domain)
-
-    def _share(self, fields: Sequence[wp.array]) -> None:
-        """Take what other parts of the grid know of fields, if there are any."""
+        part = self.grid.part
+        box = part.whole(replace(self._trail.through(window), near=None))
+        return box, box.common(part.owned)
 
     def impulses(self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array, points: np.ndarray) -> np.ndarray:
         """Return what viscous stresses of the last step give the domain and each solid, shape (1 + solids, 6): N s, N m s.

@@ -328,3 +328,13 @@ class VectorMultigrid:
         self._cycle(number + 1, launch)
         level.prolong(self.levels[number + 1], launch)
         level.smooth(False, launch)
+
+
+def make_multigrid(grid: StaggeredGrid) -> VectorMultigrid:
+    """Return the multigrid of a grid, across ranks if several work on it."""
+    part: Any = grid.part
+    if part.across is None:
+        return VectorMultigrid(grid)
+    from warp_lcp.fluids.distributed.viscosity_multigrid import SharedVectorMultigrid
+
+    return SharedVectorMultigrid(part)

@@ -10,10 +10,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
+from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import StarForest, star_forest
 from warp_lcp.distributed.messages import exchange_all
 from warp_lcp.distributed.waiting import waiting
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.part import GridPart
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.rows.vectors import Across, convert
 
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
 
@@ -34,7 +37,7 @@ def ghost_layers(cfl: float, smoothing: int) -> int:
     return max(LAYERS, math.ceil(cfl) + 3, smoothing + 3)
 
 
-class Subdomain:
+class Subdomain(GridPart):
     """A rank's part of a grid: the cells of its box, and of those around it what lies in the domain within some layers.
 
     The outermost layer is the ring that every staggered grid has around its cells. At the domain's sides the ring is that of the whole
@@ -51,12 +54,13 @@ class Subdomain:
     Attributes:
         grid: the part as a grid, whose coordinates and positions are those of the whole domain.
         cuts: has bit n set if side n of the part, see `warp_lcp.grid.sides`, is a cut.
-        owned: the cells of the box.
         own_faces: those whose lower faces belong to the box: its cells, and the ring beyond the domain's upper sides that it touches.
 
     Raises:
         ValueError: a box has fewer cells along a cut axis than layers; on all ranks.
     """
+
+    shared = True
 
     def __init__(self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int) -> None:
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
@@ -71,15 +75,38 @@ class Subdomain:
                     f"{layers} layers around a box: start fewer ranks (at most {most} along that axis), or refine the grid"
                 )
         cells = self._cells(self.box)
-        self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts)
+        self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts, part=self)
         inner = self.box.moved(cells.low, -1)
-        self.owned = self.grid.window([low + 1 for low in inner.low], inner.high)
+        self._owned = self.grid.window([low + 1 for low in inner.low], inner.high)
         last = self._at_sides(self.box)[1]
         self.own_faces = self.grid.window([low + 1 for low in inner.low], [high + end for high, end in zip(inner.high, last, strict=True)])
         self.cuts = 0
         for axis in range(dimension):
             for side in range(2):
                 self.cuts |= (decomposition.neighbor(axis, side) is not None) << (2 * axis + side)
+
+    @property
+    def across(self) -> Across | None:
+        """The other processes, as reductions take them; None: there are none."""
+        return self.ranks if self.ranks.size > 1 else None
+
+    @property
+    def owned(self) -> Window:
+        """The cells of the box."""
+        return self._owned
+
+    @property
+    def first(self) -> tuple[int, int, int]:
+        """The first of them along x, y, z, counted from 0 in the whole domain."""
+        return self.box.low
+
+    def faces(self, window: Window) -> Window:
+        """Return the cells whose lower faces belong to the box."""
+        return self.own_faces
+
+    def whole(self, window: Window) -> Window:
+        """Return all cells: others may have material where this rank has none."""
+        return self.grid.everywhere
 
     def repartition(self, decomposition: Decomposition) -> Subdomain:
         """Return the part that this rank works on with other boxes."""
@@ -196,6 +223,19 @@ class Subdomain:
         view = self.stored_box_of(field)
         if view.ptr != box.ptr:
             wp.copy(box, view)
+
+    def store(self, x: wp.array, field: wp.array, spare: wp.array) -> None:
+        """Write the solution of a problem on the box to a field of the part, in ghost cells as others have it; collective."""
+        if x.dtype is not wp.float64:  # of a method in single precision
+            convert(x.flatten(), spare.flatten())
+            x = spare
+        nx, ny, nz = self.box.counts
+        wp.copy(self.box_of(field), x.reshape((nz + 2, ny + 2, nx + 2))[1:-1, 1:-1, 1:-1])
+        self.fill(field)
+
+    def poisson(self, cells: np.ndarray, **coefficients: Any) -> DistributedGridPoisson:
+        """Return the operator of all ranks' problem, of which this one has its box."""
+        return DistributedGridPoisson(self.decomposition, cells, device=self.grid.device, **coefficients)
 
     def gathered(self, box: np.ndarray) -> np.ndarray | None:
         """Return what all ranks have of their boxes, shape (nz, ny, nx), as an array of the whole grid on the root rank; None elsewhere.

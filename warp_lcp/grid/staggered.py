@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.particle_loops import GridPlacement
 from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.rows.fields import checked_device, zeros
@@ -466,6 +467,7 @@ class StaggeredGrid:
         origin: cells (x, y, z) of a larger grid before the first one of this.
         whole: cells of the larger grid that this is a part of; None: it is no part.
         sparse: whether only a small part of its fields will be written, for which memory is taken in small pages.
+        part: what this process has of it; all if None.
 
     Raises:
         ValueError: a count is not positive, nz is not 1 in 2-D, or the spacing is not positive.
@@ -478,6 +480,7 @@ class StaggeredGrid:
     origin: tuple[int, int, int] = (0, 0, 0)
     whole: tuple[int, int, int] | None = None
     sparse: bool = field(default=False, compare=False)
+    part: GridPart = field(default=None, compare=False, repr=False)  # type: ignore[assignment]  # set below
 
     def __post_init__(self) -> None:
         """Check the arguments and resolve the device."""
@@ -488,6 +491,7 @@ class StaggeredGrid:
         if not (np.isfinite(self.spacing) and self.spacing > 0):
             raise ValueError(f"spacing = {self.spacing}: must be a positive length [m]")
         object.__setattr__(self, "device", checked_device(self.device))
+        object.__setattr__(self, "part", self.part or GridPart(self))
 
     @property
     def shape(self) -> tuple[int, int, int]:
