@@ -11,7 +11,7 @@ from warp_lcp.distributed.decomposition import Decomposition, balanced_processes
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
-from warp_lcp.distributed.surface_mesh import surface_layers
+from warp_lcp.grid.surface_mesh import surface_layers
 from warp_lcp.material.particle_assembly import Parts, kept_by, seed_materials, start_band, start_velocities
 from warp_lcp.material.particle_scene import ParticleScene
 

@@ -20,24 +20,19 @@ import warp as wp
 
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
-from warp_lcp.distributed.density_correction import SharedDensityCorrection, SharedDensityMonitor
 from warp_lcp.distributed.extension import Refill, too_far
 from warp_lcp.distributed.flight import SharedFlights
 from warp_lcp.distributed.migration import cuts_of, handed_over
 from warp_lcp.distributed.particle_pieces import take_pieces
-from warp_lcp.distributed.particles import SORTED, UNSORTED, SharedParticles
-from warp_lcp.distributed.reseeding import SharedReseeding
+from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
-from warp_lcp.distributed.surface_mesh import SharedSurfaceMesh
 from warp_lcp.grid.level_set import Fill
-from warp_lcp.grid.particles import ParticleTotals
+from warp_lcp.grid.particles import SORTED, UNSORTED, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.grid.surface_mesh import SurfaceMesh
 from warp_lcp.material.flight import Flights
-from warp_lcp.material.particle_assembly import Parts, make_flights, make_surface_mesh
+from warp_lcp.material.particle_assembly import Parts, make_flights
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_pieces import Piece, fields_of, piece_of
-from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.particle_state import signature
@@ -86,16 +81,6 @@ class SharedParticleSimulation(ParticleSimulation):
     def _in_band(self) -> int:
         """How many particles the material without any stands for."""
         return self.band.held if self.band is not None else 0
-
-    def _rearrangement(self) -> Rearrangement:
-        density_monitor, correction = partial(SharedDensityMonitor, self.part), partial(SharedDensityCorrection, self.part)
-        reseeding = partial(SharedReseeding, self.part)
-        return Rearrangement(
-            self.scene, self.grid, self.boundary, density_monitor=density_monitor, correction=correction, reseeding=reseeding
-        )
-
-    def _surface_mesh(self) -> SurfaceMesh | None:
-        return make_surface_mesh(self.scene, self.grid, self.boundary, partial(SharedSurfaceMesh, self.part))
 
     def surfaces(self) -> list[Surface]:
         """Return the surface in this rank's box; collective."""

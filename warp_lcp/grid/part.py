@@ -85,12 +85,13 @@ class GridPart:
         """Return the process that owns each cell (x, y, z) of the whole domain, shape (n, 3)."""
         return np.zeros(len(cells), dtype=np.int64)
 
-    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None) -> None:
+    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1) -> None:
         """Fill the ghost cells of fields with what other processes know (halo exchange); collective.
 
         Args:
             fields: any types, or stacks of equally many layers, the last axes z, y, x.
             width: how far from the owned cells; None: all.
+            parts: the fields are of `grid.refined(parts)`.
         """
 
     def faces(self, window: Window) -> Window:

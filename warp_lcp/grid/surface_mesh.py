@@ -21,7 +21,7 @@ from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
 from warp_lcp.grid.mesh_walls import Walls, fit_to_walls
 from warp_lcp.grid.particle_loops import MARGIN, launch, scatter, touched_planes
 from warp_lcp.grid.solids import Geometry
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
 SHARPEST = 0.5  # particle distances: standard deviation of the narrowest kernel that has no gaps, the quadratic B-spline
@@ -29,8 +29,14 @@ EXTENDED = 2  # layers that the distance is continued into solids, and the veloc
 CROWD = 0.1  # the largest smoothed share that a lone particle is taken to have: kernels as narrow as particles cannot tell it from others
 ROUNDS = 3  # of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume
 SEEN = 2 * ROUNDS + 1  # lattice cells around one that its points depend on by the smoothing
+OUTSIDE = 1.0  # of the surface, in the ring at cuts
 MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9  # a lattice cell, and more where there are solids
 MESH_POINT_BYTES = 80  # a point, its triangles and its velocity included
+
+
+def surface_layers(parts: int) -> int:
+    """Return how many layers of ghost cells the surface takes on a lattice of so many cells along the edge of a cell."""
+    return -(-SEEN // parts) + 1
 
 
 @dataclass(frozen=True)
@@ -112,9 +118,10 @@ class SurfaceMesh:
         self._known = self.lattice.field(wp.int8) if obstacles else None
         self._cubes = MarchingCubes(self.lattice)
         self._placed = False
+        self._kept = self._lattice_cells() if grid.part.shared else None  # whose triangles this rank keeps; None: all
 
     def find(self, position: wp.array, interior: Interior | None = None) -> DeviceMesh:
-        """Return the surface around particles.
+        """Return the surface around particles, ghosts among them; collective.
 
         On CUDA the last bits may differ between runs, as do sums over particles.
 
@@ -154,8 +161,33 @@ class SurfaceMesh:
             window.run(kernels.CARVE, room=self._room, phi=phi)
         return self._mesh(phi, smooth.view(wp.int32))
 
+    def _lattice_cells(self) -> Window:
+        """Return the lattice cells that have their low node in this rank's box, or in the ring beyond the domain's low sides."""
+        lattice, part = self.lattice, self.grid.part
+        each = np.array([self._parts] * 2 + [self._parts if lattice.dimension == 3 else 1])[::-1]
+        low, high = ((np.array(corner) - 1) * each + 1 for corner in (part.owned.low, part.owned.high))
+        for axis in range(lattice.dimension):
+            low[2 - axis] -= part.first[axis] == 0
+        return Window.of(low.tolist(), high.tolist(), lattice.device)
+
     def _mesh(self, phi: wp.array, number: wp.array) -> DeviceMesh:
-        """Return the smoothed surface phi = 0; `number` is scratch memory."""
+        """Return the smoothed surface phi = 0, on ranks the triangles of this one's cells; `number` is scratch memory."""
+        if self._kept is None:
+            return self._whole_mesh(phi, number)
+        part, lattice = self.grid.part, self.lattice
+        part.fill(phi, parts=self._parts)
+        for axis in range(lattice.dimension):
+            for side in range(2):
+                if part.cuts >> 2 * axis + side & 1:
+                    phi.transpose((2 - axis, *(n for n in range(3) if n != 2 - axis)))[-side].fill_(OUTSIDE)
+        mesh = self._whole_mesh(phi, number)
+        kept = self._cubes.corners(phi, number, self._kept).numpy()
+        used, corners = np.unique(kept, return_inverse=True)
+        points = wp.array(mesh.points.numpy()[used], dtype=wp.vec3, device=lattice.device)
+        return DeviceMesh(points, wp.array(corners.reshape(kept.shape), dtype=wp.int32, device=lattice.device))
+
+    def _whole_mesh(self, phi: wp.array, number: wp.array) -> DeviceMesh:
+        """Return the smoothed surface phi = 0 of all lattice cells."""
         mesh = self._cubes.contour(phi, number)
         held = smooth_mesh(mesh, self.lattice, self._room, ROUNDS)
         shapes = self.obstacles.shapes() if self.obstacles is not None and self.obstacles.shapes is not None else ()
@@ -203,6 +235,7 @@ class SurfaceMesh:
         for axis in range(self.lattice.dimension):
             lines = field.transpose((*(n for n in range(3) if n != 2 - axis), 2 - axis))
             wp.launch(kernels.mirror_kernel, lines.shape[:2], [fold, lines], device=self.lattice.device)
+        self.grid.part.fill(field, parts=self._parts)
 
 
 def faces_from_particles(

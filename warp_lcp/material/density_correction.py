@@ -24,7 +24,6 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.rows import KernelFile, RowPass
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph
-from warp_lcp.rows.vectors import convert
 from warp_lcp.settings import renamed_names
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
@@ -53,7 +52,7 @@ SHIFT = 1e-5  # of the diagonal: gives closed pockets a solution, and leaves 0.5
 
 
 class DensityMonitor:
-    """Density monitor: fraction of the material in overfull cells.
+    """Density monitor: fraction of the material in overfull cells; `measure` and `found` are collective.
 
     Args:
         grid: the grid.
@@ -64,9 +63,10 @@ class DensityMonitor:
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, max_density: float) -> None:
         self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
-        self._crowd = WindowTally(CROWD, grid, grid.domain)
+        self._crowd = WindowTally(CROWD, grid, grid.part.owned)
         self._density: wp.array | None = None
-        self._trail, self._cells = DirtyRegion(grid.domain), ActiveWindow(grid.domain)
+        self._known: tuple[float, float] | None = None  # what was found since the last `measure`
+        self._trail, self._cells = DirtyRegion(grid.part.owned), ActiveWindow(grid.domain)
         self._measuring = LaunchGraph(grid.device, self._launch)
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:
@@ -79,7 +79,8 @@ class DensityMonitor:
         """
         if density is None:
             density = self._density = self.grid.field() if self._density is None else self._density
-            self._find(density, particles, window)
+            density_of_all(self.grid, particles, window, self.particles_a_cell, density)
+        self._known = None
         self._cells.move_to(self._trail.through(window))
         self._measuring.run(density, variant=self._cells.near is None)
         self._crowd.changed()
@@ -88,21 +89,25 @@ class DensityMonitor:
         b = self.boundary
         self._crowd.take(self._cells, base=b.base, density=density, capacity=b.capacity, most=self.max_density)
 
-    def _find(self, density: wp.array, particles: Particles, window: Window) -> None:
-        """Find the particles' density."""
-        particle_density(self.grid, particles, window, self.particles_a_cell, density)
-
-    def _read(self) -> list[float]:
-        """Return what is beyond what cells may hold, what there is, and the largest density."""
-        return self._crowd.read()
-
     def found(self) -> tuple[float, float]:
         """Return the fraction of material above the limit, and the largest density.
 
         The density at rest is 1.
         """
-        above, held, densest = self._read()
-        return above / held if held > 0.0 else 0.0, densest
+        if self._known is None:
+            above, held, densest = self._crowd.read()  # what is beyond what cells may hold, what there is, the largest density
+            ranks = self.grid.part.ranks
+            above, held = ranks.sum(np.array([above, held])).tolist()
+            self._known = above / held if held > 0.0 else 0.0, float(ranks.max(densest))
+        return self._known
+
+
+def density_of_all(grid: StaggeredGrid, particles: Particles, window: Window, particles_a_cell: int, density: wp.array) -> None:
+    """Find the density of all processes' particles, see `particle_density`; collective."""
+    particles.look_around()
+    particle_density(grid, particles, window, particles_a_cell, density)
+    particles.drop_ghosts()
+    grid.part.fill(density)
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,10 +207,14 @@ class DensityCorrection:
             self._lower = grid.field(wp.float64)
         self._shift = wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device) if boundary.open or even else None
         self._problem: wl.LCP | None = None  # built when there is material: an empty problem is refused
-        self._solved = grid.domain  # the cells of the problem
+        self._solved = grid.part.owned  # the cells of the problem
+        self._copied: list[tuple[wp.array, wp.array]] = []  # fields of a rank's part, and those of its problem
+        self._copied_faces: list[tuple[wp.array, wp.array]] = []
+        self._guess = grid.part.box_like(self.x).flatten()
         self._way = Scalar()  # by which the displacement is multiplied [m]
-        self._preparation = LaunchGraph(grid.device, self._launch_preparation)
-        self._displacing = LaunchGraph(grid.device, self._launch_displacement)
+        shared = grid.part.shared  # ranks exchange particles and halos in them
+        self._preparation = LaunchGraph(grid.device, self._launch_preparation, at_once=shared)
+        self._displacing = LaunchGraph(grid.device, self._launch_displacement, at_once=shared)
 
     def apply(
         self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None, share: float = 1.0
@@ -223,7 +232,7 @@ class DensityCorrection:
             particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
         self._preparation.run(particles, window, fill, contact, variant=(window.near is None, contact is None))
         self._over.changed()
-        over_full, most = self._counts(*self._found())
+        over_full, most = self._found()
         if over_full == 0:
             self.x.zero_()
             return Correction(None, 0, most)
@@ -249,20 +258,19 @@ class DensityCorrection:
 
     def _launch_preparation(self, particles: Particles, window: Window, fill: Fill | None, contact: wp.array | None) -> None:
         """Launch the density and the set-up of the problem."""
-        self._find_density(particles, window)
+        density_of_all(self.grid, particles, window, self.particles_a_cell, self.density)
         if fill is not None:
             fill(window, self.density)
         self._prepare(contact)
-
-    def _find_density(self, particles: Particles, window: Window) -> None:
-        particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
 
     def _displace_particles(self, particles: Particles) -> None:
         self.boundary.displace(self.displacement, particles.position)
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem."""
-        convert(x.flatten(), self.x.flatten())
+        part = self.grid.part
+        part.store(x, self.x, self._guess)
+        part.fill(self._kind)
 
     def _prepare(self, contact: wp.array | None) -> None:
         """Set up the problem, and count over-full cells."""
@@ -270,38 +278,48 @@ class DensityCorrection:
         fields = DensityFields(self._kind, self._b, self.x, self.density, b.capacity, self._inside)
         self._over.take(self._solved, fields, base=b.base, contact=contact, most=most, gain=self.gain)
         if self._inside is not None:
-            self._join()
+            self.grid.part.fill(self._inside)  # before those deep inside are told by them
             least, planes = min(most, 2.0 - most), self.grid.planes - 1
             self._lacking.take(self._solved, fields, least=least, planes=planes, lower=self._lower)
 
-    def _found(self) -> tuple[float, float]:
-        """Return how many cells are over-full or lack material deep inside, and the largest density."""
+    def _found(self) -> tuple[int, float]:
+        """Return how many cells are over-full or lack material deep inside, and the largest density; collective."""
         lacking = 0.0
         if self._inside is not None:
             self._lacking.changed()
             (lacking,) = self._lacking.read()
         full, densest = self._over.read()
-        return full + lacking, densest
-
-    def _join(self) -> None:
-        """Take what else is known of the cells that are inside, before those deep inside are told by them."""
-
-    def _counts(self, full: float, densest: float) -> tuple[int, float]:
-        return int(full), densest
+        ranks = self.grid.part.ranks
+        return int(ranks.sum(full + lacking)), float(ranks.max(densest))
 
     def _solve(self, over_full: int) -> wl.SolveResult:
         if self._problem is None:
             self._problem = self._make_problem()
             self._work = self.solver.init(self._problem)
+        self._copy_to_boxes(whole=self.boundary.moves)
         self._operator.update(self._cells)
         criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations)
         return wl.solve(self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work)
 
     def _make_problem(self) -> wl.LCP:
-        faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
-        self._cells, self._guess = self._kind, self.x.flatten()
-        self._operator = wl.GridPoisson(self.grid.interior(self._kind.numpy()), shift=self._shift, device=self.grid.device, **faces)
-        return wl.LCP(self._operator, self._b, 0.0 if self._lower is None else self._lower, np.inf)
+        part, opened = self.grid.part, self.boundary.open
+        self._cells, b = part.box_like(self._kind), part.box_like(self._b)
+        lower, shift = (None if field is None else part.box_like(field) for field in (self._lower, self._shift))
+        faces = [part.box_like(field) for field in opened]
+        if part.shared:
+            pairs = [(self._kind, self._cells), (self._b, b), (self._lower, lower), (self._shift, shift)]
+            pairs.append((self.x, self._guess.reshape(b.shape)))
+            self._copied = [(field, box) for field, box in pairs if field is not None]
+            self._copied_faces = [*zip(opened, faces, strict=True)]
+        self._copy_to_boxes(whole=True)
+        named = dict(zip(("face_x", "face_y", "face_z"), faces, strict=False))
+        self._operator = part.poisson(self.grid.interior(self._cells.numpy()), shift=shift, **named)
+        return wl.LCP(self._operator, b, 0.0 if lower is None else lower, np.inf)
+
+    def _copy_to_boxes(self, *, whole: bool) -> None:
+        """Give a rank's problem what the fields of its part hold; `whole`: open fractions, too."""
+        for field, box in [*self._copied, *(self._copied_faces if whole else ())]:
+            self.grid.part.copy_to_box(field, box)
 
 
 __getattr__ = renamed_names(__name__, Crowding="DensityMonitor")

@@ -148,13 +148,11 @@ def make_flights(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, 
     return make(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up) if scene.flies else None
 
 
-def make_surface_mesh(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., SurfaceMesh] = SurfaceMesh
-) -> SurfaceMesh | None:
-    """Return what wraps the particles in a surface, made by what takes the arguments of `SurfaceMesh`, if the scene's output has one."""
+def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:
+    """Return what wraps the particles in a surface, if the scene's output has one."""
     if not scene.output.surface:
         return None
-    return make(
+    return SurfaceMesh(
         grid, per_axis=scene.particles.per_axis, resolution=scene.output.surface_resolution, smoothing=scene.output.surface_smoothing,
         obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves, boundary.shapes) if scene.solid else None,
     )  # fmt: skip
@@ -314,22 +312,18 @@ def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> 
     return near
 
 
-def make_reseeding(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., Reseeding] = Reseeding
-) -> Reseeding | None:
-    """Return what evens out the particles if a scene asks for it, made by what takes the arguments of `Reseeding`."""
+def make_reseeding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Reseeding | None:
+    """Return what evens out the particles, if a scene asks for it."""
     settings = scene.particles.reseed
     if settings is None:
         return None
     at_rest = scene.particles.per_axis**grid.dimension
     least, most = scene.particles.reseed_range(grid.dimension)
-    return make(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
+    return Reseeding(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
 
 
-def make_density_correction(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., DensityCorrection] = DensityCorrection
-) -> DensityCorrection:
-    """Return what moves the particles of a scene apart, made by what takes the arguments of `DensityCorrection`.
+def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> DensityCorrection:
+    """Return what moves the particles of a scene apart.
 
     Raises:
         ValueError: the scene has none.
@@ -338,29 +332,26 @@ def make_density_correction(
     if settings is None:
         raise ValueError("density_correction.every = 0: must be at least 1")
     solver = wl.ProjectedMultigrid(precision=scene.solver.precision)
-    return make(
+    return DensityCorrection(
         grid, boundary, solver, particles_a_cell=scene.particles.per_axis**grid.dimension,
         max_density=settings.largest(scene.particles.per_axis), every=settings.every, gain=scene.correction_gain, even=scene.keeps_volume,
         tolerance=settings.tolerance,
     )  # fmt: skip
 
 
-def make_density_monitor(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., DensityMonitor] = DensityMonitor
-) -> DensityMonitor | None:
+def make_density_monitor(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> DensityMonitor | None:
     """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are.
 
     Args:
         scene: the scene.
         grid: its grid.
         boundary: its solids.
-        make: takes the arguments of `DensityMonitor`.
     """
     settings = scene.correction
     if scene.density_correction is not None or settings is None:
         return None
     count = scene.particles.per_axis
-    return make(grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count))
+    return DensityMonitor(grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count))
 
 
 def _body(solid: SolidProperties, geometry: Geometry, name: str, friction: float, dimension: int) -> RigidBody:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import warp as wp
@@ -12,10 +12,9 @@ from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.density_correction import DensityCorrection, DensityMonitor
+from warp_lcp.material.density_correction import DensityCorrection
 from warp_lcp.material.particle_assembly import make_density_correction, make_density_monitor, make_reseeding
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.material.reseeding import Reseeding
 from warp_lcp.simulation import Stopwatch
 
 CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
@@ -36,9 +35,6 @@ class Rearrangement:
         scene: what asks for it.
         grid: its grid.
         boundary: its solids.
-        density_monitor: makes the density monitor.
-        correction: makes the density correction.
-        reseeding: makes the reseeding.
 
     Attributes:
         reseeding: the reseeding; None: the scene does not ask for it.
@@ -46,15 +42,11 @@ class Rearrangement:
         correction: the density correction; None: it has not acted yet, or never does.
     """
 
-    def __init__(
-        self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *,
-        density_monitor: Callable[..., DensityMonitor] = DensityMonitor,
-        correction: Callable[..., DensityCorrection] = DensityCorrection, reseeding: Callable[..., Reseeding] = Reseeding,
-    ) -> None:  # fmt: skip
+    def __init__(self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> None:
         """Make what the scene asks for."""
-        self._scene, self._grid, self._boundary, self._make = scene, grid, boundary, correction
-        self.reseeding = make_reseeding(scene, grid, boundary, reseeding)
-        self.density_monitor = make_density_monitor(scene, grid, boundary, density_monitor)
+        self._scene, self._grid, self._boundary = scene, grid, boundary
+        self.reseeding = make_reseeding(scene, grid, boundary)
+        self.density_monitor = make_density_monitor(scene, grid, boundary)
         self.correction: DensityCorrection | None = None
         settings = scene.correction
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
@@ -155,4 +147,4 @@ class Rearrangement:
             self.correction.x.assign(state[STATE])
 
     def _made(self) -> DensityCorrection:
-        return make_density_correction(self._scene, self._grid, self._boundary, self._make)
+        return make_density_correction(self._scene, self._grid, self._boundary)

@@ -12,7 +12,6 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
-from warp_lcp.grid.surface_mesh import SurfaceMesh
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.grid.vicinity import Vicinity
 from warp_lcp.material.coverage import Coverage, carry_over, cells_between, pace_of, travel
@@ -130,15 +129,9 @@ class ParticleSimulation(ParticleCheckpoints):
         if not (self.shared or self.band is not None or scene.endless):  # without an interior, and ends where the grid does
             self.vicinity = Vicinity(grid, self.vicinity)
         self.flights = self._flights()
-        self.rearrangement = self._rearrangement()
-        self.surface_mesh = self._surface_mesh()
+        self.rearrangement = Rearrangement(scene, grid, self.boundary)
+        self.surface_mesh = make_surface_mesh(scene, grid, self.boundary)
         self.particle_volume = make_particle_volume(scene, grid, self.boundary)
-
-    def _rearrangement(self) -> Rearrangement:
-        return Rearrangement(self.scene, self.grid, self.boundary)
-
-    def _surface_mesh(self) -> SurfaceMesh | None:
-        return make_surface_mesh(self.scene, self.grid, self.boundary)
 
     def _flights(self) -> Flights | None:
         return make_flights(self.scene, self.grid, self.boundary)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import warp as wp
 
-from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.particles_kernels import offset_kernel
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import reseeding_kernels as kernels
@@ -14,7 +15,7 @@ from warp_lcp.material.boundary import Boundary
 
 
 class Reseeding:
-    """Reseeding: sparse cells deep inside take particles from dense neighbors.
+    """Reseeding: sparse cells deep inside take particles from dense neighbors; `apply` is collective.
 
     A flow draws particles together along some streamlines and apart along others. A density correction cures the first, but voids between
     particles remain: they count as material as long as the surface does not see them, and the volume grows. A cell that no wall touches,
@@ -26,7 +27,8 @@ class Reseeding:
       interpolation errs. Angular momentum and the center of mass change with the particles' places;
     - the surface and bubbles of more than a cell: what is not full around is left alone. A whole region that is thin stays thin.
 
-    The result is the same on every run.
+    The result is the same on every run. A rank does what its cells and those beside them do, whose particles it knows as ghosts; after each
+    direction all agree about how many particles cells hold.
 
     Args:
         grid: the grid.
@@ -46,7 +48,10 @@ class Reseeding:
         self.grid, self.boundary, self.every = grid, boundary, every
         self.least, self.most, self.particles_a_cell = least, most, particles_a_cell
         self._count, self._takers = grid.field(wp.int32), wp.zeros(grid.size, dtype=wp.int32, device=grid.device)
-        self._asked = grid.domain  # cells that may take
+        low, high = grid.part.owned.low, grid.part.owned.high
+        beside = grid.window(low[::-1], [n - 1 for n in high[::-1]], grow=1).common(grid.domain)
+        assert beside is not None, "a process has cells"
+        self._asked = beside  # cells that may take: this process's, and those beside them
         self._offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
         self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)  # of takers, and of particles moved
         steps = [(-1, 0, 1) if axis < grid.dimension else (0,) for axis in (2, 1, 0)]
@@ -60,17 +65,19 @@ class Reseeding:
             window: cells that hold all particles, with two to spare on each side.
             step: number of the step, which the random part of the new places depends on.
         """
-        if not self._anywhere(particles.count):
+        part = self.grid.part
+        if not part.ranks.any(particles.count > 0):
             return 0
         grid = self.grid
-        self._sort(particles)
+        particles.arrange(SORTED)
         offsets = particles.offsets
         if offsets is None:
             offsets = self._offsets
             wp.launch(offset_kernel, grid.size + 1, [particles.key, particles.count, offsets], device=grid.device)
         self._numbers.zero_()
         window.launch(kernels.count_kernel, [offsets, self._count])
-        self._join()
+        part.fill(self._count)
+        before = self._held()
         b, s = self.boundary, kernels.ReseedingSetting()
         s.planes, s.seed, s.dx, s.inverse_dx = grid.planes, step, grid.spacing, 1.0 / grid.spacing
         s.origin, s.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
@@ -79,25 +86,24 @@ class Reseeding:
         if inside is not None:
             inside.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
         takers = int(self._numbers.numpy()[0])
-        if not self._anywhere(takers):
+        if not part.ranks.any(takers > 0):
+            particles.drop_ghosts()
             return 0
         inputs = [s, self._takers, offsets, self._count, particles.position, self._numbers]
         for direction in self._directions:
             wp.launch(kernels.exchange_kernel, takers, [wp.vec3i(*direction), *inputs], device=grid.device)
-            self._join()
-        return self._moved()
+            part.fill(self._count)
+        particles.drop_ghosts()
+        return self._moved(before)
 
-    def _anywhere(self, count: int) -> bool:
-        """Return whether there are any of what this grid has so many of."""
-        return count > 0
+    def _held(self) -> np.ndarray | None:
+        """Return how many particles the cells of a rank hold, before any has moved; None: one process counts what it moves."""
+        part = self.grid.part
+        return np.array(part.box_of(self._count.numpy())) if part.shared else None
 
-    def _sort(self, particles: Particles) -> None:
-        """Sort the particles that cells near `_asked` hold."""
-        particles.sort()
-
-    def _join(self) -> None:
-        """Give what others know of the counts of cells to this grid's."""
-
-    def _moved(self) -> int:
-        """Return how many particles have moved."""
-        return int(self._numbers.numpy()[1])
+    def _moved(self, before: np.ndarray | None) -> int:
+        """Return how many particles have moved: a rank moves ghosts, too, so that ranks count what their cells have gained."""
+        if before is None:
+            return int(self._numbers.numpy()[1])
+        part = self.grid.part
+        return int(part.ranks.sum(np.maximum(part.box_of(self._count.numpy()) - before, 0).sum()))
