@@ -27,7 +27,7 @@ from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.yield_set import F64, I32, U8
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import Rows
-from warp_lcp.rows.program import Launch, launch
+from warp_lcp.rows.program import Launch, launch, perform
 
 if typing.TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity, Walls
@@ -39,7 +39,10 @@ FIRST = {2: 2, 3: 4}  # layer of the first copy of a shear
 
 
 class SandBodies:
-    """Rigid bodies in the stress solve.
+    """Rigid bodies in the stress solve; `begin`, `prepare`, `respond` and `search` are collective.
+
+    A rank adds up what the stresses of its cells do to the bodies, their copies on edges at cuts included, and sums over ranks are the
+    force: all ranks give a body the same velocity, and so all faces of their parts.
 
     With F = - sum of rows times stresses, see `granular.body_faces`, a body leaves the solve with V = V* + rho dx^d M^-1 F. That adds
     R M^-1 R' to the matrix of the stresses: a light body's part of it is far larger than sand's own. So a step of the stresses takes it
@@ -54,19 +57,17 @@ class SandBodies:
     Args:
         grid: the grid.
         numbers: the wall's number of each body, 1 + index of its solid.
-        counted: the cells whose stresses act on the bodies here; None: all.
-        own: of the faces and edges of these, those that no one else has; None: all.
 
     Attributes:
         freedoms: k, degrees of freedom of a body.
         velocity: V of each, float64, shape (bodies, k) [m/s, 1/s]; after `Stress.residual` that which the stresses leave.
     """
 
-    def __init__(
-        self, grid: StaggeredGrid, numbers: Sequence[int], *, counted: Window | None = None, own: Window | None = None
-    ) -> None:  # fmt: skip
+    def __init__(self, grid: StaggeredGrid, numbers: Sequence[int]) -> None:
         """Allocate what does not depend on where the bodies are."""
-        self._counted, self._own = counted, own
+        part = grid.part  # the cells whose stresses act on the bodies here, and of their faces and edges those that no one else has
+        self._counted: Window | None = part.owned if part.shared else None
+        self._own: Window | None = part.faces(grid.everywhere) if part.shared else None
         self.grid, self.numbers, self.freedoms = grid, tuple(numbers), NUMBERS[grid.dimension]
         count, k, device = len(self.numbers), self.freedoms, grid.device
         self.velocity, self._force, self._start, self._error = (wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4))
@@ -74,6 +75,9 @@ class SandBodies:
         _, rows, columns = grid.shape
         self._shape = FieldShape()
         self._shape.dimension, self._shape.layer, self._shape.strides = grid.dimension, grid.size, wp.vec3i(1, columns, columns * rows)
+        self._total = wp.zeros_like(self._force)  # of all ranks
+        self._each = wp.array(np.arange(count)[:, None] + [0, 1], dtype=wp.int32, device=device)  # its entries, as `_owned` has runs
+        self._met = False  # whether sand is beside a body on some rank; else no force is asked for in the step
         self.faces: BodyFaces | None = None
         self._walls: Walls
         self._faces, self._cells, self._edges = Places(), Places(), Places()
@@ -134,9 +138,9 @@ class SandBodies:
         mass, speed = layer.numpy().T
         mass = mass * within(self.grid, self.faces.face.at, self._own)
         count = len(self.numbers)
-        self._layer_mass = self._of_all(_products(mass, rows, owner, count))
+        self._layer_mass = self._sum(_products(mass, rows, owner, count))
         momentum = [np.bincount(owner, mass * speed * row, count) for row in rows[:, 0].T]  # integers where there is no face
-        self._layer_momentum = self._of_all(np.stack(momentum, axis=1).astype(float))
+        self._layer_momentum = self._sum(np.stack(momentum, axis=1).astype(float))
         alone = inverse_mass * self._scale
         heavier = np.linalg.inv(np.eye(self.freedoms) + alone @ self._layer_mass)
         self._host_response = heavier @ alone
@@ -148,6 +152,10 @@ class SandBodies:
         active = np.zeros(1 + len(self._entries), dtype=np.int32)
         active[0], active[1 : 1 + len(held)] = len(held), held
         self._active.assign(active)
+        part = self.grid.part
+        if part.across is not None:
+            self._met = part.ranks.any(bool(packing.flags.numpy().ravel()[self._trial.numpy()].any()))
+            self._total.zero_()
 
     def forget(self, stress: StressFields) -> None:
         """Remove stresses where only the edge of a body is near."""
@@ -184,7 +192,7 @@ class SandBodies:
         steepest += _products(factor * shear_step * shear, deviator, cell.body, count)
         own = within(self.grid, edge.at, self._own)
         steepest += _products(shear_step * edges.numpy() * edge.share * own, edge.row, edge.body, count)
-        steepest = self._of_all(steepest)
+        steepest = self._sum(steepest)
         identity = np.eye(self.freedoms)
         self._correction.assign(np.linalg.inv(identity + self._host_response @ steepest))
 
@@ -210,7 +218,7 @@ class SandBodies:
         inputs = [self._shape, self._spans, stress.flatten(), self._cells, self._edges, flat_vector(packing.share), self._partial]
         if self._spans.shape[0]:
             launch(force_kernel, self._spans.shape[0], inputs, device=device)
-        inputs = [int(implicit), *self._parts_of_all(launch), self._start, self._response, self._correction]
+        inputs = [int(implicit), *self._forces(launch), self._start, self._response, self._correction]
         launch(respond_kernel, len(self.numbers), [*inputs, self._force, self._error, self.velocity], device=device)
 
     def search(self, packing: Packing, velocity: Velocity, stress: StressFields, launch: Launch) -> None:
@@ -238,13 +246,21 @@ class SandBodies:
             if len(self._edges.at):
                 launch(kernels.strain, len(self._edges.at), edges, device=device)
 
-    def _of_all(self, found: np.ndarray) -> np.ndarray:
-        """Return sums over all parts of the grid."""
-        return found
+    def _sum(self, found: np.ndarray) -> np.ndarray:
+        """Return sums over all processes."""
+        return np.asarray(self.grid.part.ranks.sum(found))
 
-    def _parts_of_all(self, launch: Launch) -> tuple[wp.array, wp.array]:
-        """Return the runs of each body, first and last, and what stresses do to the body in these."""
-        return self._owned, self._partial
+    def _forces(self, launch: Launch) -> tuple[wp.array, wp.array]:
+        """Return the runs of each body, first and last, and what stresses do to the body in these; of ranks, the sums over all."""
+        if self.grid.part.across is None:
+            return self._owned, self._partial
+        perform(self._add_up, launch)
+        return self._each, self._total
+
+    def _add_up(self) -> None:
+        if self._met:
+            mine = self._partial.numpy()
+            self._total.assign(self._sum(np.array([mine[first:last].sum(axis=0) for first, last in self._owned.numpy()])))
 
     def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
         """Return runs of the lists of cells and edges that a thread adds up, first and last of both, and each body's runs."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -15,12 +16,13 @@ from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.rows.layout import put
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch, perform
 from warp_lcp.rows.readings import Reading
 
 if TYPE_CHECKING:
     from warp_lcp.granular.cut_walls import CutWalls
 
+REACH = 2  # cells from those of a process whose stresses the velocities around these feel
 SHEARS = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # the axes of each shear
 
 
@@ -32,14 +34,14 @@ class Packing:
     with less than 0.02 are empty, those with less than 0.1 count as 0.1. A cell with phi > 0.3 beside air counts as full in the pressure's
     problem, so that a surface of partly filled cells carries a pressure, and thus friction; its mass is its own.
 
+    On ranks it is right in the box and `REACH` layers around it where the density is in all ghost layers.
+
     Args:
         grid: the grid.
         base: int8, SOLID or AIR.
         capacity: float32, share of a cell's kernel that is open.
         sides: of axes without an end, if there are any.
         cut: solids that cut cells, if there are any; `base` has those cells alone that they leave nothing of.
-        counted: the cells whose stresses are solved for; None: all of the domain.
-        known: the cells of `densest`; None: all that are stored.
 
     Attributes:
         base: that of the arguments.
@@ -59,9 +61,8 @@ class Packing:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None,
-        counted: Window | None = None, known: Window | None = None,
-    ) -> None:  # fmt: skip
+        self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None
+    ) -> None:
         self.grid, self.base, self._capacity, self.sides, self.cut = grid, base, capacity, sides, cut
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         wp.copy(self.kind, base)
@@ -73,9 +74,10 @@ class Packing:
         low, high = grid.domain.low, grid.domain.high
         more = 1 if grid.dimension == 3 else 0
         self.nodes = Window(low, (high[0] + more, high[1] + 1, high[2] + 1), grid.device)
-        self.counted = counted or grid.domain
+        self.counted = grid.part.owned
+        self._forest: Any = None  # of this step's sand, on ranks
         self.strained, self.moved, self.stressed = self._around(0, 1), self._around(1, 1), self._around(1, 2)
-        self._known = known or grid.everywhere
+        self._known = grid.part.stored
         self._rows = wp.zeros((2, *grid.shape[:2]), dtype=wp.float64, device=grid.device)  # count, largest fraction of each row
         self._found = Reading(grid.device, 2)
         self._rate = Scalar()  # dx / dt [m/s]
@@ -95,6 +97,9 @@ class Packing:
         self._rate.value = self.grid.spacing / dt
         self._update.run(density, velocity, solid, variant=tuple(field.ptr for field in (density, *velocity, *solid)))
         self._found.changed()
+        if self._forest is not None:
+            self._forest.free()
+            self._forest = None
 
     @property
     def sand_cells(self) -> int:
@@ -154,9 +159,20 @@ class Packing:
         return window.common(self.nodes) or self.nodes
 
     def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
-        """Make a field of stresses consistent with neighboring parts of the grid."""
+        """Give a field of stresses what others know of it: `REACH` layers of ghost cells, and the cells beyond periodic sides; collective.
+
+        Cells without sand have stresses of 0 on all ranks.
+        """
+        if self.grid.part.across is not None:
+            perform(partial(self._fill, stress), launch)
         if self.sides is not None:
             self.sides.wrap(stress, launch=launch)
+
+    def _fill(self, stress: wp.array) -> None:
+        part = self.grid.part
+        if self._forest is None:
+            self._forest = part.forest(stress.shape[0], REACH, which=self.flags.numpy() != 0)
+        part.fill(stress, forest=self._forest)
 
     @property
     def fields(self) -> SandFields:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import warp as wp
 
 from warp_lcp.granular.report_kernels import contact_kernel, report_pass, take_kernel
@@ -36,8 +37,10 @@ class SandReport:
         self._base = stress.packing.base if cut is None else grid.field(wp.int8)  # no face inside a solid that cuts cells is left unknown
 
     def take(self, velocity: Sequence[wp.array]) -> None:
-        """Give the faces that stresses act on the velocity that they leave [m/s], and find `known` and `contact`."""
+        """Give the faces that stresses act on the velocity that they leave [m/s], and find `known` and `contact`; collective."""
         self._taking.run(velocity, variant=tuple(field.ptr for field in velocity))
+        packing = self.stress.packing
+        packing.grid.part.fill(*velocity, *self.known, self.contact, packing.kind, self.stress.now[0])
 
     def _launch_taking(self, velocity: Sequence[wp.array]) -> None:
         stress, packing = self.stress, self.stress.packing
@@ -48,7 +51,7 @@ class SandReport:
         packing.grid.domain.launch(contact_kernel, inputs)
 
     def report(self, mass: float) -> Row:
-        """Return figures of the last solve.
+        """Return figures of the last solve; collective.
 
         yielded: share of the cells that carry shear whose friction is at its bound; dissipation: what friction takes, never negative but
         for the solve's residual [J; J/m in 2-D]; predicted_excess: by how much a cell's fraction would exceed 1 after the step, at most.
@@ -67,4 +70,7 @@ class SandReport:
 
     def _found(self) -> list[float]:
         """Return how many cells carry shear, how many have yielded, what friction takes and the largest excess."""
-        return self._report.read()
+        part = self.stress.packing.grid.part
+        part.fill(self.ratio)
+        every = part.ranks.gather(np.array(self._report.read()))
+        return [*every[:, :3].sum(axis=0).tolist(), float(every[:, 3].max())]

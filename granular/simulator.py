@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,18 +92,12 @@ class SandSimulation(ParticleSimulation):
         self._completion, self._density_to_grid = (
             LaunchGraph(grid.device, record, at_once=self.shared) for record in (self._launch_completion, self._launch_density)
         )
-        self.packing = self._packing()
-        self.carried = None if self.bodies is None else self._carried(self.bodies.numbers)
+        self.packing = Packing(grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
+        self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress, self.outcome = self._stresses(box=box, rate=rate, bodies=self.carried)
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
-
-    def _carried(self, numbers: Sequence[int]) -> SandBodies:
-        return SandBodies(self.grid, numbers)
-
-    def _packing(self) -> Packing:
-        return Packing(self.grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
 
     def _stresses(self, **settings: Any) -> tuple[Stress, SandReport]:
         stress = Stress(self.packing, self.solids.walls, **settings)

@@ -118,7 +118,7 @@ def list_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
 
 
 class SandSolids:
-    """Solids and the domain's walls, as whole cells with friction.
+    """Solids and the domain's walls, as whole cells with friction. Making it, `place` and `begin_step` are collective.
 
     A cell belongs to a solid if its center lies inside. Particles move among the surfaces of `boundary`, which may cut cells.
 
@@ -129,7 +129,6 @@ class SandSolids:
         friction: Coulomb's coefficient of the domain's walls and of each solid.
         prescribed: keep velocities on faces even if nothing moves: sources prescribe some.
         cuts: let solids that stand still cut cells for the stresses too, if `boundary` has them so.
-        counted: cells whose walls these are; None: all.
 
     Attributes:
         cut: what they leave open and where they rub; None: they are whole cells.
@@ -143,9 +142,9 @@ class SandSolids:
 
     def __init__(
         self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *,
-        prescribed: bool = False, cuts: bool = False, counted: Window | None = None,
+        prescribed: bool = False, cuts: bool = False,
     ) -> None:  # fmt: skip
-        self._counted = counted
+        self._counted = grid.part.owned if grid.part.shared else None  # cells whose walls these are; None: all
         self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
         self.base, self.index = grid.field(wp.int8), grid.field(wp.int32)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
@@ -175,7 +174,9 @@ class SandSolids:
         found = voxelize(grid, now, wall_separating=True, open_sides=self._boundary.open_sides, remarks=False)
         self._covered = found.covered
         wp.copy(self.index, found.index)
-        self._join(self.index)
+        if self._boundary.sides is not None:
+            self._boundary.sides.wrap(self.index)
+        grid.part.fill(self.index)
         grid.everywhere.launch(kernels.base_kernel, [self.index, self.base])
         cells = self.index.numpy()
         if self.cut is not None:  # the domain's walls alone are whole cells
@@ -186,20 +187,12 @@ class SandSolids:
             rubbing = not self.moves
             self._cells, self.walls = cells.copy(), Walls(grid, cells, self._friction, rubbing_only=rubbing, counted=self._counted)
 
-    def _join(self, index: wp.array) -> None:
-        """Bring the walls' numbers to where they are told by other cells."""
-        if self._boundary.sides is not None:
-            self._boundary.sides.wrap(index)
-
-    def _covers(self) -> list[int]:
-        """Return how many cells' centers each solid holds."""
-        return [int(cells) for cells in self._covered]
-
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid that stands still and that no stress feels."""
+        covered = self.grid.part.ranks.sum(np.array([*self._covered, 0]))[:-1]  # cells' centers that each solid holds
         return tuple(
             f"{solid.name} contains no center of a cell of {self.grid.spacing:.4g} m: it supports no sand, and particles may pass through"
-            for solid, cells in zip(self._placed, self._covers(), strict=True)
+            for solid, cells in zip(self._placed, covered.tolist(), strict=True)
             if self.cut is None and not cells and solid.motion is None
         )
 
@@ -216,6 +209,8 @@ class SandSolids:
         self._boundary.begin_step(time, dt)
         if self.velocity:
             self._setting.run()
+            if self.moves and self.grid.part.joined:
+                self.grid.part.fill(*self.velocity)  # where an axis without an end has led them around
 
     def _launch_velocity(self) -> None:
         """Launch what sets the velocity of the solids' faces."""

@@ -12,8 +12,8 @@ from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.sources import SharedSources
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.distributed.simulation import DistributedSand
-from warp_lcp.granular.distributed.solids import SharedSandSolids
 from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.solids import SandSolids
 from warp_lcp.material.particle_assembly import Parts, make_bodies, make_outlets, make_sources, placed_solids
 from warp_lcp.scene.scene import Scene
 
@@ -41,7 +41,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
 
     def make_parts(part: Subdomain) -> Parts:
         boundary, notes = boundary_of_part(scene, part, placed)
-        solids = SharedSandSolids(part, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source), cuts=True)
+        solids = SandSolids(part.grid, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source), cuts=True)
         warnings[:] = [*notes, *solids.notes]
         return Parts(boundary, make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part)), solids=solids)
 

@@ -11,8 +11,8 @@ import warp as wp
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.particles import SharedParticles
-from warp_lcp.granular.distributed.bodies import SharedSandBodies
-from warp_lcp.granular.distributed.stress import SharedPacking, SharedReport, SharedStress
+from warp_lcp.granular.distributed.stress import SharedStress
+from warp_lcp.granular.report import SandReport
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation, percentile_place
 from warp_lcp.grid.staggered import Window
@@ -35,16 +35,9 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
         super().__init__(*arguments, **more)
         self.balance = Balance(fixed=STEP)
 
-    def _carried(self, numbers: Sequence[int]) -> SharedSandBodies:
-        return SharedSandBodies(self.part, numbers)
-
-    def _packing(self) -> SharedPacking:
-        return SharedPacking(self.part, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
-
-    def _stresses(self, **settings: Any) -> tuple[SharedStress, SharedReport]:
-        assert isinstance(self.packing, SharedPacking)
+    def _stresses(self, **settings: Any) -> tuple[SharedStress, SandReport]:
         stress = SharedStress(self.part, self.packing, self.solids.walls, **settings)
-        return stress, SharedReport(self.part, stress)
+        return stress, SandReport(stress)
 
     def mark(self) -> None:
         """Find the sand's cells, as frames show them before the first step."""

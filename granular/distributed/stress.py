@@ -8,61 +8,19 @@ residual come from are sums of all ranks; the momentum changes by them once a pe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.halo import StarForest
 from warp_lcp.distributed.subdomain import Subdomain
-from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.report import SandReport
+from warp_lcp.granular.packing import REACH, Packing
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_kernels import PERIOD
 from warp_lcp.granular.yield_set import COLUMNS
-from warp_lcp.grid.staggered import Window
-from warp_lcp.rows.program import Launch, launch, perform
-
-REACH = 2  # cells from the box whose stresses the velocities around it feel
-
-
-class SharedPacking(Packing):
-    """How densely sand lies on a rank's part, right in the box and `REACH` layers around it where the density is in all ghost layers.
-
-    Args:
-        part: where this rank works.
-        base: as of `Packing`.
-        capacity: likewise.
-        more: likewise.
-    """
-
-    def __init__(self, part: Subdomain, base: wp.array, capacity: wp.array, **more: Any) -> None:
-        self._part = part
-        self._forest: StarForest | None = None  # of this step's sand
-        slices = part.known.slices
-        known = Window.of([axis.start for axis in slices], [axis.stop for axis in slices], part.grid.device)
-        super().__init__(part.grid, base, capacity, counted=part.owned, known=known, **more)
-
-    def update(self, *arguments: Any) -> None:
-        """Take sand as it is now, see the base class."""
-        super().update(*arguments)
-        if self._forest is not None:
-            self._forest.free()
-            self._forest = None
-
-    def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
-        """Fill the ghost cells of a field of stresses that hold sand; in others they are 0. Collective."""
-        perform(partial(self._fill, stress), launch)
-        super().join(stress, launch=launch)
-
-    def _fill(self, stress: wp.array) -> None:
-        part = self._part
-        if self._forest is None and part.ranks.size > 1:
-            self._forest = part.forest(stress.shape[0], REACH, which=self.flags.numpy() != 0)
-        part.fill(stress, forest=self._forest)
+from warp_lcp.rows.program import Launch, perform
 
 
 class SharedStress(Stress):
@@ -77,7 +35,7 @@ class SharedStress(Stress):
 
     shared = True
 
-    def __init__(self, part: Subdomain, packing: SharedPacking, walls: Walls, **more: Any) -> None:
+    def __init__(self, part: Subdomain, packing: Packing, walls: Walls, **more: Any) -> None:
         self._part = part
         super().__init__(packing, walls, **more)
         self._total, self._nothing = wp.zeros_like(self._sums), wp.zeros_like(self._sums)
@@ -120,26 +78,3 @@ class SharedStress(Stress):
 
     def _share_sums(self) -> None:
         self._total.assign(self._part.ranks.sum(self._sums.numpy()))
-
-
-class SharedReport(SandReport):
-    """Takes over what a solve of all ranks leaves; `take` and `report` are collective.
-
-    Args:
-        part: where this rank works.
-        stress: the stresses.
-    """
-
-    def __init__(self, part: Subdomain, stress: SharedStress) -> None:
-        self._part = part
-        super().__init__(stress)
-
-    def take(self, velocity: Sequence[wp.array]) -> None:
-        """Give the faces of the part the velocity that the stresses leave, those of the ghost layers by other ranks."""
-        super().take(velocity)
-        self._part.fill(*velocity, *self.known, self.contact, self.stress.packing.kind, self.stress.now[0])
-
-    def _found(self) -> list[float]:
-        self._part.fill(self.ratio)
-        every = self._part.ranks.gather(np.array(super()._found()))
-        return [*every[:, :3].sum(axis=0).tolist(), float(every[:, 3].max())]

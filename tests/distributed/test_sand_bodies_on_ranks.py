@@ -9,7 +9,6 @@ from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.distributed.bodies import SharedSandBodies
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.yield_set import NUMBERS
@@ -57,9 +56,9 @@ def test_every_cell_and_edge_acts_on_a_body_once(dimension: int, size: int) -> N
     }
     centers, numbers = random.uniform(0.3, 1.3, (3, 3)), (1, 2, 3)
 
-    def packed(grid: StaggeredGrid, index: np.ndarray, **counted) -> Packing:
+    def packed(grid: StaggeredGrid, index: np.ndarray) -> Packing:
         base = wp.array(np.where(index >= 0, SOLID, 0), dtype=wp.int8)
-        return Packing(grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32), **counted)
+        return Packing(grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32))
 
     def work(seat: Seat) -> list[np.ndarray]:
         boxes = Decomposition(grid.counts, Ranks(seat))
@@ -67,7 +66,7 @@ def test_every_cell_and_edge_acts_on_a_body_once(dimension: int, size: int) -> N
         here = tuple(slice(low, low + n) for low, n in zip(part.grid.origin[::-1], part.grid.shape, strict=True))
         mine = {name: np.ascontiguousarray(values[(..., *here)]) for name, values in fields.items()}
         cells = np.ascontiguousarray(index[here])
-        return answers(SharedSandBodies(part, numbers), packed(part.grid, cells, counted=part.owned), cells, centers, mine)
+        return answers(SandBodies(part.grid, numbers), packed(part.grid, cells), cells, centers, mine)
 
     expected = answers(SandBodies(grid, numbers), packed(grid, index), index, centers, fields)
     for found in on_ranks(size, work):

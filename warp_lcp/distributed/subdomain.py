@@ -64,7 +64,7 @@ class Subdomain(GridPart):
 
     def __init__(self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int) -> None:
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
-        self.ranks, self.box = decomposition.ranks, decomposition.box
+        self.ranks, self.box, self.joined = decomposition.ranks, decomposition.box, tuple(decomposition.joined)
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
         for axis in decomposition.cut_axes:
@@ -94,6 +94,12 @@ class Subdomain(GridPart):
     def owned(self) -> Window:
         """The cells of the box."""
         return self._owned
+
+    @property
+    def stored(self) -> Window:
+        """Stored cells that this rank is the one to know: those of the box and the ring beyond the domain's sides."""
+        known = self.known
+        return Window.of(known.low[::-1], known.high[::-1], self.grid.device)
 
     @property
     def first(self) -> tuple[int, int, int]:

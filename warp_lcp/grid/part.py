@@ -56,11 +56,13 @@ class GridPart:
         grid: as given.
         ranks: the processes that work on the grid.
         shared: whether there may be others.
+        joined: axes without an end that are cut, along which another process goes on beyond the domain's sides.
         cuts: has bit n set if beyond side n of the part, see `warp_lcp.grid.sides`, another process goes on.
     """
 
     shared: ClassVar[bool] = False
     cuts = 0
+    joined: tuple[int, ...] = ()
     ranks: Any = OneProcess()
 
     def __init__(self, grid: StaggeredGrid) -> None:
@@ -77,6 +79,11 @@ class GridPart:
         return self.grid.domain
 
     @property
+    def stored(self) -> Window:
+        """Stored cells that this process is the one to know: the owned ones, and the ring beside them at the domain's sides."""
+        return self.grid.everywhere
+
+    @property
     def first(self) -> tuple[int, int, int]:
         """The first of them along x, y, z, counted from 0 in the whole domain."""
         return self.grid.origin
@@ -85,13 +92,14 @@ class GridPart:
         """Return the process that owns each cell (x, y, z) of the whole domain, shape (n, 3)."""
         return np.zeros(len(cells), dtype=np.int64)
 
-    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1) -> None:
+    def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: Any = None) -> None:
         """Fill the ghost cells of fields with what other processes know (halo exchange); collective.
 
         Args:
             fields: any types, or stacks of equally many layers, the last axes z, y, x.
             width: how far from the owned cells; None: all.
             parts: the fields are of `grid.refined(parts)`.
+            forest: of `forest`, for such fields; None: all cells.
         """
 
     def faces(self, window: Window) -> Window:
@@ -106,6 +114,15 @@ class GridPart:
         """Return the view of a field, host or device, or of layers of one, on the owned cells."""
         low, high = self.owned.low, self.owned.high
         return field[(slice(None),) * (field.ndim - 3) + tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+
+    def forest(self, layers: int = 1, width: int | None = None, *, which: np.ndarray | None = None) -> Any:
+        """Return what `fill` exchanges of some cells alone, to be freed by the caller; collective.
+
+        Args:
+            layers: of a field.
+            width: how far from the owned cells; None: all.
+            which: of a field's cells, bool; None: all.
+        """
 
     def box_like(self, field: wp.array) -> wp.array:
         """Return the field that a problem on the owned cells has in place of a field: itself if it has no ghost cells."""
