@@ -88,11 +88,22 @@ class Column:
     """
 
     def __init__(self, capacity: int, count: int, device: wp.Device) -> None:
+        self._host: np.ndarray | None = None
         if device.is_cpu:  # NumPy's zeros take no memory before a particle has been there
-            self.store = wp.array(np.zeros((capacity, 3), dtype=np.float32), dtype=wp.vec3, device=device, copy=False)
+            self._host = np.zeros((capacity, 3), dtype=np.float32)
+            self.store = wp.array(self._host, dtype=wp.vec3, device=device, copy=False)
         else:
             self.store = wp.zeros(capacity, dtype=wp.vec3, device=device)
         self.view = self.store[:count]
+
+    def set_from(self, first: int, values: np.ndarray | float) -> None:
+        """Set the vectors in use from a number on: shape (count - first, 3), or one number for all."""
+        if self._host is not None:
+            self._host[first : len(self.view)] = values
+        elif isinstance(values, np.ndarray):
+            self.view[first:].assign(np.ascontiguousarray(values, dtype=np.float32))
+        else:
+            self.view[first:].fill_(values)
 
 
 class Particles:
@@ -135,6 +146,9 @@ class Particles:
         self._tally, columns, device = None, len(kernels.TOTAL.found), grid.device
         launches = self._launch_totals, self._launch_numbers, self._launch_sort
         self._totals, self._numbering, self._sorting = (LaunchGraph(device, launch) for launch in launches)
+        self._removal = LaunchGraph(device, self._launch_removal, at_once=device.is_cuda)  # a scan of Warp's
+        self._removed = Reading(device, 2, wp.int32)
+        self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None  # of the memory and the count that they are for
         self._total_rows = rows_memory(device, LIST_ROOM)
         if device.is_cuda:
             self._tally = Tally(kernels.TOTAL, device, CUDA_THREADS)
@@ -200,13 +214,12 @@ class Particles:
             return
         before = self.count
         self._resize(before + len(position))
-        for name, host in (("position", position), ("velocity", velocity)):
-            self._columns[name].view[before:].assign(np.ascontiguousarray(host, dtype=np.float32))
-        if self.kept is not None:
-            numbers = np.broadcast_to(np.float32(1.0) if kept is None else np.asarray(kept, dtype=np.float32), len(position))
-            self.kept[before:].assign(np.ascontiguousarray(np.repeat(numbers[:, None], 3, axis=1)))
-        for gradient in self.affine:
-            gradient[before:].zero_()  # sorting may have left anything behind the particles in use
+        for name, column in self._columns.items():
+            if name == "kept":
+                numbers = np.broadcast_to(np.float32(1.0) if kept is None else np.asarray(kept, dtype=np.float32), len(position))
+                column.set_from(before, np.repeat(numbers[:, None], 3, axis=1))
+            else:  # sorting may have left anything behind the particles in use
+                column.set_from(before, {"position": position, "velocity": velocity}.get(name, 0.0))
 
     def make_room(self, count: int) -> int:
         """Add particles at the end and return the index of the first.
@@ -220,7 +233,11 @@ class Particles:
     @property
     def marks(self) -> wp.array:
         """Scratch memory for `remove`, int32, shape (count,)."""
-        return self._order[self._capacity : self._capacity + self.count]
+        memory = self._order.ptr, self.count
+        if self._marks[0] != memory:
+            self._marks = memory, self._order[self._capacity : self._capacity + self.count]
+            self._memory.take(self.count, {"marks": self._marks[1]})
+        return self._marks[1]
 
     def remove(self, marks: wp.array) -> int:
         """Remove particles in place; the others keep their order.
@@ -235,17 +252,45 @@ class Particles:
         """
         if self.count == 0:
             return 0
-        device, stay = self.grid.device, self._order[: self.count]
-        wp.launch(kernels.stays_kernel, self.count, [marks, stay], device=device)
-        wp.utils.array_scan(stay, stay, inclusive=True)
-        left = int(stay[self.count - 1 :].numpy()[0])
-        removed = self.count - left
-        if removed:
-            for name, column in self._columns.items():
-                wp.launch(kernels.close_ranks_kernel, self.count, [marks, stay, column.view, self._spare.view], device=device)
-                self._columns[name], self._spare = self._spare, column
-            self._resize(left)
-        return removed
+        self.launch_removal(marks)
+        return sum(self.finish_removal(marks))
+
+    def launch_removal(self, marks: wp.array) -> None:
+        """Launch `remove`, or record it; `finish_removal` then ends it. There are particles."""
+        self._removal.run(marks)
+
+    def _launch_removal(self, marks: wp.array) -> None:
+        device = self.grid.device
+        if device.is_cuda:
+            stay = self._order[: self.count]
+            self._removed.array.zero_()
+            wp.launch(kernels.stays_kernel, self.count, [marks, stay, self._removed.array], device=device)
+            wp.utils.array_scan(stay, stay, inclusive=True)
+            return
+        columns = dict.fromkeys(("affine_0", "affine_1", "affine_2", "kept")) | self.arrays()
+        counted: dict[str, typing.Any] = {"removed": self._removed.array, "marks": marks, "count": self._memory.count}
+        kernels.CLOSE_RANKS.bind(Rows.entries(1, device), **counted, **columns).launch()
+
+    def finish_removal(self, marks: wp.array) -> tuple[int, int]:
+        """End the removal that has been launched.
+
+        Args:
+            marks: those it was launched with.
+
+        Returns:
+            How many particles with the mark 1 were removed, and how many with another.
+        """
+        self._removed.changed()
+        first, others = self._removed.numpy().tolist()
+        if first + others:
+            if self.grid.device.is_cuda:
+                stay = self._order[: self.count]
+                for name, column in self._columns.items():
+                    inputs = [marks, stay, column.view, self._spare.view]
+                    wp.launch(kernels.close_ranks_kernel, self.count, inputs, device=self.grid.device)
+                    self._columns[name], self._spare = self._spare, column
+            self._resize(self.count - first - others)
+        return first, others
 
     def move_to(self, grid: StaggeredGrid) -> None:
         """Sort the particles by the cells of another grid from now on."""
