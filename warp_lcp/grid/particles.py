@@ -15,7 +15,7 @@ from warp_lcp.grid.particle_loops import CPU_GRAIN, LIST_ROOM, MARGIN, ListMemor
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.memory import RowsMemory, Scalar, rows_memory
+from warp_lcp.rows.memory import RowsMemory, Scalar, Slot, rows_memory
 from warp_lcp.rows.program import LaunchGraph, call
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
@@ -84,8 +84,13 @@ class Column:
 
     Attributes:
         store: wp.vec3, shape (capacity,).
-        view: the part in use, shape (count,).
+        count: vectors in use.
+        slot: where recorded launches find them; None: not yet known.
+        listed: their number, for recorded launches.
     """
+
+    slot: Slot | None = None
+    listed: ListMemory
 
     def __init__(self, capacity: int, count: int, device: wp.Device) -> None:
         self._host: np.ndarray | None = None
@@ -94,12 +99,34 @@ class Column:
             self.store = wp.array(self._host, dtype=wp.vec3, device=device, copy=False)
         else:
             self.store = wp.zeros(capacity, dtype=wp.vec3, device=device)
-        self.view = self.store[:count]
+        self._view: wp.array | None = None
+        self.count = count
+
+    @property
+    def view(self) -> wp.array:
+        """The part in use, shape (count,)."""
+        if self._view is None:
+            self._view = self.store[: self.count]
+            if self.slot is not None:
+                self._view.slot, self._view.listed = self.slot, self.listed
+        return self._view
+
+    def use(self, count: int) -> None:
+        """Have so many vectors in use."""
+        if count != self.count:
+            self.count, self._view = count, None
+
+    def publish(self, memory: ListMemory, name: str) -> None:
+        """Have recorded launches find the vectors in use by a name."""
+        self.slot, self.listed = memory.slot(name), memory
+        self.slot.point_to_first(self.count, self.store)
+        if self._view is not None:
+            self._view.slot, self._view.listed = self.slot, memory
 
     def set_from(self, first: int, values: np.ndarray | float) -> None:
         """Set the vectors in use from a number on: shape (count - first, 3), or one number for all."""
         if self._host is not None:
-            self._host[first : len(self.view)] = values
+            self._host[first : self.count] = values
         elif isinstance(values, np.ndarray):
             self.view[first:].assign(np.ascontiguousarray(values, dtype=np.float32))
         else:
@@ -316,19 +343,21 @@ class Particles:
         if count > self._capacity:
             self._grow(before)
         for column in (*self._columns.values(), self._spare):
-            column.view = column.store[:count]
+            column.use(count)
         self._publish()
 
     def _publish(self) -> None:
         """Tell recorded launches how many particles there are, and where."""
-        if self.count != self._memory.count.value:
+        count, memory = self.count, self._memory
+        if count != memory.count.value and self._tally is not None:
             self._total_rows.take(self._rows_of_totals().summed)
-        if self._tally is None and self.count != self._memory.count.value:
-            self._places.value = self._rows_of_totals().places
-            pieces = _rows_of_sort(self.count, self.grid.device)
-            self._sort_rows.take(pieces.single)
-            self._sort_pieces.value = pieces.places
-        self._memory.take(self.count, {**self.arrays(), "key": self.key, "spare": self._spare.view})
+        elif count != memory.count.value:
+            self._places.value = self._total_rows.take_entries(count, _chunk_of_totals(count, self.grid.device))
+            self._sort_pieces.value = self._sort_rows.take_entries(count, _piece_of_sort(count))
+        for name, column in self._columns.items():
+            column.publish(memory, name)
+        self._spare.publish(memory, "spare")
+        memory.take(count, {"key": self.key})
 
     def _grow(self, before: int) -> None:
         """Make room for `count` particles and more, and keep those there were `before`."""
@@ -446,9 +475,7 @@ class Particles:
 
     def _rows_of_totals(self) -> Rows:
         """Return how the particles are shared out for sums over them."""
-        device = self.grid.device
-        chunk = max(CUDA_CHUNK if device.is_cuda else CHUNK, -(-self.count // (CUDA_THREADS if device.is_cuda else THREADS)))
-        return Rows.entries(self.count, device, chunk)
+        return Rows.entries(self.count, self.grid.device, _chunk_of_totals(self.count, self.grid.device))
 
     def _launch_totals(self) -> None:
         """Launch the sums over the particles, and those of the threads' sums."""
@@ -497,9 +524,19 @@ class Particles:
         return {name: column.view for name, column in self._columns.items()}
 
 
+def _chunk_of_totals(count: int, device: wp.Device) -> int:
+    """Return how many particles a thread adds up."""
+    return max(CUDA_CHUNK if device.is_cuda else CHUNK, -(-count // (CUDA_THREADS if device.is_cuda else THREADS)))
+
+
+def _piece_of_sort(count: int) -> int:
+    """Return how many keys are a piece of those that are sorted."""
+    return max(CPU_GRAIN, -(-count // SORT_PIECES))
+
+
 def _rows_of_sort(count: int, device: wp.Device) -> Rows:
     """Return the pieces in which keys are sorted."""
-    return Rows.entries(count, device, max(CPU_GRAIN, -(-count // SORT_PIECES)), weight=4)
+    return Rows.entries(count, device, _piece_of_sort(count), weight=4)
 
 
 def _halves(array: wp.array) -> tuple[wp.array, wp.array]:

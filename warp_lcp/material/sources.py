@@ -105,8 +105,10 @@ class Sources:
         self._running: list[bool] | None = None  # what the device knows of it
         self._imposing, self._counting = (LaunchGraph(device, record) for record in (self._impose, self._count))
         self._entering = LaunchGraph(device, self._enter)
-        self._span = wp.zeros(14, dtype=wp.float64, device=device)  # see `sources.h`
-        self._lattice, self._points = ListMemory(device), dict.fromkeys(("entries", "slot", "filled", "point"), zeros(0, wp.int32, device))
+        self._span_on_host = np.zeros(14)  # see `sources.h`
+        self._span = wp.array(self._span_on_host, dtype=wp.float64, device=device, copy=device.is_cuda)
+        self._lattice = ListMemory(device)
+        self._points, self._found = dict.fromkeys(("entries", "slot", "filled", "point"), zeros(0, wp.int32, device)), list[np.ndarray]()
 
     def top_speed(self, time: float, span: float) -> float:
         """Return the largest speed of sources that run in a time span [m/s].
@@ -217,12 +219,13 @@ class Sources:
         counts = high - low
         self._reserve(int(counts.prod()))
         span = np.concatenate([*ways, low, counts[:2]])
-        if self.grid.device.is_cpu:
-            self._span.numpy()[:] = span
-        else:
+        self._span_on_host[:] = span
+        if self.grid.device.is_cuda:
             self._span.assign(span)
         self._entering.run(number)
-        entries, slot, filled, points = (array.numpy()[: int(self._lattice.count.value)] for array in self._points.values())
+        if self.grid.device.is_cuda:
+            self._found = [array.numpy() for array in self._points.values()]
+        entries, slot, filled, points = (array[: int(self._lattice.count.value)] for array in self._found)
         which = np.flatnonzero(entries | filled if starts else entries)
         return slot[which], entries[which], filled[which] * starts, points[which]
 
@@ -241,7 +244,10 @@ class Sources:
             for name in self._points:
                 kind = wp.vec3 if name == "point" else wp.int32
                 self._points[name] = wp.zeros(int(GROWTH * count), dtype=kind, device=self.grid.device)
-        self._lattice.take(count, self._points)
+            self._lattice.take(count, self._points)
+            if self.grid.device.is_cpu:
+                self._found = [array.numpy() for array in self._points.values()]  # the same memory
+        self._lattice.resize(count)
 
     def _new(self, held: np.ndarray, slot: np.ndarray, entries: np.ndarray, filled: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return where particles come in [m], of the points of `_entered`: if the source starts, those that fill cells are among them.
