@@ -1,5 +1,6 @@
 """Sources, drains and open sides: inflow at a given velocity, and outflow."""
 
+import math
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -105,6 +106,7 @@ class Sources:
         self._running: list[bool] | None = None  # what the device knows of it
         self._imposing, self._counting = (LaunchGraph(device, record) for record in (self._impose, self._count))
         self._entering = LaunchGraph(device, self._enter)
+        self._nothing = *(np.zeros(0, dtype=np.int32) for _ in range(3)), np.zeros((0, 3), dtype=np.float32)
         self._span_on_host = np.zeros(14)  # see `sources.h`
         self._span = wp.array(self._span_on_host, dtype=wp.float64, device=device, copy=device.is_cuda)
         self._lattice = ListMemory(device)
@@ -210,23 +212,24 @@ class Sources:
         """
         box, until = self._boxes[number], min(now, self.sources[number].stop)
         if box is None:
-            return np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
+            return self._nothing
         distance, ways = self.grid.spacing / self.per_axis, [self._way(number, time) for time in (since, until, now)]
-        low = np.floor((box[0] - np.maximum(*ways[:2])) / distance) - 1
-        high = np.ceil((box[1] - np.minimum(*ways[:2])) / distance) + 1
-        if self.grid.dimension == 2:
-            low[2], high[2] = 0.0, 1.0
-        counts = high - low
-        self._reserve(int(counts.prod()))
-        span = np.concatenate([*ways, low, counts[:2]])
-        self._span_on_host[:] = span
+        low, counts = [0.0] * 3, [1] * 3
+        for axis in range(self.grid.dimension):
+            begin, end = ways[0][axis], ways[1][axis]
+            low[axis] = math.floor((box[0][axis] - max(begin, end)) / distance) - 1.0
+            counts[axis] = int(math.ceil((box[1][axis] - min(begin, end)) / distance) + 1.0 - low[axis])
+        self._reserve(math.prod(counts))
+        self._span_on_host[:] = (*ways[0], *ways[1], *ways[2], *low, *counts[:2])
         if self.grid.device.is_cuda:
-            self._span.assign(span)
+            self._span.assign(self._span_on_host)
         self._entering.run(number)
         if self.grid.device.is_cuda:
             self._found = [array.numpy() for array in self._points.values()]
         entries, slot, filled, points = (array[: int(self._lattice.count.value)] for array in self._found)
         which = np.flatnonzero(entries | filled if starts else entries)
+        if not len(which):
+            return self._nothing
         return slot[which], entries[which], filled[which] * starts, points[which]
 
     def _enter(self, number: int) -> None:
@@ -264,16 +267,17 @@ class Sources:
         points = np.repeat(points, new, axis=0)
         return points[self.boundary.admits(points)] if len(points) else points
 
-    def _way(self, number: int, time: float) -> np.ndarray:
+    def _way(self, number: int, time: float) -> list[float]:
+        """Return how far a source's lattice has moved at a time [m]."""
         source = self.sources[number]
-        return np.asarray(source.velocity * (time - source.start), dtype=np.float64)
+        return [float(v) * (time - source.start) for v in source.velocity]
 
-    def _box(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def _box(self, cells: np.ndarray) -> tuple[list[float], list[float]] | None:
         """Return the low and the high corner [m] of cells (k, j, i); None: there are none."""
         if not len(cells):
             return None
         low, high = (corner[::-1] + np.array(self.grid.origin) for corner in (cells.min(axis=0), cells.max(axis=0) + 1))
-        return low * self.grid.spacing, high * self.grid.spacing
+        return (low * self.grid.spacing).tolist(), (high * self.grid.spacing).tolist()
 
     def _impose(self, velocity: Faces, known: Faces, cells: wp.array | None, supply: bool) -> None:
         """Launch what `supply` does, or what `hold` does."""
