@@ -11,11 +11,12 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.subdomain import Subdomain
-from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.rows.vectors import convert
 
 
@@ -39,7 +40,8 @@ class DistributedPressure(PressureProjection):
         super().__init__(part.grid, boundary, solver, **settings)
         self.part = part
         self._cells.move_to(part.owned)
-        self._projection.at_once = True  # ranks exchange halos in it
+        at_once = part.grid.device.is_cuda  # ranks exchange halos through the host
+        self._projection.at_once, self._boxing = at_once, LaunchGraph(part.grid.device, self._copy_to_box, at_once=at_once)
         if self._phi is None and not (self.shares_pockets or part.ranks.any(bool(boundary.open_sides & ~part.cuts))):
             self._shift = None  # sides at cuts are open, but not the domain's
         self._boxes: list[Any] = [None if f is None else self.part.box_like(f) for f in self._shared]
@@ -56,11 +58,10 @@ class DistributedPressure(PressureProjection):
     def _look(self, window: Window | None) -> None:
         """Solve for the cells of the box, whatever the window."""
 
-    def project(self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria) -> Projection:
-        """Take a result, and the velocity, marks and contacts of the ghost layers from other ranks."""
-        found = super().project(velocity, window, result, criteria)
+    def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array | None) -> None:
+        """Launch the projection, and take velocity, marks and contacts of the ghost layers from other ranks."""
+        super()._launch_projection(velocity, window, x)
         self.part.fill(*velocity, *self.known, self.contact)
-        return found
 
     def fluid_cells(self) -> np.ndarray:
         """Return where in the box FLUID was in the last projection, as (k, j, i) in the stored shape of the part, shape (n, 3)."""
@@ -83,7 +84,7 @@ class DistributedPressure(PressureProjection):
         self._work = self.solver.init(self._problem)
 
     def _update(self) -> None:
-        self._copy_to_box()
+        self._boxing.run()
         if self.boundary.moves:
             self._copy_open()
         self._operator.update(self._boxes[0])
@@ -109,7 +110,7 @@ class DistributedPressure(PressureProjection):
         if x.dtype is not wp.float64:  # of a method in single precision; the guess has been used
             convert(x.flatten(), self._guess.flatten())
             x = self._guess
-        wp.copy(self.part.box_of(self.pressure), x.reshape(self._rhs.shape)[1:-1, 1:-1, 1:-1])
+        self.part.take_box(self.pressure, x.reshape(self._rhs.shape))
         self.part.fill(self.pressure)
 
     def counted(self) -> int:

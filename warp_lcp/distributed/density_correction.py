@@ -15,6 +15,7 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import DirtyRegion, Window
 from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.density_correction import CROWD, DensityCorrection, DensityMonitor
+from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.rows.vectors import convert
 
 
@@ -66,7 +67,9 @@ class SharedDensityCorrection(DensityCorrection):
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         super().__init__(*settings, **more)
         self.part, self._solved = part, part.owned
-        self._preparation.at_once = self._displacing.at_once = True  # ranks exchange particles and halos in them
+        at_once = part.grid.device.is_cuda  # ranks exchange halos through the host
+        self._preparation.at_once = self._displacing.at_once = at_once
+        self._boxing = LaunchGraph(part.grid.device, self._copy_to_boxes, at_once=at_once)
         self._boxes: list[Any] = [None if f is None else part.box_like(f) for f in self._fields]
         self._cells, self._rhs, self._guess, _, _ = self._boxes
 
@@ -74,11 +77,17 @@ class SharedDensityCorrection(DensityCorrection):
     def _fields(self) -> list[Any]:
         return [self._kind, self._b, self.x, self._lower, self._shift]
 
-    def _find_density(self, particles: Particles, window: Window) -> None:
+    def _gather(self, particles: Particles) -> None:
+        super()._gather(particles)
         assert isinstance(particles, SharedParticles), "particles of ranks"
         particles.look_around()
-        super()._find_density(particles, window)
+
+    def _release(self, particles: Particles) -> None:
+        assert isinstance(particles, SharedParticles), "particles of ranks"
         particles.drop_ghosts()
+
+    def _find_density(self, particles: Particles, window: Window) -> None:
+        super()._find_density(particles, window)
         self.part.fill(self.density)
 
     def _join(self) -> None:
@@ -99,17 +108,20 @@ class SharedDensityCorrection(DensityCorrection):
         return wl.LCP(self._operator, self._rhs, 0.0 if lower is None else lower, np.inf)
 
     def _solve(self, over_full: int) -> wl.SolveResult:
-        for field, box in zip(self._fields, self._boxes, strict=True):
-            if box is not None:
-                self.part.copy_to_box(field, box)
+        self._boxing.run()
         if self.boundary.moves and self._problem is not None:
             for field, face in zip(self.boundary.open, self._faces.values(), strict=True):
                 self.part.copy_to_box(field, face)
         return super()._solve(over_full)
 
+    def _copy_to_boxes(self) -> None:
+        for field, box in zip(self._fields, self._boxes, strict=True):
+            if box is not None:
+                self.part.copy_to_box(field, box)
+
     def _take(self, x: wp.array) -> None:
         if x.dtype is not wp.float64:
             convert(x.flatten(), self._guess.flatten())
             x = self._guess
-        wp.copy(self.part.box_of(self.x), x.reshape(self._rhs.shape)[1:-1, 1:-1, 1:-1])
+        self.part.take_box(self.x, x.reshape(self._rhs.shape))
         self.part.fill(self.x, self._kind)

@@ -178,6 +178,7 @@ class SharedParticles(Particles):
             self._order_first(self._own)
             self._lying = PlaceOrder(self.place[: self._own])
         self.runs = wp.array(self._lying.runs(self.place, self._own), dtype=wp.int32, device=self.grid.device)
+        self._memory.take(self.count, {"runs": self.runs})
 
     def _order_first(self, count: int) -> None:
         """Bring the first particles into the order of their places, of which others have been added or gone."""

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.halo import StarForest, star_forest
-from warp_lcp.distributed.messages import exchange_all
+from warp_lcp.distributed.messages import exchange_all, exchanging_all
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.rows.program import is_recording, launch, perform
 
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
 
@@ -32,6 +33,27 @@ def ghost_layers(cfl: float, smoothing: int) -> int:
         smoothing: binomial passes over the level set.
     """
     return max(LAYERS, math.ceil(cfl) + 3, smoothing + 3)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.distributed.cells")
+@no_type_check
+def copy_kernel(to: wp.array3d(dtype=Any), source: wp.array3d(dtype=Any)):
+    """Copy a row of cells."""
+    k, j = wp.tid()
+    for i in range(to.shape[2]):
+        to[k, j, i] = source[k, j, i]
+
+
+for _T in (wp.int8, wp.uint8, wp.float32, wp.float64):
+    wp.overload(copy_kernel, [wp.array3d(dtype=_T), wp.array3d(dtype=_T)])
+
+
+def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
+    """Copy cells of a field to another, now or among recorded launches; both may be views."""
+    if is_recording():
+        launch(copy_kernel, to.shape[:2], [to, source], device=to.device)
+    else:
+        wp.copy(to, source)
 
 
 class Subdomain:
@@ -132,6 +154,8 @@ class Subdomain:
     def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: StarForest | None = None) -> None:
         """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
 
+        On the CPU it may be recorded among launches, which all ranks then run alike.
+
         Args:
             fields: any types, the last axes z, y, x; or the host's views of their memory, which cost less to fill often.
             width: how far from the box; None: all.
@@ -144,7 +168,11 @@ class Subdomain:
         if forest is None:
             kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
             forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
-        exchange_all(forest, [(host, host) for host in hosts])
+        pairs = [(host, host) for host in hosts]
+        if is_recording():
+            perform(exchanging_all(forest, pairs), wp.launch)
+            return
+        exchange_all(forest, pairs)
         for field, host in zip(fields, hosts, strict=True):
             if isinstance(field, wp.array) and field.device.is_cuda:
                 field.assign(host)
@@ -195,7 +223,11 @@ class Subdomain:
         """Give a field of the box what one of the part holds, if it does not share its memory."""
         view = self.stored_box_of(field)
         if view.ptr != box.ptr:
-            wp.copy(box, view)
+            copy_cells(box, view)
+
+    def take_box(self, field: wp.array, box: wp.array) -> None:
+        """Give a field of the part the cells of a field of the box."""
+        copy_cells(self.box_of(field), box[1:-1, 1:-1, 1:-1])
 
     def gathered(self, box: np.ndarray) -> np.ndarray | None:
         """Return what all ranks have of their boxes, shape (nz, ny, nx), as an array of the whole grid on the root rank; None elsewhere.

@@ -219,9 +219,10 @@ class DensityCorrection:
             contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`; None: they do not.
             share: of the displacement that particles go.
         """
-        if particles.offsets is not None:
-            particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
-        self._preparation.run(particles, window, fill, contact, variant=(window.near is None, contact is None))
+        self._gather(particles)
+        variant = window.near is None, contact is None, particles.runs is None
+        self._preparation.run(particles, window, fill, contact, variant=variant)
+        self._release(particles)
         self._over.changed()
         over_full, most = self._counts(*self._found())
         if over_full == 0:
@@ -235,6 +236,14 @@ class DensityCorrection:
         self._displacing.run(self._kept_solution(result.x))
         self._displace_particles(particles)
         return Correction(result, over_full, most)
+
+    def _gather(self, particles: Particles) -> None:
+        """Let the particles be there from which the density is found."""
+        if particles.offsets is not None:
+            particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
+
+    def _release(self, particles: Particles) -> None:
+        """Undo `_gather`, once the density is found."""
 
     def _kept_solution(self, x: wp.array) -> wp.array | None:
         """Return a solution that lies where the last one did; another, of a method in single precision, is taken here."""
