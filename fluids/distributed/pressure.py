@@ -34,6 +34,7 @@ class DistributedPressure(PressureProjection):
         settings: others, as of `PressureProjection`.
     """
 
+    _everyone: int | None = None  # unknowns of all ranks in this step, once they are asked for
     shares_pockets = False  # whether pockets between solids add to the diagonal
 
     def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
@@ -57,6 +58,7 @@ class DistributedPressure(PressureProjection):
 
     def _look(self, window: Window | None) -> None:
         """Solve for the cells of the box, whatever the window."""
+        self._everyone = None
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array | None) -> None:
         """Launch the projection, and take velocity, marks and contacts of the ghost layers from other ranks."""
@@ -115,7 +117,9 @@ class DistributedPressure(PressureProjection):
 
     def counted(self) -> int:
         """Return the number of unknowns of all ranks."""
-        return int(self.part.ranks.sum(super().counted()))
+        if self._everyone is None:
+            self._everyone = int(self.part.ranks.sum(super().counted()))
+        return self._everyone
 
     def _found(self) -> tuple[float, float]:
         """Return the sum of what all ranks have found released, and the largest outflow of others."""

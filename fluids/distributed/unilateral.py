@@ -34,3 +34,8 @@ class SharedUnilateralPressure(DistributedPressure, UnilateralPressure):
         """Return where in the box there was liquid or pressure in the last projection, as (k, j, i) in the part's stored shape."""
         cells, pressure = (self.part.box_of(field.numpy()) for field in (self.cells, self.pressure))
         return np.argwhere((cells == FLUID) | (pressure > 0.0)) + np.array(self.part.owned.low)
+
+    def counted(self) -> int:
+        """Return the number of unknowns of all ranks, of the problem, then of the projection."""
+        self._everyone = None
+        return super().counted()
