@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_lcp.fluids import forces_kernels as kernels
 from warp_lcp.fluids.wall_kernels import Walls
+from warp_lcp.grid.cell_kernel import scan
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
@@ -17,6 +18,8 @@ from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.particle_log import Row
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR, BodyMotion
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, clear
 
 if TYPE_CHECKING:
     from warp_lcp.fluids.simulator import LiquidSimulation
@@ -57,6 +60,8 @@ class WallSums:
         self.grid, self.solids, self.walls = grid, solids, walls_of(grid, boundary)
         rows = grid.shape[0] * grid.shape[1]
         self._counts, self._offsets = (wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2))
+        self._about = wp.zeros(solids, dtype=wp.vec3d, device=grid.device)
+        self._counting, self._writing = (LaunchGraph(grid.device, record) for record in (self._count, self._write))
         self._reserve(0)
 
     def take(self, kernel: wp.Kernel, window: Window, references: np.ndarray, given: Sequence[Any]) -> np.ndarray:
@@ -68,18 +73,26 @@ class WallSums:
             references: a point of each solid [m], shape (solids, 3).
             given: further arguments.
         """
-        about = wp.array(references, dtype=wp.vec3d, device=self.grid.device)
-        self._counts.zero_()
-        window.launch_rows(kernel, [self.walls, about, self._counts, None, None, None, *given])
-        wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
+        self._about.assign(references)
+        self._counting.run(kernel, window, list(given), variant=window.near is None)
         total = int(self._offsets.numpy()[-1]) + int(self._counts.numpy()[-1])
         if total == 0:
             return np.zeros((self.solids, 6))
         if total > len(self._owners):
             self._reserve(round(SPARE * total))
-        window.launch_rows(kernel, [self.walls, about, self._counts, self._offsets, self._owners, self._values, *given])
+        self._writing.run(kernel, window, list(given), variant=window.near is None)
         owners, values = self._owners.numpy()[:total], self._values.numpy()[:total]
         return np.stack([np.bincount(owners, weights=column, minlength=self.solids) for column in values.T], axis=-1)
+
+    def _count(self, kernel: wp.Kernel, window: Window, given: list[Any]) -> None:
+        """Launch the count of a kernel's entries, and find where those of each row begin."""
+        clear(self._counts)
+        window.launch_rows(kernel, [self.walls, self._about, self._counts, None, None, None, *given])
+        scan(self._counts, self._offsets, inclusive=False)
+
+    def _write(self, kernel: wp.Kernel, window: Window, given: list[Any]) -> None:
+        """Launch what writes a kernel's entries."""
+        window.launch_rows(kernel, [self.walls, self._about, self._counts, self._offsets, self._owners, self._values, *given])
 
     def launch(self, kernel: wp.Kernel, window: Window, given: Sequence[Any]) -> None:
         """Launch a kernel for what else it does; its entries are counted only."""
@@ -88,6 +101,7 @@ class WallSums:
     def _reserve(self, count: int) -> None:
         self._owners = wp.zeros(count, dtype=wp.int32, device=self.grid.device)
         self._values = wp.zeros((count, 6), dtype=wp.float64, device=self.grid.device)
+        self._writing.forget()
 
 
 class SolidForces:
@@ -118,6 +132,8 @@ class SolidForces:
         self._solids, self._dimension = tuple(solids), dimension
         self._centers = np.array([np.zeros(3), *(_center(solid.geometry, dimension) for solid in solids)])
         self.impulses, self.references = np.zeros((1 + len(solids), 6)), self._centers
+        self._kick = [Scalar() for _ in range(3)]
+        self._bodies: wp.array | None = None  # whether each solid is a rigid body, once the device is known
 
     def columns(self) -> tuple[str, ...]:
         """Return `domain_fx`, `solid0_fx` and so on, [N], and `domain_tx` and so on, [N m]; 2-D: _fx, _fy [N/m], _torque [N]."""
@@ -140,10 +156,13 @@ class SolidForces:
     def add_pressure(self, sums: WallSums, window: Window, simulation: LiquidSimulation) -> None:
         """Add what a step's pressure has given; the velocity of closed faces must be that before the projection still."""
         velocity, projection, scale = simulation.velocity, simulation.projection, simulation.scene.physics.density * sums.grid.cell_volume
-        bodies = wp.array([False, *(isinstance(s.motion, BodyMotion) for s in self._solids)], dtype=wp.uint8, device=sums.grid.device)
-        given = [bodies, simulation.boundary.touch, projection.pressure, *(*velocity, velocity[0])[:3]]
-        kick = wp.vec3(*(simulation.gravity * simulation.kick_dt))
-        self.add(sums.take(kernels.pressure_kernel, window, self.references, [*given, kick, scale]))
+        if self._bodies is None:
+            bodies = [False, *(isinstance(s.motion, BodyMotion) for s in self._solids)]
+            self._bodies = wp.array(bodies, dtype=wp.uint8, device=sums.grid.device)
+        given = [self._bodies, simulation.boundary.touch, projection.pressure, *(*velocity, velocity[0])[:3]]
+        for number, change in zip(self._kick, simulation.gravity * simulation.kick_dt, strict=True):
+            number.value = float(change)
+        self.add(sums.take(kernels.pressure_kernel, window, self.references, [*given, *self._kick, scale]))
 
     @staticmethod
     def push(bodies: RigidBodies, impulses: np.ndarray) -> None:

@@ -11,11 +11,11 @@ from warp_lcp.grid.cell_kernel import F32, F64, INTS, U8, cell_kernel
 def pressure_kernel(
     k, j, first, end, S: Walls, references: wp.array(dtype=wp.vec3d), counts: INTS, offsets: INTS, owners: INTS,
     values: wp.array2d(dtype=wp.float64), bodies: wp.array(dtype=wp.uint8), touch: U8, x: F64,
-    u: F32, v: F32, w: F32, kick: wp.vec3, scale: wp.float64,
+    u: F32, v: F32, w: F32, kick_x: float, kick_y: float, kick_z: float, scale: wp.float64,
 ):  # fmt: skip
     """Count the closed parts of faces that pressure acts on in a row, or with `values` write its impulses on them: `scale` x a share.
 
-    x is continued from a cell's center to the wall, see `warp_lcp.fluids.forces`; `kick` [m/s] is what gravity adds to velocities.
+    x is continued from a cell's center to the wall, see `warp_lcp.fluids.forces`; `kick_x`, `kick_y`, `kick_z` [m/s] are what gravity adds to velocities.
     """
     row = k * x.shape[1] + j
     begin = int(0)
@@ -27,7 +27,7 @@ def pressure_kernel(
             rise = float(0.0)
             still = int(0)
             if not S.index:
-                rise = wp.dot(wall_way(S, k, j, i), kick)
+                rise = wp.dot(wall_way(S, k, j, i), wp.vec3(kick_x, kick_y, kick_z))
                 still = standing_of(S, k, j, i)
             for n in range(2 * (S.planes + 1)):
                 axis = n >> 1

@@ -187,7 +187,9 @@ class PressureProjection:
         self._ratio_cell, self._adhesion, self._threshold, self._limit = (Scalar() for _ in range(4))
         self._counting = LaunchGraph(grid.device, lambda: self._count.take(self._cells, kind=self._unknown))
         self._preparation = LaunchGraph(grid.device, self._launch_preparation)
-        self._projection = LaunchGraph(grid.device, self._launch_projection, at_once=part.shared)  # ranks exchange halos in it
+        launches = self._launch_projection, self._copy_cells
+        self._projection, self._copying = (LaunchGraph(grid.device, f, at_once=part.at_once) for f in launches)
+        self._everyone: int | None = None  # unknowns of all processes in this step, once they are asked for
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
 
@@ -209,6 +211,7 @@ class PressureProjection:
             window: cells that hold all FLUID cells; None: all cells.
         """
         self._look(window)
+        self._everyone = None
         self._counting.run(variant=self._cells.near is None)
         self._count.changed()
         if self._problem is None and self.counted() > 0:
@@ -254,7 +257,8 @@ class PressureProjection:
         pairs = [*zip(fields, boxes, strict=True), (self._b, self._rhs), (self._start, self._guess.reshape(self._rhs.shape))]
         self._copied = [(field, box) for field, box in pairs if field is not None and part.shared]
         self._copied_faces = [(field, box) for field, box in zip(opened, faces, strict=True) if part.shared]
-        self._copy_to_boxes(whole=True)
+        self._copy_cells()
+        self._copy_faces()
         assert kind is not None
         self._operator = part.poisson(self.grid.interior(kind.numpy()), shift=shift, **dict(zip(FACES, faces, strict=False)))
         self._kinds = kind
@@ -267,7 +271,9 @@ class PressureProjection:
 
     def _update(self) -> None:
         """Take the cells, and where bodies meet them."""
-        self._copy_to_boxes(whole=self.boundary.moves)
+        self._copying.run()
+        if self.boundary.moves:
+            self._copy_faces()
         self._operator.update(self._kinds)
         if self.coupling is not None:
             self.coupling.take(self._unknown)
@@ -277,9 +283,14 @@ class PressureProjection:
         b = self.boundary
         return LiquidBoundary(self.kind, self._phi, self.grid.planes, *three_components(b.open), *three_components(b.velocity))
 
-    def _copy_to_boxes(self, *, whole: bool) -> None:
-        """Give a rank's problem what the fields of its part hold; `whole`: open fractions, too."""
-        for field, box in [*self._copied, *(self._copied_faces if whole else ())]:
+    def _copy_cells(self) -> None:
+        """Give a rank's problem what the fields of its part hold."""
+        for field, box in self._copied:
+            self.grid.part.copy_to_box(field, box)
+
+    def _copy_faces(self) -> None:
+        """Give it the faces' open fractions."""
+        for field, box in self._copied_faces:
             self.grid.part.copy_to_box(field, box)
 
     def solve(self, speed: float) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
@@ -352,7 +363,6 @@ class PressureProjection:
         variant = window.near is None, self._cells.near is None, self.jump is None
         self._projection.run(velocity, window, result.x, variant=variant)
         self._contacts.changed()
-        self.grid.part.fill(*velocity, *self.known, self.contact)
         return Projection(result, unknowns, self._found)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
@@ -367,10 +377,13 @@ class PressureProjection:
             self._cells, self._faces, FaceVelocity.of(velocity), touch=self.boundary.touch, x=self.pressure, contact=self.contact,
             threshold=self._threshold,
         )  # fmt: skip
+        self.grid.part.fill(*velocity, *self.known, self.contact)
 
     def counted(self) -> int:
         """Return the number of unknowns of the prepared problem; collective."""
-        return int(self.grid.part.ranks.sum(int(self._count.read()[0])))
+        if self._everyone is None or not self.grid.part.shared:
+            self._everyone = int(self.grid.part.ranks.sum(int(self._count.read()[0])))
+        return self._everyone
 
     def not_finite(self) -> np.ndarray:
         """Return the cells whose right-hand side is not finite, shape (n, 3); collective.

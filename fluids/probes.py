@@ -12,6 +12,8 @@ from warp_lcp.grid.cell_kernel import F32, F64, I8, interpolated
 from warp_lcp.grid.staggered import StaggeredGrid, three_components
 from warp_lcp.material.particle_log import Row
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, launch
 
 if typing.TYPE_CHECKING:
     from warp_lcp.fluids.simulator import LiquidSimulation
@@ -61,14 +63,15 @@ def depth_of(x: wp.vec3, planes: int, shape: wp.vec3i, kind: I8, phi: F32):
 @typing.no_type_check
 def probe_kernel(
     points: wp.array(dtype=wp.vec3), counts: wp.vec3i, planes: int, kind: I8, x: F64, phi: F32, u: F32, v: F32, w: F32,
-    kick: wp.vec3, up: wp.vec3, reach: wp.array(dtype=wp.vec2), values: wp.array2d(dtype=wp.float64),
+    kick_x: float, kick_y: float, kick_z: float, up: wp.vec3, reach: wp.array(dtype=wp.vec2), values: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
     """Find x [m/s], velocity [m/s] and level [cells] at points in array coordinates, in which cell i reaches from i to i + 1.
 
-    `kick` [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points against it and has length 1. The surface is
+    `kick_x`, ... [m/s] are what gravity adds to x from a cell to the next along each axis, `up` points against it and has length 1. The surface is
     looked for between two distances from the point, `reach` [cells].
     """
     t = wp.tid()
+    kick = wp.vec3(kick_x, kick_y, kick_z)
     shape = counts + wp.vec3i(2, 2, 2)
     p = points[t]
     inside = bool(True)
@@ -147,6 +150,8 @@ class Probes:
         size = math.hypot(*gravity)  # not 0 where the squares are
         self._up = -gravity / size if size > 0.0 else np.zeros(3)
         self._points = np.array([[*probe.position, 0.0][:3] for probe in probes])
+        self._grid: StaggeredGrid | None = None  # that has been measured on
+        self._kick = [Scalar() for _ in range(3)]
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the columns: NAME_pressure [Pa], NAME_level [m], NAME_vx, NAME_vy and in 3-D NAME_vz [m/s]."""
@@ -204,13 +209,22 @@ class Probes:
     def _measure(self, simulation: "LiquidSimulation") -> np.ndarray:
         """Return x [m/s], velocity [m/s] and level [cells] of each probe."""
         grid, projection, velocity = simulation.grid, simulation.projection, three_components(simulation.velocity)
-        points = wp.array((grid.to_grid(self._points) - grid.origin).astype(np.float32), dtype=wp.vec3, device=grid.device)
-        ways = self._reach(grid)
-        reach = wp.array(ways.astype(np.float32), dtype=wp.vec2, device=grid.device)
-        values = wp.zeros((len(self.probes), VALUES), dtype=wp.float64, device=grid.device)
-        fields = [projection.kind, projection.pressure, simulation.surface.phi, *velocity]
-        kick = wp.vec3(*(self.gravity * simulation.kick_dt))
-        inputs = [points, wp.vec3i(*grid.counts), grid.planes, *fields, kick, wp.vec3(*self._up), reach, values]
-        wp.launch(probe_kernel, len(self.probes), inputs, device=grid.device)
-        mine = np.asarray(values.numpy())
-        return self._joined(mine, ways, grid) if grid.part.shared else mine
+        if self._grid is not grid:
+            self._grid, self._measuring = grid, LaunchGraph(grid.device, self._launch)
+            points = (grid.to_grid(self._points) - grid.origin).astype(np.float32)
+            self._at = wp.array(points, dtype=wp.vec3, device=grid.device)
+            self._reached = self._reach(grid)
+            self._ways = wp.array(self._reached.astype(np.float32), dtype=wp.vec2, device=grid.device)
+            self._values = wp.zeros((len(self.probes), VALUES), dtype=wp.float64, device=grid.device)
+        for number, change in zip(self._kick, self.gravity * simulation.kick_dt, strict=True):
+            number.value = float(change)
+        self._measuring.run([projection.kind, projection.pressure, simulation.surface.phi, *velocity])
+        mine = np.array(self._values.numpy())
+        return self._joined(mine, self._reached, grid) if grid.part.shared else mine
+
+    def _launch(self, fields: list[wp.array | None]) -> None:
+        """Launch the search at all points."""
+        assert self._grid is not None, "the grid is known"
+        counts, up = wp.vec3i(*self._grid.counts), wp.vec3(*self._up)
+        inputs = [self._at, counts, self._grid.planes, *fields, *self._kick, up, self._ways, self._values]
+        launch(probe_kernel, len(self.probes), inputs, device=self._grid.device)

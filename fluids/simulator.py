@@ -100,7 +100,7 @@ class LiquidSimulation(ParticleSimulation):
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
         self.surface = self._surface()
-        self._surface_graph = LaunchGraph(grid.device, self._launch_surface, at_once=self.shared)
+        self._surface_graph = LaunchGraph(grid.device, self._launch_surface, at_once=self.shared and grid.device.is_cuda)
         self.tension = self._tension()
         self.projection = self._pressure()
         self.probes = self._probes()
@@ -298,7 +298,7 @@ class LiquidSimulation(ParticleSimulation):
         projection = self.projection
         with self.watch.stage("surface", self.particles.key, projection.kind):
             self.surface.begin(window)
-            self._surface_graph.run(window, variant=window.near is None)
+            self._surface_graph.run(window, variant=(window.near is None, self.particles.runs is None))
         if self.tension is not None:
             with self.watch.stage("surface tension", *self.velocity, self.tension.jump):
                 self.tension.act(self.velocity, window, projection.kind, self.kick_dt)

@@ -97,6 +97,7 @@ class UnilateralPressure(PressureProjection):
         self._begin(kick_dt)
         self._rate.value, self._ratio_cell.value = self.grid.spacing / dt, self._ratio
         self._settling.value = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
+        self._everyone = None
         self._preparation.run(velocity)
         self._count.changed()
         unknowns = self.counted()
@@ -120,7 +121,6 @@ class UnilateralPressure(PressureProjection):
         """
         self._last = self._kick
         self._projection.run(velocity, window, result.x, variant=(result.x.ptr, window.near is None))
-        self.grid.part.fill(*velocity, *self.known, self.contact)
         return Projection(result, self.counted(), self._found)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
@@ -133,6 +133,7 @@ class UnilateralPressure(PressureProjection):
             window.launch(kernels.push_kernel, inputs)
         inputs = [self._at(velocity), self._rate, self._settling, self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
         self._cells.launch_rows(kernels.contact_kernel, inputs)
+        self.grid.part.fill(*velocity, *self.known, self.contact)
 
     def _found_here(self) -> tuple[float, float]:
         rows = self._cells.rows_of(self._sums)

@@ -53,7 +53,7 @@ class WallDrag:
             D.shift = wp.array(still if boundary.wall_velocity is None else boundary.wall_velocity, dtype=wp.vec3, device=grid.device)
             D.turn = wp.zeros(len(coefficients), dtype=wp.mat33, device=grid.device)
         self._drag, self._dt = D, Scalar()
-        self._slowing = LaunchGraph(grid.device, self._slow_down)
+        self._slowing, self._keeping = LaunchGraph(grid.device, self._slow_down), LaunchGraph(grid.device, self._keep)
 
     def act(
         self, sums: WallSums, window: Window, velocity: Sequence[wp.array], projection: PressureProjection, phi: wp.array | None, dt: float,
@@ -78,6 +78,7 @@ class WallDrag:
             self._slowing.run(sums, window, velocity, projection, phi, variant=window.near is None)
             return float(self._losses.numpy().sum()), None
         impulses = np.zeros((sums.solids, 6))
+        self._keeping.run(velocity)
         for given in self._given(sums, velocity, projection, phi, apply=False):
             impulses += sums.take(drag_kernel, window, references, given)
         return float(self._losses.numpy().sum()), impulses
@@ -86,19 +87,23 @@ class WallDrag:
         self, sums: WallSums, window: Window, velocity: Sequence[wp.array], projection: PressureProjection, phi: wp.array | None
     ) -> None:
         """Launch the drag without the output of impulses."""
+        self._keep(velocity)
         for given in self._given(sums, velocity, projection, phi, apply=True):
             sums.launch(drag_kernel, window, given)
+
+    def _keep(self, velocity: Sequence[wp.array]) -> None:
+        """Launch copies of the velocity as it was, and begin with no losses."""
+        for before, field in zip(self._before, velocity, strict=True):
+            copy(before, field)
+        clear(self._losses)
 
     def _given(
         self, sums: WallSums, velocity: Sequence[wp.array], projection: PressureProjection, phi: wp.array | None, *, apply: bool
     ) -> list[list[Any]]:
-        """Keep the velocity as it was, and return what the kernel takes for each component."""
+        """Return what the kernel takes for each component."""
         D = self._drag
-        for before, field in zip(self._before, velocity, strict=True):
-            copy(before, field)
         D.walls, D.kind, D.contact, D.phi = sums.walls, projection.kind, projection.contact, phi
         D.u, D.v, D.w = three_components(self._before)
         D.known_u, D.known_v, D.known_w = three_components(projection.known)
-        clear(self._losses)
         faces = enumerate(zip(velocity, projection.known, strict=True))
         return [[D, axis, self._dt, self._mass, int(apply), field, known, self._losses] for axis, (field, known) in faces]

@@ -124,7 +124,7 @@ def test_what_the_pressure_takes_from_the_liquid_solids_get(dimension: int, soli
                 gained[axis] -= 0.5 * mass * u[beside].sum()
         fields = velocity if solids == "voxel" else [wp.zeros_like(field) for field in velocity]
         bodies = wp.zeros(3, dtype=wp.uint8, device="cpu")
-        given = [bodies, boundary.touch, x, *[*fields, fields[0]][:3], wp.vec3(), mass]
+        given = [bodies, boundary.touch, x, *[*fields, fields[0]][:3], 0.0, 0.0, 0.0, mass]
         pushed = simulation.wall_sums.take(pressure_kernel, window, np.zeros((3, 3)), given)
         assert np.abs(gained + pushed.sum(axis=0)[:3]).max() < 1e-5 * np.abs(pushed).max()
         checked.append(np.abs(pushed[:, 1]).min())

@@ -12,7 +12,7 @@ from warp_lcp.distributed.components import GROUND, joined, nodes_of
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import Window
+from warp_lcp.grid.staggered import ActiveWindow, Window
 from warp_lcp.material.flight import Flights
 
 ALONE = -1  # of a cell that belongs to nothing
@@ -32,12 +32,12 @@ class SharedFlights(Flights):
 
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         super().__init__(*settings, **more)
-        self._growing.at_once = True  # in other windows each time
         self._part, owned = part, part.owned
         low, high = owned.low[::-1], [h - 1 for h in owned.high[::-1]]
         self._beside, self._below = (part.grid.window(low, high, grow=layers) for layers in (1, 2))
         self._cuts = [self._planes(axis, side) for axis in range(part.dimension) for side in range(2) if part.cuts >> 2 * axis + side & 1]
         self._seen: Window | None = None  # of the last search; None: this rank sees nothing
+        self._window, self._around = ActiveWindow(self._beside), ActiveWindow(self._below)  # of the search
         self._row, self._shared = np.zeros(0, dtype=np.int32), 0  # of each tree, its body, -1: none; bodies that several ranks have
 
     def _planes(self, axis: int, side: int) -> list[Window]:
@@ -58,7 +58,9 @@ class SharedFlights(Flights):
             self._count.changed()
             self._found = True
             return
-        self._grow(self._seen, below, weights, kind)
+        self._window.move_to(self._seen)
+        self._around.move_to(below)
+        self._grow(self._window, self._around, weights, kind)
 
     def _bodies(self) -> int:
         """Join the trees of all ranks, and return how many bodies this rank knows: first those that several have trees of."""

@@ -182,10 +182,14 @@ class StarForest:
 
     Args:
         made: the forest, of no use when this is gone.
+
+    Attributes:
+        pairs: units and addresses of roots and leaves that recorded exchanges read, by what they hold.
     """
 
     def __init__(self, made: Any) -> None:
         self.made, self.free = made, weakref.finalize(self, made.destroy)
+        self.pairs: dict[tuple[int, ...], Any] = {}
 
 
 def star_forest(

@@ -24,16 +24,19 @@ unsigned long long* told = (unsigned long long*)told_;
 __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 typedef int Fault; typedef Fault (*Call)(void*, void*, const void*, void*, void*);
 const Call calls[2] = {(Call)begin_, (Call)end_};
+const unsigned long long* pairs = (const unsigned long long*)pairs_;
 for (int i = 0; i < 2; ++i)
-    if (!told[1]) told[1] = calls[i]((void*)forest_, (void*)unit_, (const void*)roots_, (void*)leaves_, (void*)replace_);
+    for (int p = 0; p < count; ++p)
+        if (!told[1]) {
+            const unsigned long long* pair = pairs + 3*p;
+            told[1] = calls[i]((void*)forest_, (void*)pair[0], (const void*)pair[1], (void*)pair[2], (void*)replace_); }
 __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 #endif
 """)
 def copy_to_leaves(
-    begin_: wp.uint64, end_: wp.uint64, forest_: wp.uint64, unit_: wp.uint64, roots_: wp.uint64, leaves_: wp.uint64, replace_: wp.uint64,
-    told_: wp.uint64,
+    begin_: wp.uint64, end_: wp.uint64, forest_: wp.uint64, pairs_: wp.uint64, replace_: wp.uint64, count: int, told_: wp.uint64
 ):  # fmt: skip
-    """Call PetscSFBcastBegin and PetscSFBcastEnd."""
+    """Call PetscSFBcastBegin for each pair, a unit and the addresses of roots and leaves, then PetscSFBcastEnd."""
 
 
 @wp.func_native("""
@@ -57,11 +60,10 @@ def add_of_all(
 
 @wp.kernel(enable_backward=False, module="warp_lcp.messages")
 def exchange_kernel(
-    begin: wp.uint64, end: wp.uint64, forest: wp.uint64, unit: wp.uint64, roots: wp.uint64, leaves: wp.uint64, replace: wp.uint64,
-    told: wp.uint64,
+    begin: wp.uint64, end: wp.uint64, forest: wp.uint64, pairs: wp.uint64, replace: wp.uint64, count: int, told: wp.uint64
 ):  # fmt: skip
     """Copy roots to leaves over a star forest; one thread, on the CPU."""
-    copy_to_leaves(begin, end, forest, unit, roots, leaves, replace, told)
+    copy_to_leaves(begin, end, forest, pairs, replace, count, told)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.messages")
@@ -119,10 +121,18 @@ def exchange_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarra
 
 def exchanging(forest: StarForest, roots: np.ndarray, leaves: np.ndarray) -> Operation:
     """Return `exchange` as an operation of the team."""
-    library, unit = _library(), _library().units[roots.dtype.itemsize].value
+    return exchanging_all(forest, [(roots, leaves)])
+
+
+def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Operation:
+    """Return `exchange_all` as an operation of the team."""
+    library = _library()
     functions = (ctypes.cast(call, ctypes.c_void_p).value for call in (library.begin, library.end))
-    given = [*functions, forest.made.handle, unit, roots.ctypes.data, leaves.ctypes.data, library.replace.value]
-    return _operation(exchange_kernel, given, (forest, roots, leaves))
+    listed = [(library.units[a.dtype.itemsize].value, a.ctypes.data, b.ctypes.data) for a, b in pairs]
+    key = tuple(word & (1 << 64) - 1 for pair in listed for word in pair)
+    words = forest.pairs.setdefault(key, (ctypes.c_uint64 * len(key))(*key))
+    given = [*functions, forest.made.handle, ctypes.addressof(words), library.replace.value, len(pairs)]
+    return _operation(exchange_kernel, given, (forest, words, pairs))
 
 
 def adding(comm: Any, sums: np.ndarray) -> Operation:

@@ -30,7 +30,7 @@ class SharedNarrowBand(NarrowBand):
     def __init__(self, part: Subdomain, *settings: Any, **more: Any) -> None:
         self.part = part
         super().__init__(*settings, **more)
-        self._carrying.at_once = True  # ranks exchange halos in it
+        self._carrying.at_once = part.grid.device.is_cuda  # ranks exchange halos through the host
         self._own, self._before = part.owned, part.grid.origin
         self._first = NEW  # place of fresh particles
 

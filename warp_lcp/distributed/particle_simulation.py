@@ -165,11 +165,9 @@ class SharedParticleSimulation(ParticleSimulation):
             self.restore_bodies()
             raise
 
-    def particles_to_grid(self, window: Window) -> None:
-        """Bring the particles' velocities to the faces, and let gravity act on them."""
-        super().particles_to_grid(window)
-        with self.watch.stage("exchange between ranks", *self.velocity, *self.weights):
-            self.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
+    def _launch_particles_to_grid(self, window: Window) -> None:
+        super()._launch_particles_to_grid(window)
+        self.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
 
     def extrapolate_velocity(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
         """Continue the velocity into air and walls, see the base class; it is then right in all ghost layers.
@@ -178,13 +176,16 @@ class SharedParticleSimulation(ParticleSimulation):
             StepFailed: it is so fast that particles would leave the ghost layers.
         """
         super().extrapolate_velocity(window, known, kind, contact)
-        self.part.fill(*self.velocity)
         cells = float(self.part.ranks.max(too_far(self.part, self.velocity, self._dt)))
         if cells > 0.0:
             raise StepFailed(
                 f"step {self.step_count}: {self.scene.materials()[0]} would move {cells:.1f} cells, more than the ghost layers of a rank, "
                 f"{self.part.layers - 1}"
             )
+
+    def _launch_extrapolation(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array) -> None:
+        super()._launch_extrapolation(window, known, kind, contact)
+        self.part.fill(*self.velocity)
 
     def _layer_filled(self) -> Join | None:
         return Refill(self.part)

@@ -177,6 +177,7 @@ class SharedParticles(Particles):
             self._order_first(self._own)
             self._lying = PlaceOrder(self.place[: self._own])
         self.runs = wp.array(self._lying.runs(self.place, self._own), dtype=wp.int32, device=self.grid.device)
+        self._memory.take(self.count, {"runs": self.runs})
 
     def _order_first(self, count: int) -> None:
         """Bring the first particles into the order of their places, of which others have been added or gone."""
@@ -218,12 +219,12 @@ class SharedParticles(Particles):
         """Give particles behind the others their places."""
         self.place, self._lying = np.append(self.place, places), None
 
-    def remove(self, marks: wp.array) -> int:
-        """Remove particles of this rank; see the base class."""
-        stays = marks.numpy()[: self.count] == 0
-        removed = super().remove(marks)
-        if removed:
-            self.place, self._lying = self.place[stays], None
+    def finish_removal(self, marks: wp.array) -> tuple[int, int]:
+        """End the removal of particles of this rank; see the base class."""
+        count = self.count
+        removed = super().finish_removal(marks)
+        if self.count < count:
+            self.place, self._lying = self.place[marks.numpy()[:count] == 0], None
         return removed
 
     def drop_ghosts(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,9 @@ class SharedSources(Sources):
 
     def _check_cells(self, counts: np.ndarray) -> None:
         super()._check_cells(self.part.ranks.sum(counts))
+
+    def _anything(self, entered: Sequence[Any]) -> bool:
+        return True  # since ranks count together
 
     def _occupants(self, particles: Particles) -> np.ndarray:
         """Return how many particles of all ranks each cell holds: some have come into a box that are not its rank's yet."""

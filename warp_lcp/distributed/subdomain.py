@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
@@ -12,10 +12,11 @@ import warp as wp
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import StarForest, star_forest
-from warp_lcp.distributed.messages import exchange_all
+from warp_lcp.distributed.messages import exchange_all, exchanging_all
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.rows.program import is_recording, launch, perform
 from warp_lcp.rows.vectors import Across, convert
 
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
@@ -35,6 +36,27 @@ def ghost_layers(cfl: float, smoothing: int) -> int:
         smoothing: binomial passes over the level set.
     """
     return max(LAYERS, math.ceil(cfl) + 3, smoothing + 3)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.distributed.cells")
+@no_type_check
+def copy_kernel(to: wp.array3d(dtype=Any), source: wp.array3d(dtype=Any)):
+    """Copy a row of cells."""
+    k, j = wp.tid()
+    for i in range(to.shape[2]):
+        to[k, j, i] = source[k, j, i]
+
+
+for _T in (wp.int8, wp.uint8, wp.float32, wp.float64):
+    wp.overload(copy_kernel, [wp.array3d(dtype=_T), wp.array3d(dtype=_T)])
+
+
+def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
+    """Copy cells of a field to another, now or among recorded launches; both may be views."""
+    if is_recording():
+        launch(copy_kernel, to.shape[:2], [to, source], device=to.device)
+    else:
+        wp.copy(to, source)
 
 
 class Subdomain(GridPart):
@@ -89,6 +111,11 @@ class Subdomain(GridPart):
     def across(self) -> Across | None:
         """The other processes, as reductions take them; None: there are none."""
         return self.ranks if self.ranks.size > 1 else None
+
+    @property
+    def at_once(self) -> bool:
+        """Whether launches cannot be recorded where ranks exchange halos in them: on CUDA that goes through the host."""
+        return bool(self.grid.device.is_cuda)
 
     @property
     def owned(self) -> Window:
@@ -165,6 +192,8 @@ class Subdomain(GridPart):
     def fill(self, *fields: wp.array | np.ndarray, width: int | None = None, parts: int = 1, forest: StarForest | None = None) -> None:
         """Fill the ghost cells of fields of the part, or of stacks of equally many layers of those; collective.
 
+        On the CPU it may be recorded among launches, which all ranks then run alike.
+
         Args:
             fields: any types, the last axes z, y, x; or the host's views of their memory, which cost less to fill often.
             width: how far from the box; None: all.
@@ -177,7 +206,11 @@ class Subdomain(GridPart):
         if forest is None:
             kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
             forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
-        exchange_all(forest, [(host, host) for host in hosts])
+        pairs = [(host, host) for host in hosts]
+        if is_recording():
+            perform(exchanging_all(forest, pairs), wp.launch)
+            return
+        exchange_all(forest, pairs)
         for field, host in zip(fields, hosts, strict=True):
             if isinstance(field, wp.array) and field.device.is_cuda:
                 field.assign(host)
@@ -228,7 +261,7 @@ class Subdomain(GridPart):
         """Give a field of the box what one of the part holds, if it does not share its memory."""
         view = self.stored_box_of(field)
         if view.ptr != box.ptr:
-            wp.copy(box, view)
+            copy_cells(box, view)
 
     def store(self, x: wp.array, field: wp.array, spare: wp.array) -> None:
         """Write the solution of a problem on the box to a field of the part, in ghost cells as others have it; collective."""
@@ -236,7 +269,7 @@ class Subdomain(GridPart):
             convert(x.flatten(), spare.flatten())
             x = spare
         nx, ny, nz = self.box.counts
-        wp.copy(self.box_of(field), x.reshape((nz + 2, ny + 2, nx + 2))[1:-1, 1:-1, 1:-1])
+        copy_cells(self.box_of(field), x.reshape((nz + 2, ny + 2, nx + 2))[1:-1, 1:-1, 1:-1])
         self.fill(field)
 
     def poisson(self, cells: np.ndarray, **coefficients: Any) -> DistributedGridPoisson:

@@ -5,12 +5,13 @@ import ast
 import inspect
 import textwrap
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
-from warp_lcp.rows.program import Launch, is_recording, launch_ranges
+from warp_lcp.rows.program import Launch, call, is_recording, launch, launch_ranges
 
 F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))  # fields
 I16, I32 = wp.array3d(dtype=wp.int16), wp.array3d(dtype=wp.int32)
@@ -112,6 +113,24 @@ def launch_list(
     inputs, sized = [wp.vec2i(0, 0), *inputs], 0 if listed is None else listed.entries
     extent = None if listed is None else listed.rows
     launch_ranges(kernel, (count,), cost, inputs, device=wp.get_device(device), launch=launch, ordered=ordered, sized=sized, extent=extent)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.scan")
+def scan_kernel(values: INTS, sums: INTS, inclusive: int):
+    """Write the sum of the values before each, or up to and with it."""
+    total = int(0)
+    for n in range(values.shape[0]):
+        value = values[n]
+        sums[n] = total + wp.where(inclusive != 0, value, 0)
+        total += value
+
+
+def scan(values: wp.array, sums: wp.array, *, inclusive: bool) -> None:
+    """Launch prefix sums of int32 numbers, or record them; both arrays may be the same."""
+    if values.device.is_cuda:
+        call(partial(wp.utils.array_scan, values, sums, inclusive=inclusive))
+    else:
+        launch(scan_kernel, 1, [values, sums, int(inclusive)], device=values.device)
 
 
 def _kernel(function: Callable, module: str) -> wp.Kernel:

@@ -74,6 +74,11 @@ class GridPart:
         return None
 
     @property
+    def at_once(self) -> bool:
+        """Whether launches cannot be recorded where processes exchange ghost cells in them."""
+        return False
+
+    @property
     def owned(self) -> Window:
         """The cells that this process is the one to know."""
         return self.grid.domain

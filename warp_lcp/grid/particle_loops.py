@@ -48,25 +48,36 @@ class ListMemory:
         self._slots: dict[str, Slot] = {}
         self._entries = ctypes.c_int64()
         self.entries = ctypes.addressof(self._entries)
-        self.touched = self._resized(wp.empty(2, dtype=wp.int32, device=device), 1)
+        self.touched = wp.empty(2, dtype=wp.int32, device=device)
+        self.slot("touched of").point_to(self.touched)
 
     def take(self, count: int, arrays: Mapping[str, wp.array[Any]]) -> None:
         """Take the list over: its length, and its arrays by name, which launches name by the same objects."""
         for name, array in arrays.items():
-            self._slots.setdefault(name, Slot()).point_to(array)
+            self.slot(name).point_to(array)
             array.listed = self
+        self.resize(count)
+
+    def slot(self, name: str) -> Slot:
+        """Return the address of an array of the list."""
+        found = self._slots.get(name)
+        if found is None:
+            found = self._slots[name] = Slot()
+        return found
+
+    def resize(self, count: int) -> None:
+        """Have so many entries from now on."""
         if count == self.count.value:
             return
         self.count.value = self._entries.value = count
-        self.rows.take(chunks(count, self.device).single)
-        self.touched = self._resized(self.touched, count)
-
-    def _resized(self, touched: wp.array[Any], count: int) -> wp.array[Any]:
+        if self.device.is_cuda:
+            self.rows.take(chunks(count, self.device).single)
+        else:
+            self.rows.take_entries(count, CPU_GRAIN)
         least = 2 * -(-max(count, 1) // CPU_GRAIN)
-        if len(touched) < least:
-            touched = wp.empty(2 * least, dtype=wp.int32, device=self.device)
-        self._slots.setdefault("touched of", Slot()).point_to(touched)
-        return touched
+        if len(self.touched) < least:
+            self.touched = wp.empty(2 * least, dtype=wp.int32, device=self.device)
+            self.slot("touched of").point_to(self.touched)
 
 
 TOUCHED: dict[Any, RowPass] = {

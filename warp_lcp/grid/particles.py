@@ -15,7 +15,7 @@ from warp_lcp.grid.particle_loops import CPU_GRAIN, LIST_ROOM, MARGIN, ListMemor
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.memory import RowsMemory, Scalar, rows_memory
+from warp_lcp.rows.memory import RowsMemory, Scalar, Slot, rows_memory
 from warp_lcp.rows.program import LaunchGraph, call
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
@@ -85,15 +85,53 @@ class Column:
 
     Attributes:
         store: wp.vec3, shape (capacity,).
-        view: the part in use, shape (count,).
+        count: vectors in use.
+        slot: where recorded launches find them; None: not yet known.
+        listed: their number, for recorded launches.
     """
 
+    slot: Slot | None = None
+    listed: ListMemory
+
     def __init__(self, capacity: int, count: int, device: wp.Device) -> None:
+        self._host: np.ndarray | None = None
         if device.is_cpu:  # NumPy's zeros take no memory before a particle has been there
-            self.store = wp.array(np.zeros((capacity, 3), dtype=np.float32), dtype=wp.vec3, device=device, copy=False)
+            self._host = np.zeros((capacity, 3), dtype=np.float32)
+            self.store = wp.array(self._host, dtype=wp.vec3, device=device, copy=False)
         else:
             self.store = wp.zeros(capacity, dtype=wp.vec3, device=device)
-        self.view = self.store[:count]
+        self._view: wp.array | None = None
+        self.count = count
+
+    @property
+    def view(self) -> wp.array:
+        """The part in use, shape (count,)."""
+        if self._view is None:
+            self._view = self.store[: self.count]
+            if self.slot is not None:
+                self._view.slot, self._view.listed = self.slot, self.listed
+        return self._view
+
+    def use(self, count: int) -> None:
+        """Have so many vectors in use."""
+        if count != self.count:
+            self.count, self._view = count, None
+
+    def publish(self, memory: ListMemory, name: str) -> None:
+        """Have recorded launches find the vectors in use by a name."""
+        self.slot, self.listed = memory.slot(name), memory
+        self.slot.point_to_first(self.count, self.store)
+        if self._view is not None:
+            self._view.slot, self._view.listed = self.slot, memory
+
+    def set_from(self, first: int, values: np.ndarray | float) -> None:
+        """Set the vectors in use from a number on: shape (count - first, 3), or one number for all."""
+        if self._host is not None:
+            self._host[first : self.count] = values
+        elif isinstance(values, np.ndarray):
+            self.view[first:].assign(np.ascontiguousarray(values, dtype=np.float32))
+        else:
+            self.view[first:].fill_(values)
 
 
 class Particles:
@@ -136,6 +174,9 @@ class Particles:
         self._tally, columns, device = None, len(kernels.TOTAL.found), grid.device
         launches = self._launch_totals, self._launch_numbers, self._launch_sort
         self._totals, self._numbering, self._sorting = (LaunchGraph(device, launch) for launch in launches)
+        self._removal = LaunchGraph(device, self._launch_removal, at_once=device.is_cuda)  # a scan of Warp's
+        self._removed = Reading(device, 2, wp.int32)
+        self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None  # of the memory and the count that they are for
         self._total_rows = rows_memory(device, LIST_ROOM)
         if device.is_cuda:
             self._tally = Tally(kernels.TOTAL, device, CUDA_THREADS)
@@ -201,13 +242,12 @@ class Particles:
             return
         before = self.count
         self._resize(before + len(position))
-        for name, host in (("position", position), ("velocity", velocity)):
-            self._columns[name].view[before:].assign(np.ascontiguousarray(host, dtype=np.float32))
-        if self.kept is not None:
-            numbers = np.broadcast_to(np.float32(1.0) if kept is None else np.asarray(kept, dtype=np.float32), len(position))
-            self.kept[before:].assign(np.ascontiguousarray(np.repeat(numbers[:, None], 3, axis=1)))
-        for gradient in self.affine:
-            gradient[before:].zero_()  # sorting may have left anything behind the particles in use
+        for name, column in self._columns.items():
+            if name == "kept":
+                numbers = np.broadcast_to(np.float32(1.0) if kept is None else np.asarray(kept, dtype=np.float32), len(position))
+                column.set_from(before, np.repeat(numbers[:, None], 3, axis=1))
+            else:  # sorting may have left anything behind the particles in use
+                column.set_from(before, {"position": position, "velocity": velocity}.get(name, 0.0))
 
     def make_room(self, count: int) -> int:
         """Add particles at the end and return the index of the first.
@@ -221,7 +261,11 @@ class Particles:
     @property
     def marks(self) -> wp.array:
         """Scratch memory for `remove`, int32, shape (count,)."""
-        return self._order[self._capacity : self._capacity + self.count]
+        memory = self._order.ptr, self.count
+        if self._marks[0] != memory:
+            self._marks = memory, self._order[self._capacity : self._capacity + self.count]
+            self._memory.take(self.count, {"marks": self._marks[1]})
+        return self._marks[1]
 
     def remove(self, marks: wp.array) -> int:
         """Remove particles in place; the others keep their order.
@@ -236,17 +280,45 @@ class Particles:
         """
         if self.count == 0:
             return 0
-        device, stay = self.grid.device, self._order[: self.count]
-        wp.launch(kernels.stays_kernel, self.count, [marks, stay], device=device)
-        wp.utils.array_scan(stay, stay, inclusive=True)
-        left = int(stay[self.count - 1 :].numpy()[0])
-        removed = self.count - left
-        if removed:
-            for name, column in self._columns.items():
-                wp.launch(kernels.close_ranks_kernel, self.count, [marks, stay, column.view, self._spare.view], device=device)
-                self._columns[name], self._spare = self._spare, column
-            self._resize(left)
-        return removed
+        self.launch_removal(marks)
+        return sum(self.finish_removal(marks))
+
+    def launch_removal(self, marks: wp.array) -> None:
+        """Launch `remove`, or record it; `finish_removal` then ends it. There are particles."""
+        self._removal.run(marks)
+
+    def _launch_removal(self, marks: wp.array) -> None:
+        device = self.grid.device
+        if device.is_cuda:
+            stay = self._order[: self.count]
+            self._removed.array.zero_()
+            wp.launch(kernels.stays_kernel, self.count, [marks, stay, self._removed.array], device=device)
+            wp.utils.array_scan(stay, stay, inclusive=True)
+            return
+        columns = dict.fromkeys(("affine_0", "affine_1", "affine_2", "kept")) | self.arrays()
+        counted: dict[str, typing.Any] = {"removed": self._removed.array, "marks": marks, "count": self._memory.count}
+        kernels.CLOSE_RANKS.bind(Rows.entries(1, device), **counted, **columns).launch()
+
+    def finish_removal(self, marks: wp.array) -> tuple[int, int]:
+        """End the removal that has been launched.
+
+        Args:
+            marks: those it was launched with.
+
+        Returns:
+            How many particles with the mark 1 were removed, and how many with another.
+        """
+        self._removed.changed()
+        first, others = self._removed.numpy().tolist()
+        if first + others:
+            if self.grid.device.is_cuda:
+                stay = self._order[: self.count]
+                for name, column in self._columns.items():
+                    inputs = [marks, stay, column.view, self._spare.view]
+                    wp.launch(kernels.close_ranks_kernel, self.count, inputs, device=self.grid.device)
+                    self._columns[name], self._spare = self._spare, column
+            self._resize(self.count - first - others)
+        return first, others
 
     def move_to(self, grid: StaggeredGrid) -> None:
         """Sort the particles by the cells of another grid from now on."""
@@ -272,19 +344,21 @@ class Particles:
         if count > self._capacity:
             self._grow(before)
         for column in (*self._columns.values(), self._spare):
-            column.view = column.store[:count]
+            column.use(count)
         self._publish()
 
     def _publish(self) -> None:
         """Tell recorded launches how many particles there are, and where."""
-        if self.count != self._memory.count.value:
+        count, memory = self.count, self._memory
+        if count != memory.count.value and self._tally is not None:
             self._total_rows.take(self._rows_of_totals().summed)
-        if self._tally is None and self.count != self._memory.count.value:
-            self._places.value = self._rows_of_totals().places
-            pieces = _rows_of_sort(self.count, self.grid.device)
-            self._sort_rows.take(pieces.single)
-            self._sort_pieces.value = pieces.places
-        self._memory.take(self.count, {**self.arrays(), "key": self.key, "spare": self._spare.view})
+        elif count != memory.count.value:
+            self._places.value = self._total_rows.take_entries(count, _chunk_of_totals(count, self.grid.device))
+            self._sort_pieces.value = self._sort_rows.take_entries(count, _piece_of_sort(count))
+        for name, column in self._columns.items():
+            column.publish(memory, name)
+        self._spare.publish(memory, "spare")
+        memory.take(count, {"key": self.key})
 
     def _grow(self, before: int) -> None:
         """Make room for `count` particles and more, and keep those there were `before`."""
@@ -408,9 +482,7 @@ class Particles:
 
     def _rows_of_totals(self) -> Rows:
         """Return how the particles are shared out for sums over them."""
-        device = self.grid.device
-        chunk = max(CUDA_CHUNK if device.is_cuda else CHUNK, -(-self.count // (CUDA_THREADS if device.is_cuda else THREADS)))
-        return Rows.entries(self.count, device, chunk)
+        return Rows.entries(self.count, self.grid.device, _chunk_of_totals(self.count, self.grid.device))
 
     def _launch_totals(self) -> None:
         """Launch the sums over the particles, and those of the threads' sums."""
@@ -459,9 +531,19 @@ class Particles:
         return {name: column.view for name, column in self._columns.items()}
 
 
+def _chunk_of_totals(count: int, device: wp.Device) -> int:
+    """Return how many particles a thread adds up."""
+    return max(CUDA_CHUNK if device.is_cuda else CHUNK, -(-count // (CUDA_THREADS if device.is_cuda else THREADS)))
+
+
+def _piece_of_sort(count: int) -> int:
+    """Return how many keys are a piece of those that are sorted."""
+    return max(CPU_GRAIN, -(-count // SORT_PIECES))
+
+
 def _rows_of_sort(count: int, device: wp.Device) -> Rows:
     """Return the pieces in which keys are sorted."""
-    return Rows.entries(count, device, max(CPU_GRAIN, -(-count // SORT_PIECES)), weight=4)
+    return Rows.entries(count, device, _piece_of_sort(count), weight=4)
 
 
 def _halves(array: wp.array) -> tuple[wp.array, wp.array]:

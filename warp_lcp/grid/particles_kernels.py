@@ -12,6 +12,7 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
 NUMBER = KERNELS["warp_lcp.grid.particles.number"]
 TOTAL = KERNELS["warp_lcp.grid.particles.total"]
 ADD_IN_ORDER = KERNELS["warp_lcp.grid.particles.add_in_order"]
+CLOSE_RANKS = KERNELS["warp_lcp.grid.particles.close_ranks"]  # on the CPU
 
 APART = 16  # numbers between the counts of two pieces, so that they do not share a set of the cache
 _SORT = {"APART": APART}
@@ -52,10 +53,13 @@ def put_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
-def stays_kernel(marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32)):
-    """Write 1 for a particle without a mark, 0 for others."""
+def stays_kernel(marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32), removed: wp.array(dtype=wp.int32)):
+    """Write 1 for a particle without a mark, 0 for others; count those with the mark 1, and those with another."""
     p = wp.tid()
-    stays[p] = wp.where(marks[p] == 0, 1, 0)
+    mark = marks[p]
+    stays[p] = wp.where(mark == 0, 1, 0)
+    if mark != 0:
+        wp.atomic_add(removed, wp.where(mark == 1, 0, 1), 1)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")

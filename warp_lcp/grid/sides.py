@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, cell_kernel, launch_list, list_kernel
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
@@ -86,25 +86,24 @@ def continue_beyond(grid: StaggeredGrid, bits: int, field: wp.array) -> None:
         grid.everywhere.launch(continue_kernel, [bits, *grid.counts, field])
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.sides")
+@list_kernel("warp_lcp.grid.sides")
 @typing.no_type_check
-def gone_kernel(bits: int, axes: int, low: float, high: wp.vec3, position: wp.array(dtype=wp.vec3), marks: wp.array(dtype=wp.int32)):
+def gone_kernel(i, bits: int, axes: int, low: float, high: wp.vec3, position: wp.array(dtype=wp.vec3), marks: wp.array(dtype=wp.int32)):
     """Mark particles that have reached an open side, of all others 0."""
-    p = wp.tid()
     gone = int(0)
     for axis in range(axes):
-        x = position[p][axis]
+        x = position[i][axis]
         if (bits >> (2 * axis)) & 1 == 1:
             if x < low:
                 gone = 1
         if (bits >> (2 * axis + 1)) & 1 == 1:
             if x > high[axis]:
                 gone = 1
-    marks[p] = gone
+    marks[i] = gone
 
 
 def mark_gone(grid: StaggeredGrid, bits: int, position: wp.array, marks: wp.array) -> None:
-    """Mark the particles that have reached an open side.
+    """Launch the marking of the particles that have reached an open side, or record it.
 
     Args:
         grid: the grid.
@@ -114,7 +113,7 @@ def mark_gone(grid: StaggeredGrid, bits: int, position: wp.array, marks: wp.arra
     """
     high = [(count - GONE) * grid.spacing for count in grid.domain_counts]
     inputs = [bits, grid.dimension, GONE * grid.spacing, wp.vec3(*high), position, marks]
-    wp.launch(gone_kernel, len(position), inputs, device=grid.device)
+    launch_list(gone_kernel, len(position), inputs, device=grid.device)
 
 
 END = 0.6 * MARGIN  # cells from the upper side within which no particle may lie: a tent there would reach beyond what is stored

@@ -329,9 +329,13 @@ class CutBoundary:
         cell = np.clip(np.floor(coordinates).astype(np.int64) - origin, 0, last)
         i, j, k = cell.T
         x, y, z = (coordinates - origin - cell).T
-        d = self.cut.distance.numpy().astype(np.float64)
+        distance = self.cut.distance.numpy()
+
+        def d(*cell: np.ndarray) -> np.ndarray:
+            return np.asarray(distance[cell], dtype=np.float64)
+
         planes = [
-            (1 - y) * ((1 - x) * d[c, j, i] + x * d[c, j, i + 1]) + y * ((1 - x) * d[c, j + 1, i] + x * d[c, j + 1, i + 1])
+            (1 - y) * ((1 - x) * d(c, j, i) + x * d(c, j, i + 1)) + y * ((1 - x) * d(c, j + 1, i) + x * d(c, j + 1, i + 1))
             for c in (k, k + 1)
         ]
         between = planes[0] if self.grid.dimension == 2 else (1 - z) * planes[0] + z * planes[1]

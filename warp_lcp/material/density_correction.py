@@ -212,9 +212,8 @@ class DensityCorrection:
         self._copied_faces: list[tuple[wp.array, wp.array]] = []
         self._guess = grid.part.box_like(self.x).flatten()
         self._way = Scalar()  # by which the displacement is multiplied [m]
-        shared = grid.part.shared  # ranks exchange particles and halos in them
-        self._preparation = LaunchGraph(grid.device, self._launch_preparation, at_once=shared)
-        self._displacing = LaunchGraph(grid.device, self._launch_displacement, at_once=shared)
+        launches = self._launch_preparation, self._launch_displacement, self._copy_cells
+        self._preparation, self._displacing, self._copying = (LaunchGraph(grid.device, f, at_once=grid.part.at_once) for f in launches)
 
     def apply(
         self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None, share: float = 1.0
@@ -230,7 +229,10 @@ class DensityCorrection:
         """
         if particles.offsets is not None:
             particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
-        self._preparation.run(particles, window, fill, contact, variant=(window.near is None, contact is None))
+        particles.look_around()
+        variant = window.near is None, contact is None, particles.runs is None
+        self._preparation.run(particles, window, fill, contact, variant=variant)
+        particles.drop_ghosts()
         self._over.changed()
         over_full, most = self._found()
         if over_full == 0:
@@ -258,7 +260,8 @@ class DensityCorrection:
 
     def _launch_preparation(self, particles: Particles, window: Window, fill: Fill | None, contact: wp.array | None) -> None:
         """Launch the density and the set-up of the problem."""
-        density_of_all(self.grid, particles, window, self.particles_a_cell, self.density)
+        particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
+        self.grid.part.fill(self.density)
         if fill is not None:
             fill(window, self.density)
         self._prepare(contact)
@@ -296,7 +299,9 @@ class DensityCorrection:
         if self._problem is None:
             self._problem = self._make_problem()
             self._work = self.solver.init(self._problem)
-        self._copy_to_boxes(whole=self.boundary.moves)
+        self._copying.run()
+        if self.boundary.moves:
+            self._copy_faces()
         self._operator.update(self._cells)
         criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations)
         return wl.solve(self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work)
@@ -311,14 +316,20 @@ class DensityCorrection:
             pairs.append((self.x, self._guess.reshape(b.shape)))
             self._copied = [(field, box) for field, box in pairs if field is not None]
             self._copied_faces = [*zip(opened, faces, strict=True)]
-        self._copy_to_boxes(whole=True)
+        self._copy_cells()
+        self._copy_faces()
         named = dict(zip(("face_x", "face_y", "face_z"), faces, strict=False))
         self._operator = part.poisson(self.grid.interior(self._cells.numpy()), shift=shift, **named)
         return wl.LCP(self._operator, b, 0.0 if lower is None else lower, np.inf)
 
-    def _copy_to_boxes(self, *, whole: bool) -> None:
-        """Give a rank's problem what the fields of its part hold; `whole`: open fractions, too."""
-        for field, box in [*self._copied, *(self._copied_faces if whole else ())]:
+    def _copy_cells(self) -> None:
+        """Give a rank's problem what the fields of its part hold."""
+        for field, box in self._copied:
+            self.grid.part.copy_to_box(field, box)
+
+    def _copy_faces(self) -> None:
+        """Give it the faces' open fractions."""
+        for field, box in self._copied_faces:
             self.grid.part.copy_to_box(field, box)
 
 

@@ -120,7 +120,7 @@ class ParticleSimulation(ParticleCheckpoints):
         self._columns: tuple[str, ...] | None = None  # of the log, once they are asked for
         self._ends = grid.extent - 0.5 * MARGIN * grid.spacing  # [m]; a tent at the very end would reach beyond what is stored
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
-        at_once = self.shared
+        at_once = self.shared and grid.device.is_cuda  # ranks exchange halos through the host
         self._transfer_to_grid = LaunchGraph(grid.device, self._launch_particles_to_grid, at_once=at_once)
         self._extrapolation = LaunchGraph(grid.device, self._launch_extrapolation, at_once=at_once)
         self._transfer_to_particles = LaunchGraph(grid.device, self._launch_grid_to_particles, at_once=at_once)
@@ -283,7 +283,7 @@ class ParticleSimulation(ParticleCheckpoints):
             for kick, change in zip(self.kicks, self.gravity * self.kick_dt, strict=True):
                 kick.value = float(change)
             acts = tuple(kick.value != 0.0 for kick in self.kicks)  # gravity may be turned between steps
-            self._transfer_to_grid.run(window, variant=(window.near is None, acts))
+            self._transfer_to_grid.run(window, variant=(window.near is None, acts, p.runs is None))
 
     def _launch_particles_to_grid(self, window: Window) -> None:
         p = self.particles
@@ -305,10 +305,10 @@ class ParticleSimulation(ParticleCheckpoints):
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.boundary_kernels`.
         """
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
-            self._extrapolation.run(window, list(known), kind, contact, self._layer_filled(), variant=window.near is None)
+            self._extrapolation.run(window, list(known), kind, contact, variant=window.near is None)
 
-    def _launch_extrapolation(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
-        self._continue(window, known, kind, contact, join)
+    def _launch_extrapolation(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array) -> None:
+        self._continue(window, known, kind, contact, self._layer_filled())
         if self.sources is not None:
             self.sources.hold(self.velocity, [])
 

@@ -1,6 +1,5 @@
 """Sources, drains and open sides: inflow at a given velocity, and outflow."""
 
-import itertools
 import math
 import typing
 from collections.abc import Callable, Sequence
@@ -9,14 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.particles import MARGIN, Particles
+from warp_lcp.grid.cell_kernel import launch_list, list_kernel
+from warp_lcp.grid.particle_loops import ListMemory, launch
+from warp_lcp.grid.particles import GROWTH, MARGIN, Particles
 from warp_lcp.grid.sides import mark_gone
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import sources_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.rows.fields import zeros
+from warp_lcp.rows.memory import Slot
+from warp_lcp.rows.program import LaunchGraph, clear
 
 NOW = 1e-9  # s: a time that a step has been cut to may be off by its rounding
 GRAZED = 1e-9  # of a way: less than that in a cell is rounding
@@ -101,7 +104,13 @@ class Sources:
             self._window = grid.window((cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1)
         self._moving_walls = boundary.velocity if not boundary.open else []
         self._running: list[bool] | None = None  # what the device knows of it
-        self._imposing = LaunchGraph(device, self._impose)
+        self._imposing, self._counting = (LaunchGraph(device, record) for record in (self._impose, self._count))
+        self._entering = LaunchGraph(device, self._enter)
+        self._nothing = *(np.zeros(0, dtype=np.int32) for _ in range(3)), np.zeros((0, 3), dtype=np.float32)
+        self._span_on_host = np.zeros(14)  # see `sources.h`
+        self._span = wp.array(self._span_on_host, dtype=wp.float64, device=device, copy=device.is_cuda)
+        self._lattice = ListMemory(device)
+        self._points, self._found = dict.fromkeys(("entries", "slot", "filled", "point"), zeros(0, wp.int32, device)), list[np.ndarray]()
 
     def top_speed(self, time: float, span: float) -> float:
         """Return the largest speed of sources that run in a time span [m/s].
@@ -151,17 +160,26 @@ class Sources:
         running = [number for number, source in enumerate(self.sources) if source.start <= now + NOW and source.stop > since + NOW]
         if not running:
             return 0
+        entered = []
+        for number in running:
+            start = self.sources[number].start
+            starts = before is None or start > before + NOW
+            found = self._entered(number, min(max(since, start), now) if starts else since, now, starts=starts)
+            if len(found[-1]):
+                entered.append((number, found))
+        if not self._anything(entered):
+            return 0
         held = self._occupants(particles) / self.per_axis**self.grid.dimension
         emitted = 0
-        for number in running:
-            source = self.sources[number]
-            if self._boxes[number] is None:
-                continue
-            starts = before is None or source.start > before + NOW
-            points = self._points(number, min(max(since, source.start), now) if starts else since, now, held, starts=starts)
+        for number, found in entered:
+            source, points = self.sources[number], self._new(held, *found)
             particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape), source.kept)
             emitted += len(points)
         return emitted
+
+    def _anything(self, entered: Sequence[typing.Any]) -> bool:
+        """Return whether points of a lattice have entered a source."""
+        return len(entered) > 0
 
     def _check_cells(self, counts: np.ndarray) -> None:
         """Refuse sources without an open cell, given how many each has."""
@@ -174,90 +192,92 @@ class Sources:
 
     def _occupants(self, particles: Particles) -> np.ndarray:
         """Return how many particles each cell holds."""
-        self._counts.zero_()
-        numbers = [1.0 / self.grid.spacing, wp.vec3i(*self.grid.counts), wp.vec3i(*self.grid.origin)]
-        inputs = [*numbers, self._fields[0], particles.position, self._counts]
-        wp.launch(kernels.occupants_kernel, particles.count, inputs, device=self.grid.device)
+        self._counting.run(particles)
         return np.asarray(self._counts.numpy())
 
-    def _points(self, number: int, since: float, now: float, held: np.ndarray, *, starts: bool) -> np.ndarray:
-        """Return where the points are [m] that a source's lattice has brought in since a time [s].
+    def _count(self, particles: Particles) -> None:
+        """Launch the count of the particles in each cell."""
+        clear(self._counts)
+        numbers = [1.0 / self.grid.spacing, wp.vec3i(*self.grid.counts), wp.vec3i(*self.grid.origin)]
+        inputs = [*numbers, self._fields[0], particles.position, self._counts]
+        launch_list(kernels.occupants_kernel, particles.count, inputs, device=self.grid.device, ordered=True)
 
-        If the source starts then, those that fill cells are among them. Some have left the cells again.
-        """
-        until = min(now, self.sources[number].stop)
-        lattice, jitter = self._lattice(number, since, until)
-        filled, slot, entries = self._entries(number, *(self._at(number, lattice, jitter, time) for time in (since, until)))
-        new = np.where(self._emits[slot] & (held[np.maximum(slot, 1) - 1] < JAMMED), entries, 0)
-        if starts:
-            new += (filled > 0) & self._emits[filled] & (held[np.maximum(filled, 1) - 1] < FILLED)
-        lattice, jitter = np.repeat(lattice, new, axis=0), np.repeat(jitter, new, axis=0)
-        points = self._at(number, lattice, jitter, now).astype(np.float32)
-        dx, axes = self.grid.spacing, slice(self.grid.dimension)
-        size = self.grid.extent[axes]
-        np.clip(points[:, axes], 1.1 * MARGIN * dx, size - 1.1 * MARGIN * dx, out=points[:, axes])
-        return points[self.boundary.admits(points)] if len(points) else points
-
-    def _lattice(self, number: int, since: float, until: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers of the points that may lie in a source's cells between two times, shape (n, 3), and their displacements."""
-        distance, dimension = self.grid.spacing / self.per_axis, self.grid.dimension
-        ways, box = (self._way(number, since), self._way(number, until)), self._boxes[number]
-        assert box is not None, "a source without cells here emits nothing"
-        lows, highs = (box[0] - np.maximum(*ways)) / distance, (box[1] - np.minimum(*ways)) / distance
-        ranges = [np.arange(np.floor(low) - 1, np.ceil(high) + 1) for low, high in zip(lows, highs, strict=True)]
-        if dimension == 2:
-            ranges[2] = np.zeros(1)
-        Z, Y, X = np.meshgrid(ranges[2], ranges[1], ranges[0], indexing="ij")
-        lattice = np.stack([X.ravel(), Y.ravel(), Z.ravel()], axis=1)
-        return lattice, self.jitter * (_uniform(lattice, self.random_seed + number) - 0.5)
-
-    def _at(self, number: int, lattice: np.ndarray, jitter: np.ndarray, time: float) -> np.ndarray:
-        """Return where lattice points are at a time [m]."""
-        points = (lattice + 0.5 + jitter) * (self.grid.spacing / self.per_axis) + self._way(number, time)
-        if self.grid.dimension == 2:
-            points[:, 2] = 0.0
-        return np.asarray(points)
-
-    def _way(self, number: int, time: float) -> np.ndarray:
-        source = self.sources[number]
-        return np.asarray(source.velocity * (time - source.start), dtype=np.float64)
-
-    def _slot(self, points: np.ndarray, number: int) -> np.ndarray:
-        """Return the slot of the source's cell that each point lies in, 0 if it lies in none."""
-        cells = np.floor(points / self.grid.spacing).astype(np.int64) + 1 - np.array(self.grid.origin)
-        if self.grid.dimension == 2:
-            cells[:, 2] = 1
-        np.clip(cells, 0, np.array(self.grid.shape[::-1]) - 1, out=cells)
-        slot = self._slots[cells[:, 2], cells[:, 1], cells[:, 0]]
-        return np.where((slot > 0) & (self._owner[np.maximum(slot, 1) - 1] == number), slot, 0)
-
-    def _entries(self, number: int, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Follow points [m], which all go the same straight way, through a source's cells.
+    def _entered(self, number: int, since: float, now: float, *, starts: bool) -> tuple[np.ndarray, ...]:
+        """Find the points that a source's lattice has brought in since a time [s].
 
         Returns:
-            The slots that they are in at first, those that they have come into last, and how often they have come in.
+            Of each point the slot of the cell that it has come into last, how often it came into one, and, if the source starts
+            then, the slot of the cell that it was in at first, which are 0 for none; float32, shape (n, 3): where it is [m].
+            Some have left the cells again.
         """
-        filled = here = self._slot(first, number)
-        slot, entries = np.zeros_like(here), np.zeros(len(here), dtype=np.int64)
-        begin, way = first / self.grid.spacing, (last[0] - first[0]) / self.grid.spacing
-        crossings = [np.zeros(len(first)), np.ones(len(first))]  # shares of the way between which it stays in one cell
-        for axis in np.flatnonzero(way):
-            plane = (np.floor if way[axis] > 0.0 else np.ceil)(begin[:, axis]) - begin[:, axis]
-            crossings += [(plane + n * np.sign(way[axis])) / way[axis] for n in range(1, math.ceil(abs(way[axis])) + 1)]
-        ordered = np.sort(np.clip(crossings, 0.0, 1.0), axis=0)
-        middles = ((first + (0.5 * (a + b))[:, None] * (last - first), b - a > GRAZED) for a, b in itertools.pairwise(ordered))
-        for points, counts in itertools.chain(middles, [(last, True)]):
-            there = np.where(counts, self._slot(points, number), here)
-            comes = (here == 0) & (there > 0)
-            slot, entries, here = np.where(comes, there, slot), entries + comes, there
-        return filled, slot, entries
+        box, until = self._boxes[number], min(now, self.sources[number].stop)
+        if box is None:
+            return self._nothing
+        distance, ways = self.grid.spacing / self.per_axis, [self._way(number, time) for time in (since, until, now)]
+        low, counts = [0.0] * 3, [1] * 3
+        for axis in range(self.grid.dimension):
+            begin, end = ways[0][axis], ways[1][axis]
+            low[axis] = math.floor((box[0][axis] - max(begin, end)) / distance) - 1.0
+            counts[axis] = int(math.ceil((box[1][axis] - min(begin, end)) / distance) + 1.0 - low[axis])
+        self._reserve(math.prod(counts))
+        self._span_on_host[:] = (*ways[0], *ways[1], *ways[2], *low, *counts[:2])
+        if self.grid.device.is_cuda:
+            self._span.assign(self._span_on_host)
+        self._entering.run(number)
+        if self.grid.device.is_cuda:
+            self._found = [array.numpy() for array in self._points.values()]
+        entries, slot, filled, points = (array[: int(self._lattice.count.value)] for array in self._found)
+        which = np.flatnonzero(entries | filled if starts else entries)
+        if not len(which):
+            return self._nothing
+        return slot[which], entries[which], filled[which] * starts, points[which]
 
-    def _box(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def _enter(self, number: int) -> None:
+        """Launch what follows the points of a source's lattice through its cells."""
+        grid, seed = self.grid, (self.random_seed + number) * 0x9E3779B97F4A7C15 + 1
+        size = dict(zip(("size_x", "size_y", "size_z"), map(float, grid.extent), strict=True))
+        numbers = {"number": number, "nx": grid.shape[2], "ny": grid.shape[1], "nz": grid.shape[0], "seed": (seed + 2**63) % 2**64 - 2**63}
+        lengths = {"distance": grid.spacing / self.per_axis, "jitter": self.jitter, "grazed": GRAZED, "margin": 1.1 * MARGIN * grid.spacing}
+        given = {"slots": self._fields[0].flatten(), "owner": self._fields[1], "span": self._span, **self._points}
+        launch(kernels.ENTER, int(self._lattice.count.value), grid, **given, **numbers, **lengths, **size)
+
+    def _reserve(self, count: int) -> None:
+        """Have room for so many points of a lattice."""
+        if count > len(self._points["entries"]):
+            for name in self._points:
+                kind = wp.vec3 if name == "point" else wp.int32
+                self._points[name] = wp.zeros(int(GROWTH * count), dtype=kind, device=self.grid.device)
+            self._lattice.take(count, self._points)
+            if self.grid.device.is_cpu:
+                self._found = [array.numpy() for array in self._points.values()]  # the same memory
+        self._lattice.resize(count)
+
+    def _new(self, held: np.ndarray, slot: np.ndarray, entries: np.ndarray, filled: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return where particles come in [m], of the points of `_entered`: if the source starts, those that fill cells are among them.
+
+        Args:
+            held: by each cell, as a share of what it holds at rest.
+            slot: as returned there, like the others.
+            entries: likewise.
+            filled: likewise.
+            points: likewise.
+        """
+        new = np.where(self._emits[slot] & (held[np.maximum(slot, 1) - 1] < JAMMED), entries, 0)
+        new += (filled > 0) & self._emits[filled] & (held[np.maximum(filled, 1) - 1] < FILLED)
+        points = np.repeat(points, new, axis=0)
+        return points[self.boundary.admits(points)] if len(points) else points
+
+    def _way(self, number: int, time: float) -> list[float]:
+        """Return how far a source's lattice has moved at a time [m]."""
+        source = self.sources[number]
+        return [float(v) * (time - source.start) for v in source.velocity]
+
+    def _box(self, cells: np.ndarray) -> tuple[list[float], list[float]] | None:
         """Return the low and the high corner [m] of cells (k, j, i); None: there are none."""
         if not len(cells):
             return None
         low, high = (corner[::-1] + np.array(self.grid.origin) for corner in (cells.min(axis=0), cells.max(axis=0) + 1))
-        return low * self.grid.spacing, high * self.grid.spacing
+        return (low * self.grid.spacing).tolist(), (high * self.grid.spacing).tolist()
 
     def _impose(self, velocity: Faces, known: Faces, cells: wp.array | None, supply: bool) -> None:
         """Launch what `supply` does, or what `hold` does."""
@@ -287,32 +307,15 @@ def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) 
     return owner.reshape(nz, ny, nx)
 
 
-def _uniform(lattice: np.ndarray, seed: int) -> np.ndarray:
-    """Return a number in [0, 1) for each coordinate that depends on nothing but the lattice point and the seed."""
-    # the finalizer of SplitMix64 after each word
-    state = np.full(len(lattice), (seed * 0x9E3779B97F4A7C15 + 1) % 2**64, dtype=np.uint64)
-    words = [*lattice.astype(np.int64).astype(np.uint64).T]
-    with np.errstate(over="ignore"):
-        for word in words:
-            state = _mixed(state ^ word)
-        columns = [_mixed(state + np.uint64((axis + 1) * 0x9E3779B97F4A7C15 % 2**64)) for axis in range(3)]
-    return np.stack(columns, axis=1).astype(np.float64) / 2.0**64
+DEPARTED, DRAINED = wp.constant(1), wp.constant(2)  # marks of particles
 
 
-def _mixed(word: np.ndarray) -> np.ndarray:
-    word = word + np.uint64(0x9E3779B97F4A7C15)
-    word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return word ^ (word >> np.uint64(31))
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.material.outlets")
+@list_kernel("warp_lcp.material.outlets")
 @typing.no_type_check
-def mark_inside_kernel(distance: wp.array(dtype=wp.float32), marks: wp.array(dtype=wp.int32)):
-    """Mark particles at a negative distance."""
-    p = wp.tid()
-    if distance[p] < 0.0:
-        marks[p] = 1
+def mark_inside_kernel(i, distance: wp.array(dtype=wp.float32), marks: wp.array(dtype=wp.int32)):
+    """Mark particles at a negative distance that have not departed."""
+    if distance[i] < 0.0 and marks[i] == 0:
+        marks[i] = DRAINED
 
 
 @dataclass(frozen=True)
@@ -347,7 +350,9 @@ class Outlets:
 
     def __init__(self, grid: StaggeredGrid, drains: Sequence[Drain], open_sides: int) -> None:
         self.grid, self.drains, self.open_sides = grid, tuple(drains), open_sides
-        self._distance = wp.zeros(0, dtype=wp.float32, device=grid.device)
+        self._store, self._slot = zeros(0, wp.float32, grid.device), Slot()
+        self._distance = self._store  # of as many as there are particles
+        self._leaving = LaunchGraph(grid.device, self._launch, at_once=grid.device.is_cuda)  # a scan of Warp's
 
     def apply(self, particles: Particles, before: float, now: float) -> tuple[int, int]:
         """Remove particles; the others keep their order.
@@ -360,24 +365,32 @@ class Outlets:
         Returns:
             How many drains have swallowed, and how many have left through open sides.
         """
-        departed, drained = self.remove_departed(particles), 0
-        drains = [drain for drain in self.drains if drain.opens(before, now)]
-        if drains and particles.count:
-            marks = particles.marks
-            marks.zero_()
-            if len(self._distance) < particles.count:
-                self._distance = wp.zeros(particles.capacity, dtype=wp.float32, device=self.grid.device)
-            for drain in drains:
-                distance = self._distance[: particles.count]
-                drain.geometry.signed_distance(particles.position, distance)
-                wp.launch(mark_inside_kernel, particles.count, [distance, marks], device=self.grid.device)
-            drained = particles.remove(marks)
-        return drained, departed
+        return self._remove(particles, tuple(drain for drain in self.drains if drain.opens(before, now)))
 
     def remove_departed(self, particles: Particles) -> int:
         """Remove particles beyond open sides; return their number."""
-        if not (self.open_sides and particles.count):
-            return 0
+        return self._remove(particles, ())[1]
+
+    def _remove(self, particles: Particles, drains: tuple[Drain, ...]) -> tuple[int, int]:
+        """Remove particles beyond open sides and in some drains; return how many drains have swallowed, and how many have left."""
+        count = particles.count
+        if not count or not (self.open_sides or drains):
+            return 0, 0
+        if drains and len(self._distance) != count:
+            if len(self._store) < count:
+                self._store = zeros(particles.capacity, wp.float32, self.grid.device)
+            self._distance = self._store[:count]
+            self._slot.point_to(self._distance)
         marks = particles.marks
-        mark_gone(self.grid, self.open_sides, particles.position, marks)
-        return particles.remove(marks)
+        self._leaving.run(particles, drains, marks, self._distance)
+        departed, drained = particles.finish_removal(marks)
+        return drained, departed
+
+    def _launch(self, particles: Particles, drains: tuple[Drain, ...], marks: wp.array, distance: wp.array) -> None:
+        """Launch the marks of the particles that leave, and their removal."""
+        position = particles.position
+        mark_gone(self.grid, self.open_sides, position, marks)
+        for drain in drains:
+            drain.geometry.signed_distance(position, distance)
+            launch_list(mark_inside_kernel, particles.count, [distance, marks], device=self.grid.device)
+        particles.launch_removal(marks)

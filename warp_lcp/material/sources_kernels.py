@@ -1,19 +1,20 @@
 # mypy: ignore-errors
 """Kernels of sources: their velocity on faces, their cells, and how many particles those hold."""
 
-import typing
+from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, cell_below, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, cell_below, cell_kernel, list_kernel
 from warp_lcp.grid.staggered import cell_index
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows import KernelFile
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 _BYTES = wp.array(dtype=wp.uint8)
 
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "warp_lcp.material.sources"}
+ENTER = KernelFile(Path(__file__).parent / "headers/sources.h")["warp_lcp.material.sources.enter"]
 
 
 @wp.func
@@ -61,12 +62,10 @@ def occupy_kernel(k, j, i, slots: I32, sources: wp.array(dtype=wp.int32), runnin
         kind[k, j, i] = wp.where(fluid != 0, _FLUID, _SOLID)
 
 
-@wp.kernel(**options)
-def occupants_kernel(
-    inverse_dx: float, n: wp.vec3i, origin: wp.vec3i, slots: I32, position: wp.array(dtype=wp.vec3), counts: wp.array(dtype=wp.int32)
-):
+@list_kernel("warp_lcp.material.sources")
+def occupants_kernel(i, inverse_dx: float, n: wp.vec3i, origin: wp.vec3i, slots: I32, position: POINTS, counts: INTS):
     """Count the particles in each slot."""
-    x = position[wp.tid()] * inverse_dx
+    x = position[i] * inverse_dx
     k = int(1)
     if slots.shape[0] > 3:
         k = cell_index(x[2] + 1.0 - float(origin[2]), n[2])

@@ -17,7 +17,8 @@ from warp_lcp.rows.layout import RowLayout
 _BLANK: Any = RowLayout()
 LAYOUT = type(_BLANK.__ctype__())
 LAYOUT_BYTES = ctypes.sizeof(LAYOUT)
-ARRAY_BYTES = ctypes.sizeof(wp.array(dtype=wp.uint8).__ctype__())
+_ARRAY: Any = type(wp.array(dtype=wp.uint8).__ctype__())
+ARRAY_BYTES, SHAPE_OFFSET = ctypes.sizeof(_ARRAY), _ARRAY.shape.offset
 BOX, PLACE = struct.Struct("6i"), struct.Struct("3i")  # members of a RowLayout from `nx` to `slab`; first (k, j, i)
 FORMATS: dict[Any, Any] = {
     wp.float32: ctypes.c_float, wp.float64: ctypes.c_double, wp.int32: ctypes.c_int32, wp.int64: ctypes.c_int64, wp.bool: ctypes.c_bool,
@@ -78,16 +79,22 @@ def value_of(number: Any) -> Any:
 class Slot:
     """Address of an array that other arrays replace between runs; the current array has it as attribute `slot`."""
 
-    __slots__ = ("_memory", "address")
+    __slots__ = ("_length", "_memory", "address")
 
     def __init__(self) -> None:
         self._memory = ctypes.create_string_buffer(ARRAY_BYTES)
         self.address = ctypes.addressof(self._memory)
+        self._length = ctypes.c_int32.from_buffer(self._memory, SHAPE_OFFSET)
 
     def point_to(self, array: wp.array[Any]) -> None:
         """Have recorded launches use this array from now on."""
         ctypes.memmove(self.address, ctypes.addressof(array.__ctype__()), ARRAY_BYTES)
         array.slot = self
+
+    def point_to_first(self, count: int, store: wp.array[Any]) -> None:
+        """Have recorded launches use the first elements of an array of one axis from now on."""
+        ctypes.memmove(self.address, ctypes.addressof(store.__ctype__()), ARRAY_BYTES)
+        self._length.value = count
 
 
 class RowsMemory:
@@ -121,6 +128,12 @@ class RowsMemory:
         BOX.pack_into(self.layout, LAYOUT.nx.offset, nx, rows, planes, grain, chunks, 1)
         PLACE.pack_into(self.place, 0, *place)
         self.tasks.value = planes * rows * chunks
+
+    def take_entries(self, count: int, cells: int) -> int:
+        """Take the entries of a list over on the CPU, as `Rows.entries` with so many `cells` a task; return the number of tasks."""
+        chunks = -(-count // cells)
+        self.take_box(count, 1, 1, cells, chunks, (0, 0, 0))
+        return chunks
 
     def take(self, layout: Any, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Take rows over.

@@ -225,6 +225,23 @@ for (int column = P.first; column < P.first + n; ++column) {
         else s = found[t] > s || found[t] != found[t] ? found[t] : s; }
     results[column] = s; }
 
+// kernel warp_lcp.grid.particles.close_ranks: Remove the particles with a mark, in place; the
+// others keep their order. Count those with the mark 1, and those with another
+//   compute    float32
+//   whole      int32 marks; vec3 position, velocity, affine_0?, affine_1?, affine_2?, kept?
+//   box        int32 removed
+//   numbers    int count
+float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data, (float*)given.affine_0.data,
+                          (float*)given.affine_1.data, (float*)given.affine_2.data, (float*)given.kept.data};
+int counts[2] = {0, 0}, to = 0;
+while (to < count && marks[to] == 0) ++to;  // nothing moves before the first that goes
+for (int p = to; p < count; ++p) {
+    if (marks[p] != 0) { ++counts[marks[p] != 1]; continue; }
+    for (float* column : columns)
+        if (column) for (int d = 0; d < 3; ++d) column[3*(long long)to + d] = column[3*(long long)p + d];
+    ++to; }
+removed[0] = counts[0]; removed[1] = counts[1];
+
 // kernel warp_lcp.grid.particles.sort_count: Count how many keys of a piece have each digit
 //   compute    float32
 //   whole      int32 counts
