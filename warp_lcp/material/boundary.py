@@ -15,7 +15,7 @@ import warp as wp
 from warp_lcp.grid.advection import MARGIN, advect, advect_with_distance, clearance, push_out
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.level_set import whole_cell_capacity
-from warp_lcp.grid.motion import kinks
+from warp_lcp.grid.motion import boxes_of, kinks
 from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -243,7 +243,10 @@ class CutBoundary:
         self._counts, self._dt = Reading(grid.device, 3, wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
-        self._motions, self._bounds = cut.motions, [solid.geometry.bounds() for solid in cut.solids if solid.motion is not None]
+        self._motions = cut.motions
+        self._bounds = boxes_of([solid.geometry.bounds() for solid in cut.solids if solid.motion is not None])
+        self._size = grid.extent
+        self._size[grid.dimension :] = 0.0
         self.kinks = tuple(time for motion in self._motions.motions for time in kinks(motion))
         self._walls = LaunchGraph(grid.device, self._find_walls)
         self._find_walls()
@@ -254,9 +257,7 @@ class CutBoundary:
 
         From `time` to `time` + `span` [s].
         """
-        size = self.grid.extent
-        size[self.grid.dimension :] = 0.0
-        return self._motions.top_speed(self._bounds, size, time, span)
+        return self._motions.top_speed(self._bounds, self._size, time, span)
 
     def begin_step(self, time: float, dt: float) -> None:
         """Compute the velocity of the solids from `time` on [s]."""

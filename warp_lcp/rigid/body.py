@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from itertools import accumulate, pairwise
+from operator import is_
+from pathlib import Path
 from typing import cast, overload
 
 import numpy as np
 
 from warp_lcp.grid.motion import Pose
 from warp_lcp.rigid.mass_properties import MassProperties
+from warp_lcp.rows import KernelFile
+from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.settings import NonNegative, Part, checked
 
-SAME_TURN = 1e-15  # [rad]: half a step's turn that no longer changes
 MOST_ROUNDS = 60  # of the fixed point; a step turns a body by far less than a radian, and each round by a factor of that less
 STATE, VALUES = 20, 26  # numbers of a body's state, and with the impulses given
 POSITION, ROTATION, MOMENTUM, SPINNING = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 18)  # where in the state
@@ -21,6 +25,8 @@ UNIT, EPSILON = np.eye(3), float(np.finfo(np.float64).eps)
 CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)  # v @ CROSS: entries of the matrix of v x
 AXES = [0, 1, 2]
 PLANAR = [0, 1, 5]  # vx, vy, wz among the six
+KERNELS = KernelFile(Path(__file__).parent / "headers/motion.h", {"MOST_ROUNDS": MOST_ROUNDS})
+ADVANCE, POSES = (HostKernel(KERNELS[f"warp_lcp.rigid.motion.{name}"]) for name in ("advance", "poses"))
 
 
 def _part(columns: slice, shape: tuple[int, ...] = (-1,)) -> property:
@@ -89,6 +95,7 @@ class RigidBody:
         self.friction, self.restitution = checked("friction", friction, NonNegative), checked("restitution", restitution, Part)
         self.properties, self.name = properties, name
         self.values = np.zeros(VALUES)
+        self.states: BodyStates | None = None  # that `values` are a row of
         self.position, self.rotation = properties.center, np.eye(3)
         self.momentum = properties.mass * _three(velocity)
         self.angular_momentum = properties.inertia @ _three(angular_velocity)
@@ -238,7 +245,7 @@ class BodyStates(Sequence[RigidBody]):
         self._bodies = tuple(bodies)
         self.values = np.array([body.values for body in bodies]).reshape(-1, VALUES)
         for body, row in zip(self._bodies, self.values, strict=True):
-            body.values = row
+            body.values, body.states = row, self
         each = [body.properties for body in bodies]
         self.mass = np.array([properties.mass for properties in each])
         self.center = np.array([properties.center for properties in each]).reshape(-1, 3)
@@ -349,16 +356,8 @@ class BodyMotion:
 
         Poses of n bodies at m times [s], see `pose`.
         """
-        values, mass, center, inverse_inertia = _stacked(motions)
-        states, dt = np.repeat(values[None], len(times), axis=0), times[:, None] - values[:, TIME]
-        later, number = np.nonzero(dt)
-        if len(later):
-            moved = states[later, number]
-            advance_states(moved, mass[number], inverse_inertia[number], dt[later, number])
-            states[later, number] = moved
-        rotation = states[..., ROTATION].reshape(*states.shape[:2], 3, 3)
-        turned = (rotation @ center[..., None])[..., 0]
-        return rotation, center - turned + (states[..., POSITION] - center)
+        rotations, translations, _, _ = _moved(motions, times)
+        return rotations, translations
 
     @staticmethod
     def velocity_fields_of(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, np.ndarray]:
@@ -366,17 +365,28 @@ class BodyMotion:
 
         A body's point x moves at turn x + shift now.
         """
-        values, mass, _, inverse_inertia = _stacked(motions)
-        turn = cross_matrix(spins(values[:, ROTATION].reshape(-1, 3, 3), inverse_inertia, values[:, SPINNING]))
-        shift = values[:, MOMENTUM] / mass[:, None] - (turn @ values[:, POSITION, None])[..., 0]
-        return turn, shift
+        _, _, turns, shifts = _moved(motions, np.zeros(0))
+        return turns, shifts
 
 
-def _stacked(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return values, mass, center and inverse inertia of the bodies, shapes (n, 26), (n,), (n, 3) and (n, 3, 3)."""
-    each = [motion.body.properties for motion in motions]
-    values, mass = np.array([motion.body.values for motion in motions]), np.array([of.mass for of in each])
-    return values, mass, np.array([of.center for of in each]), np.array([of.inverse_inertia for of in each])
+def _moved(motions: Sequence[BodyMotion], times: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return rotations and translations at some times, and the turns and shifts of now, of all motions."""
+    n, m = len(motions), len(times)
+    shapes = ((m, n, 3, 3), (m, n, 3), (n, 3, 3), (n, 3))
+    sizes = [9 * m * n, 3 * m * n, 9 * n, 3 * n]
+    reals, _ = POSES.run((*_held(motions), times), (), tasks=n, work=sum(sizes), count=n, times=m)
+    found = reals[39 * n + m : 39 * n + m + sum(sizes)].copy()
+    ends = list(accumulate(sizes, initial=0))
+    return tuple(found[begin:end].reshape(shape) for (begin, end), shape in zip(pairwise(ends), shapes, strict=True))
+
+
+def _held(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, ...]:
+    """Return values, masses, inverse inertias and centers of the bodies."""
+    bodies, states = [motion.body for motion in motions], motions[0].body.states
+    if states is not None and len(states) == len(bodies) and all(map(is_, bodies, states)):
+        return states.values, states.mass, states.inverse_inertia, states.center
+    each, values = [body.properties for body in bodies], np.array([body.values for body in bodies])
+    return values, *(np.array([getattr(of, name) for of in each]) for name in ("mass", "inverse_inertia", "center"))
 
 
 def in_space(values: np.ndarray) -> np.ndarray:
@@ -407,22 +417,10 @@ def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.nda
         inverse_inertia: shape (n, 3, 3), or (3, 3) for all.
         dt: time [s], or one for each, shape (n,).
     """
-    R, L = values[:, ROTATION].reshape(-1, 3, 3), values[:, SPINNING]
-    inverse = inverse_inertia if np.shape(inverse_inertia) == R.shape else np.broadcast_to(inverse_inertia, R.shape)
-    each = np.asarray(dt) if np.ndim(dt) else np.full(len(R), dt)
-    time = each[:, None]
-    half, left = 0.5 * time * spins(R, inverse, L), np.arange(len(R))
-    for _ in range(MOST_ROUNDS):
-        before = half[left]
-        half[left] = 0.5 * time[left] * spins(rotation_by(before) @ R[left], inverse[left], L[left])
-        left = left[~(np.abs(half[left] - before).max(axis=1) <= SAME_TURN)]
-        if not len(left):
-            break
-    turned = orthonormal(rotation_by(2.0 * half) @ R)
-    values[:, POSITION] += time * (values[:, MOMENTUM] / mass[:, None])
-    values[:, ROTATION] = turned.reshape(-1, 9)
-    values[:, ANGLE] += each * spins(turned, inverse, L)[:, 2]
-    values[:, TIME] += dt
+    count = len(values)
+    inverse = np.broadcast_to(inverse_inertia, (count, 3, 3))
+    reals, _ = ADVANCE.run((values, mass, inverse, np.broadcast_to(dt, count)), (), tasks=count, count=count)
+    values[:] = reals[: values.size].reshape(values.shape)
 
 
 def shift_states(values: np.ndarray, ways: np.ndarray) -> None:
