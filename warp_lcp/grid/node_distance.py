@@ -120,7 +120,12 @@ class ShapeTable:
         limits = [UNLIMITED if (box := shape.bounds()) is None else np.where(np.isfinite(box), 0.0, box) for shape in shapes]
         placements = [shape.placement for shape in shapes]
         of_placements = [[getattr(p, name) for p in placements] for name in ("rotation", "translation", "scale")]
-        of_shapes = [[shape.origin() for shape in shapes], corners, [margin for _, margin in hulls], limits]  # infinite where without an end
+        of_shapes = [
+            [shape.origin() for shape in shapes],
+            corners,
+            [margin for _, margin in hulls],
+            limits,
+        ]  # infinite where without an end
         self._fixed = np.concatenate([np.ravel(of) for of in (*of_placements, *of_shapes, [grid.spacing, FAR])])
         self._places = np.concatenate([starts, grid.origin, grid.shape[::-1]])
         self._numbers = {"count": len(solids), "shapes": len(shapes), "corners": most, "flat": grid.dimension == 2}
@@ -149,7 +154,9 @@ class ShapeTable:
         given = (rotation, translation, self._fixed)
         reals, (near,) = PLACE.run(given, (self._places,), work=12 * shapes + 6 * n + 6, **self._numbers)
         begin = 12 * n + len(self._fixed)
-        inverse, origin, nodes, around = np.split(reals[begin : begin + 12 * shapes + 6 * n + 6], np.cumsum([9 * shapes, 3 * shapes, 6 * n]))
+        inverse, origin, nodes, around = np.split(
+            reals[begin : begin + 12 * shapes + 6 * n + 6], np.cumsum([9 * shapes, 3 * shapes, 6 * n])
+        )
         frame, solids, boxes = self._shapes.host["frame"], self._solids.host, nodes.reshape(n, 2, 3).astype(np.int64)
         frame["inverse_rotation"], frame["translation"] = inverse.reshape(-1, 3, 3), origin.reshape(-1, 3)
         self.low, self.high = boxes[:, 0], boxes[:, 1]

@@ -16,9 +16,9 @@ from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, Join
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
+from warp_lcp.rigid.planar_contacts import AHEAD, PlanarContacts
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
-AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for
 SLOP = 1e-5  # of a body's size: overlap that is left alone
 RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
@@ -75,6 +75,7 @@ class ContactSolve:
         self._bounce = np.array([body.restitution for body in bodies])
         self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # and the rotations that they are of
         self._last: tuple[Contacts, np.ndarray, ContactProblem] | None = None  # contacts, roots and problem of `push_apart`
+        self._planar = PlanarContacts(detection, self.reach) if PlanarContacts.holds(detection) else None
         self._roots_of_inertias = np.linalg.cholesky(bodies.inverse_inertia)
 
     def check_start(self, time: float) -> None:
@@ -105,14 +106,18 @@ class ContactSolve:
             gravity: [m/s^2], shape (3,); the bodies' velocities are those before it acts.
             gone: bodies that touch nothing, shape (n,); None: there are none.
         """
-        falls = float(np.linalg.norm(gravity)) * dt
+        falls, near = float(np.linalg.norm(gravity)) * dt, NEAR * float(self._size.min())
+        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
+        everywhere = gone is None or not gone.any()
+        planar = self._planar.find(time, dt, falls, near, brought) if self._planar is not None and everywhere else None
+        if planar is not None:
+            found, contacts = planar
+            return contacts if self._planar.still and not self._joined else self.assembled(self._apart(found), time, dt, gravity)
         six = self.bodies.velocities()
         speeds, spins = lengths(six[:, :3]), lengths(six[:, 3:])
         ways = AHEAD * dt * (speeds + spins * self.reach + falls)
-        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
-        near = NEAR * float(self._size.min())
         found = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
-        if gone is not None and gone.any():
+        if not everywhere:
             out = np.append(gone, False)
             found = found.where(~(out[found.first] | out[found.second]))
         return self.assembled(found, time, dt, gravity)

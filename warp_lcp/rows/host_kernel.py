@@ -13,7 +13,7 @@ import warp as wp
 from warp_lcp.rows.layout import Rows
 from warp_lcp.rows.memory import Scalar, rows_memory
 from warp_lcp.rows.program import LaunchGraph
-from warp_lcp.rows.row_pass import RowPass
+from warp_lcp.rows.row_pass import PLACE, RowPass
 
 
 class HostKernel(threading.local):
@@ -21,11 +21,12 @@ class HostKernel(threading.local):
 
     Args:
         kernel: has `reals` (float64) and `indices` (int32) as `whole`, float64 fields of its tasks as `box`, and numbers.
+        numbers: of the kernel that are the same in all runs.
     """
 
-    def __init__(self, kernel: RowPass) -> None:
+    def __init__(self, kernel: RowPass, **numbers: float) -> None:
         self._kernel, self._room, self._tasks = kernel, [0, 0, 0], 0
-        self._numbers = {name: Scalar() for name in kernel.numbers if name not in ("k0", "j0", "i0")}
+        self._numbers = {name: Scalar(numbers.get(name, 0)) for name in kernel.numbers if name not in PLACE}
 
     def run(
         self, reals: Sequence[np.ndarray], indices: Sequence[Any], *, tasks: int = 1, work: int = 0, **numbers: float

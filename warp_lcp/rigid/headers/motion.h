@@ -1,17 +1,19 @@
 // Motion of rigid bodies, see `rigid/body.py`. Matrices are stored by rows; `values` are the 26
 // numbers of a body's state.
 
-// snippet turns: Angular velocities, matrices of rotations, and the step of `advance_states`.
+// snippet spins: Angular velocities R I^-1 R' L.
+const auto spin_of = [&](const double *R, const double *inverse, const double *L, double *w) {
+    double u[3], v[3];
+    apply_transposed(R, L, u); apply(inverse, u, v); apply(R, v, w);
+};
+
+// snippet turns: Matrices of rotations, and the step of `advance_states`.
 const auto cross_matrix = [&](const double *v, double *K) {  // K x = v x x; zeros are products, so that what is not finite spreads
     const double zero = fused(v[2], 0.0, fused(v[1], 0.0, v[0]*0.0));
     K[0] = K[4] = K[8] = zero;
     K[1] = zero - v[2]; K[2] = zero + v[1];
     K[3] = zero + v[2]; K[5] = zero - v[0];
     K[6] = zero - v[1]; K[7] = zero + v[0];
-};
-const auto spin_of = [&](const double *R, const double *inverse, const double *L, double *w) {  // R I^-1 R' L
-    double u[3], v[3];
-    apply_transposed(R, L, u); apply(inverse, u, v); apply(R, v, w);
 };
 const auto rotation_by = [&](const double *v, double *R) {  // by |v| about v
     const double pi = 3.141592653589793, angle = length(v)/pi;
@@ -60,6 +62,7 @@ const auto advance = [&](double *values, double mass, const double *inverse, dou
 //   constants  MOST_ROUNDS = 60
 EXACT_MATH
 #include "algebra.h:algebra"
+#include "spins"
 #include "turns"
 const double *mass = reals + 26*count, *inverse = mass + count, *dt = inverse + 9*count;
 for (int t = first; t < last; ++t) advance(reals + 26*t, mass[t], inverse + 9*t, dt[t]);
@@ -74,6 +77,7 @@ for (int t = first; t < last; ++t) advance(reals + 26*t, mass[t], inverse + 9*t,
 //   constants  MOST_ROUNDS = 60
 EXACT_MATH
 #include "algebra.h:algebra"
+#include "spins"
 #include "turns"
 const double *mass = reals + 26*count, *inverse = mass + count, *centers = inverse + 9*count, *time = centers + 3*count;
 double *rotations = reals + 39*count + times, *translations = rotations + 9*count*times;

@@ -1,0 +1,121 @@
+"""Contacts of a few bodies in a plane by one native call, with the bits of `ContactDetection` and `ContactSolve.assembled`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from warp_lcp.rigid.box_contacts import FACE_FIRST, PARALLEL
+from warp_lcp.rigid.contact_detection import (
+    FLAT,
+    LEVEL,
+    LOWER,
+    MORE,
+    MOST,
+    MUCH_LOWER,
+    OTHER_SIDE,
+    SAME,
+    ContactDetection,
+    ContactPoints,
+    FoundContacts,
+)
+from warp_lcp.rigid.contact_shape import ON_SURFACE
+from warp_lcp.rigid.contacts import Contacts
+from warp_lcp.rigid.obstacles import Obstacle
+from warp_lcp.rows import KernelFile
+from warp_lcp.rows.host_kernel import HostKernel
+
+AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for
+FEW = 64  # bodies: with more, pairs are sorted
+WIDTHS = (1, 1, 1, 3, 3, 1, 6, 6, 6, 2, 1, 1, 1, 1)  # numbers of a contact, field by field
+FIND = HostKernel(
+    KernelFile(Path(__file__).parent / "headers/planar_contacts.h")["warp_lcp.rigid.planar_contacts.find"],
+    AHEAD=AHEAD, ON_SURFACE=ON_SURFACE, PARALLEL=PARALLEL, FACE_FIRST=FACE_FIRST, LOWER=LOWER, MUCH_LOWER=MUCH_LOWER, LEVEL=LEVEL, SAME=SAME,
+    OTHER_SIDE=OTHER_SIDE, FLAT=FLAT[2], MORE=MORE, MOST_OF_PAIR=MOST[2],
+)  # fmt: skip
+
+
+class PlanarContacts:
+    """Search for the contacts of a few boxes, discs and capsules in a plane.
+
+    Args:
+        detection: of the bodies, of which `holds` is true.
+        reach: of each body's points from its center of mass [m], shape (n,).
+    """
+
+    def __init__(self, detection: ContactDetection, reach: np.ndarray) -> None:
+        self.bodies, self.obstacles = detection.bodies, detection.obstacles
+        bodies, shapes = self.bodies, detection.shapes
+        middle = [0.5 * (shape.low + shape.high) for shape in shapes]
+        half = [0.5 * (shape.high - shape.low) - shape.radius for shape in shapes]
+        of_bodies = [[body.friction for body in bodies], [body.restitution for body in bodies]]
+        of_shapes = [shape.numbers for shape in shapes]
+        fixed = (bodies.mass, bodies.inverse_inertia, bodies.center, middle, half, reach, *of_bodies, of_shapes)
+        self._fixed = np.concatenate([np.ravel(of) for of in fixed])
+        self._planes = np.array([len(obstacle.points) if obstacle.shape is None else -1 for obstacle in self.obstacles], dtype=np.int32)
+        self.still = all(obstacle.motion is None for obstacle in self.obstacles)
+        self._standing = [self._placed(obstacle, 0.0) if obstacle.motion is None else None for obstacle in self.obstacles]
+        self._around: tuple[float, np.ndarray] | None = None  # obstacles that all stand, and the margin around them
+        self._capacity = 64
+
+    @staticmethod
+    def holds(detection: ContactDetection) -> bool:
+        """Return whether it finds the contacts of these bodies and obstacles."""
+        shapes = (*detection.shapes, *(obstacle.shape for obstacle in detection.obstacles if obstacle.shape is not None))
+        return (
+            detection.dimension == 2 and not detection.every and len(detection.shapes) <= FEW and all(s.numbers is not None for s in shapes)
+        )
+
+    @staticmethod
+    def _placed(obstacle: Obstacle, time: float) -> np.ndarray:
+        """Return what the kernel has of an obstacle, but for its margin."""
+        pose, shape = obstacle.pose(time), obstacle.shape
+        if shape is None:
+            return np.concatenate([pose.apply(obstacle.points).ravel(), (obstacle.normals @ pose.rotation.T).ravel()])
+        reach = np.abs(pose.rotation) @ (0.5 * (shape.high - shape.low))
+        of_pose = [pose.rotation.ravel(), pose.translation, pose.apply(0.5 * (shape.low + shape.high)), reach]
+        return np.concatenate([shape.numbers, *of_pose])
+
+    def _obstacles(self, time: float, margins: Sequence[float]) -> np.ndarray:
+        """Return the kernel's obstacles, each with the gap up to which a body that rests touches it [m]."""
+        if self.still and self._around is not None and self._around[0] == margins[0]:
+            return self._around[1]
+        placed = [self._placed(o, time) if of is None else of for o, of in zip(self.obstacles, self._standing, strict=True)]
+        found = np.concatenate([part for margin, of in zip(margins, placed, strict=True) for part in ((margin,), of)] or [np.zeros(0)])
+        if self.still and len(margins):
+            self._around = margins[0], found
+        return found
+
+    def find(self, time: float, dt: float, falls: float, near: float, brought: Sequence[float]) -> tuple[FoundContacts, Contacts] | None:
+        """Return the contacts, and these with rows for obstacles that stand.
+
+        Args:
+            time: of the state [s].
+            dt: time step [s].
+            falls: speed that gravity gives in a step [m/s].
+            near: gap up to which bodies that rest touch each other [m].
+            brought: how far each obstacle may come [m].
+
+        Returns:
+            None: this loop does not find them.
+        """
+        n, capacity = len(self.bodies), self._capacity
+        obstacles = self._obstacles(time, [near + way for way in brought])
+        given = (self.bodies.values, self._fixed, obstacles)
+        sizes = {"count": n, "obstacles": len(self.obstacles), "length_of_obstacles": len(obstacles), "capacity": capacity}
+        reals, (total,) = FIND.run(given, (self._planes,), work=10 * n + sum(WIDTHS) * capacity, dt=dt, falls=falls, near=near, **sizes)
+        k, begin = int(total[0]), 103 * n + len(obstacles) + 10 * n
+        if k < 0:
+            return None
+        fields = []
+        for width in WIDTHS:
+            fields.append(reals[begin : begin + width * k].copy())
+            begin += width * capacity
+        first, second, which = (field.astype(np.int64) for field in fields[:3])
+        point, normal, gap = fields[3].reshape(k, 3), fields[4].reshape(k, 3), fields[5]
+        frames, one, other = (field.reshape(k, 2, 3) for field in fields[6:9])
+        wall, target, friction, restitution, size = fields[9].reshape(k, 2), *fields[10:]
+        found = FoundContacts(first, second, which, ContactPoints(point, normal, gap))
+        return found, Contacts(first, second, point, frames, gap, size, friction, one, other, wall, target, restitution, np.zeros(k))
