@@ -123,8 +123,9 @@ class ContactSolve:
         return self.assembled(found, time, dt, gravity)
 
     def approach(self, contacts: Contacts) -> np.ndarray:
-        """Return normal velocities at contacts [m/s], shape (k,); negative: approaching."""
-        return contacts.velocities(self._velocities())[:, 0] if len(contacts) else np.zeros(0)
+        """Return normal velocities at contacts [m/s], shape (k,), for `bounce`; negative: approaching; 0 where nothing bounces."""
+        bounces = contacts.restitution.any()  # else `bounce` does nothing
+        return contacts.velocities(self._velocities())[:, 0] if bounces else np.zeros(len(contacts))
 
     def bounce(self, contacts: Contacts, approach: np.ndarray, dt: float, kick_dt: float, gravity: np.ndarray) -> np.ndarray:
         """Set the rebound velocity and time of impacts (updates the contacts).
@@ -145,6 +146,8 @@ class ContactSolve:
             Impulses of the other contacts before the impacts [N s], shape (k, dimension).
         """
         before = np.zeros((len(contacts), self.dimension))
+        if not contacts.restitution.any():
+            return before
         g, gap, e = float(np.linalg.norm(gravity)), contacts.gap, contacts.restitution
         may = (e > 0.0) & (approach < -BOUNCE * g * dt) & (gap + dt * (approach - FALL * g * kick_dt) < 0.0)
         if not may.any():
@@ -238,6 +241,12 @@ class ContactSolve:
         self.residual, self.iterations = 0.0, 0
         if not len(contacts) and not self.joints:
             return np.zeros((0, self.dimension))
+        if self._planar is not None and not self.joints and self._solver is sweeps_and_newton:
+            given = (self.memory.values, False) if start is None else (start, True)
+            solved = self._planar.push(contacts, *given, EXACT, UNSOLVED)
+            if solved is not None:
+                impulses, self.residual, self.iterations = solved
+                return impulses
         b = contacts.velocities(self._velocities())
         b[:, 0] -= contacts.target
         start = self.memory.recall(contacts, self.bodies) if start is None else start

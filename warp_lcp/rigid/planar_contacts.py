@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.box_contacts import FACE_FIRST, PARALLEL
 from warp_lcp.rigid.contact_detection import (
     FLAT,
@@ -21,8 +22,9 @@ from warp_lcp.rigid.contact_detection import (
     ContactPoints,
     FoundContacts,
 )
+from warp_lcp.rigid.contact_problem import YIELDS
 from warp_lcp.rigid.contact_shape import ON_SURFACE
-from warp_lcp.rigid.contacts import Contacts
+from warp_lcp.rigid.contacts import SAME_PLACE, Contacts
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.host_kernel import HostKernel
@@ -30,11 +32,13 @@ from warp_lcp.rows.host_kernel import HostKernel
 AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for
 FEW = 64  # bodies: with more, pairs are sorted
 WIDTHS = (1, 1, 1, 3, 3, 1, 6, 6, 6, 2, 1, 1, 1, 1)  # numbers of a contact, field by field
+KERNELS = KernelFile(Path(__file__).parent / "headers/planar_contacts.h")
 FIND = HostKernel(
-    KernelFile(Path(__file__).parent / "headers/planar_contacts.h")["warp_lcp.rigid.planar_contacts.find"],
-    AHEAD=AHEAD, ON_SURFACE=ON_SURFACE, PARALLEL=PARALLEL, FACE_FIRST=FACE_FIRST, LOWER=LOWER, MUCH_LOWER=MUCH_LOWER, LEVEL=LEVEL, SAME=SAME,
-    OTHER_SIDE=OTHER_SIDE, FLAT=FLAT[2], MORE=MORE, MOST_OF_PAIR=MOST[2],
+    KERNELS["warp_lcp.rigid.planar_contacts.find"],
+    AHEAD=AHEAD, ON_SURFACE=ON_SURFACE, PARALLEL=PARALLEL, FACE_FIRST=FACE_FIRST, LOWER=LOWER, MUCH_LOWER=MUCH_LOWER,
+    LEVEL=LEVEL, SAME=SAME, OTHER_SIDE=OTHER_SIDE, FLAT=FLAT[2], MORE=MORE, MOST_OF_PAIR=MOST[2],
 )  # fmt: skip
+PUSH = HostKernel(KERNELS["warp_lcp.rigid.planar_contacts.push"], YIELDS=YIELDS, SAME_PLACE=SAME_PLACE)
 
 
 class PlanarContacts:
@@ -59,6 +63,9 @@ class PlanarContacts:
         self._standing = [self._placed(obstacle, 0.0) if obstacle.motion is None else None for obstacle in self.obstacles]
         self._around: tuple[float, np.ndarray] | None = None  # obstacles that all stand, and the margin around them
         self._capacity = 64
+        self._masses = np.concatenate(
+            [np.ravel(of) for of in (bodies.mass, bodies.inverse_inertia, np.linalg.cholesky(bodies.inverse_inertia))]
+        )
 
     @staticmethod
     def holds(detection: ContactDetection) -> bool:
@@ -115,7 +122,37 @@ class PlanarContacts:
             begin += width * capacity
         first, second, which = (field.astype(np.int64) for field in fields[:3])
         point, normal, gap = fields[3].reshape(k, 3), fields[4].reshape(k, 3), fields[5]
-        frames, one, other = (field.reshape(k, 2, 3) for field in fields[6:9])
+        frames = fields[6].reshape(k, 2, 3)
+        # in the order in which `ContactSolve.assembled` leaves them, by which BLAS chooses how it adds up
+        one, other = (np.ascontiguousarray(rows.reshape(k, 2, 3).transpose(2, 0, 1)).transpose(1, 2, 0) for rows in fields[7:9])
         wall, target, friction, restitution, size = fields[9].reshape(k, 2), *fields[10:]
         found = FoundContacts(first, second, which, ContactPoints(point, normal, gap))
         return found, Contacts(first, second, point, frames, gap, size, friction, one, other, wall, target, restitution, np.zeros(k))
+
+    def push(
+        self, contacts: Contacts, before: np.ndarray, resumed: bool, stopping: StoppingCriteria, unsolved: float
+    ) -> tuple[np.ndarray, float, int] | None:
+        """Push the bodies apart by nonlinear conjugate gradients on sweeps.
+
+        Args:
+            contacts: of the step.
+            before: impulses to start from [N s], shape (k, 2), if `resumed`; else those of a `ContactMemory`, shape (m, 8).
+            resumed: see `before`.
+            stopping: of NNCG.
+            unsolved: largest residual with which the bodies are pushed.
+
+        Returns:
+            Impulses of the contacts [N s], residual and iterations; None: they are not solved for, and the bodies are as before.
+        """
+        c, n, k = contacts, len(self.bodies), len(contacts)
+        of_contacts = (c.point, c.frames, c.size, c.one, c.other, c.wall, c.target, c.friction)
+        given, work = (self.bodies.values, self._masses, *of_contacts, before), 37 * k + 12 * (n + 1)
+        reals, (worst, iterations) = PUSH.run(
+            given, (c.first, c.second), work=work, places=5 * k + n + 2, count=n, contacts=k, old=0 if resumed else len(before),
+            resumed=resumed, rtol=stopping.rtol, most=stopping.max_iterations, unsolved=unsolved,
+        )  # fmt: skip
+        if not worst[0] <= unsolved:
+            return None
+        self.bodies.values[:] = reals[: 26 * n].reshape(n, 26)
+        begin = 45 * n + 26 * k + before.size
+        return reals[begin : begin + 2 * k].reshape(k, 2).copy(), float(worst[0]), int(iterations[0])

@@ -29,7 +29,7 @@ class HostKernel(threading.local):
         self._numbers = {name: Scalar(numbers.get(name, 0)) for name in kernel.numbers if name not in PLACE}
 
     def run(
-        self, reals: Sequence[np.ndarray], indices: Sequence[Any], *, tasks: int = 1, work: int = 0, **numbers: float
+        self, reals: Sequence[np.ndarray], indices: Sequence[Any], *, tasks: int = 1, work: int = 0, places: int = 0, **numbers: float
     ) -> tuple[np.ndarray, list[np.ndarray]]:
         """Run the kernel.
 
@@ -38,13 +38,14 @@ class HostKernel(threading.local):
             indices: what `indices` holds.
             tasks: number of elements of each field in `box`, which are 0 before.
             work: room in `reals` after what is given, which is not cleared.
+            places: likewise in `indices`.
             numbers: of the kernel.
 
         Returns:
             `reals` and each field in `box`: the memory itself, which the next run overwrites.
         """
         filled, listed = sum(f.size for f in reals), sum(map(len, indices))
-        self._reserve(filled + work, listed, tasks)
+        self._reserve(filled + work, listed + places, tasks)
         np.concatenate([f.ravel() for f in reals], out=self._reals[:filled])
         if listed:
             np.concatenate(indices, out=self._indices[:listed], casting="same_kind")
