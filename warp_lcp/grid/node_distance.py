@@ -7,6 +7,7 @@ nearest to its center. Distances below `FAR` cells are exact, others are at leas
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from operator import ge
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.rows.program import clear, copy
 
-NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) and one past the last
+NodeBox = tuple[Sequence[int], Sequence[int]]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
 KINDS: dict[Any, int] = {Box: kernels.BOX, Sphere: kernels.SPHERE, Capsule: kernels.CAPSULE, Plane: kernels.PLANE}
 PLACE = HostKernel(KernelFile(Path(__file__).parent / "headers/node_distance.h")["warp_lcp.grid.node_distance.place"])
@@ -67,9 +68,9 @@ class NodeDistances:
             copy(target, source)
 
 
-def node_window(grid: StaggeredGrid, low: np.ndarray, high: np.ndarray) -> Window:
+def node_window(grid: StaggeredGrid, low: Sequence[int], high: Sequence[int]) -> Window:
     """Return the window of nodes low <= (x, y, z) < high, without cells where there are none."""
-    if (low >= high).any():
+    if any(map(ge, low, high)):
         return Window((1, 1, 1), (1, 1, 2), grid.device)
     return Window(_kji(low), _kji(high), grid.device)
 
@@ -79,6 +80,12 @@ def nodes_near(grid: StaggeredGrid, geometry: Geometry, reach: float = FAR) -> t
     bounds = geometry.bounds()
     low, high = nodes_within(grid, UNLIMITED if bounds is None else bounds, reach)
     return (low, high) if (low < high).all() else None
+
+
+def box_near(grid: StaggeredGrid, geometry: Geometry) -> NodeBox | None:
+    """Return the box of `nodes_near`."""
+    near = nodes_near(grid, geometry)
+    return None if near is None else (near[0].tolist(), near[1].tolist())
 
 
 def nodes_within(grid: StaggeredGrid, bounds: np.ndarray, reach: float = FAR) -> tuple[np.ndarray, np.ndarray]:
@@ -154,18 +161,18 @@ class ShapeTable:
         given = (rotation, translation, self._fixed)
         reals, (near,) = PLACE.run(given, (self._places,), work=12 * shapes + 6 * n + 6, **self._numbers)
         begin = 12 * n + len(self._fixed)
-        inverse, origin, nodes, around = np.split(
-            reals[begin : begin + 12 * shapes + 6 * n + 6], np.cumsum([9 * shapes, 3 * shapes, 6 * n])
-        )
+        middle, after = begin + 9 * shapes, begin + 12 * shapes
+        inverse, origin = reals[begin:middle], reals[middle:after]
+        nodes, around = reals[after : after + 6 * n], reals[after + 6 * n : after + 6 * n + 6].tolist()
         frame, solids, boxes = self._shapes.host["frame"], self._solids.host, nodes.reshape(n, 2, 3).astype(np.int64)
         frame["inverse_rotation"], frame["translation"] = inverse.reshape(-1, 3, 3), origin.reshape(-1, 3)
         self.low, self.high = boxes[:, 0], boxes[:, 1]
         solids["low"], solids["high"] = self.low, self.high
         self._solids.send()
         self._shapes.send()
-        low, high = around.reshape(2, 3).astype(np.int64)
-        self.box = (low, high) if near[0] else None
-        self._window.move_to(node_window(self.grid, *(self.box or (self.low[0], self.low[0]))))
+        low, high = map(int, around[:3]), map(int, around[3:])
+        self.box = (tuple(low), tuple(high)) if near[0] else None
+        self._window.move_to(node_window(self.grid, *(self.box or ((0, 0, 0), (0, 0, 0)))))
 
     def enter(self, nodes: NodeDistances, snap: float) -> None:
         """Enter the solids' distances; those within `snap` [cells] of a surface are 0."""
@@ -219,7 +226,7 @@ class NodeSampler:
                     wp.launch(kernels.claim_listed, count, inputs, device=self.grid.device)
 
     def look_at_centers(
-        self, nodes: NodeDistances, solids: Callable[[], Sequence[Geometry]], low: np.ndarray, high: np.ndarray, marks: wp.array,
+        self, nodes: NodeDistances, solids: Callable[[], Sequence[Geometry]], low: Sequence[int], high: Sequence[int], marks: wp.array,
         listed: bool = False,
     ) -> None:  # fmt: skip
         """Mark as HOLLOW the cells in the open whose corners all have distance 0: gaps of one cell, where plates have no mark.
@@ -233,27 +240,27 @@ class NodeSampler:
             listed: whether `list_flat_cells` has listed the cells.
         """
         low, high = self.inner(low, high)
-        if (low >= high).any():
+        if any(map(ge, low, high)):
             return
         if not listed:
             self.list_flat_cells(nodes, node_window(self.grid, low, high))
         found = int(self._listed.numpy()[0])
         if found > len(self._list):
-            longest = int(np.argmax(high - low))
-            middle = int(low[longest] + high[longest]) // 2
+            longest = int(np.argmax(np.subtract(high, low)))
+            middle = (low[longest] + high[longest]) // 2
             for part in (slice(None, middle), slice(middle, None)):
-                begin, end = low.copy(), high.copy()
+                begin, end = list(low), list(high)
                 begin[longest], end[longest] = part.start or begin[longest], part.stop or end[longest]
                 self.look_at_centers(nodes, solids, begin, end, marks)
         elif found:
-            block, listed = self._block(low, high, offset=0.5), self._list[:found]
+            block, listed = self._block(np.array(low), np.array(high), offset=0.5), self._list[:found]
             for order, geometry in enumerate(solids()):
                 distances = self._measure(geometry, found, kernels.listed_points, [block, listed])
                 wp.launch(kernels.mark_listed, found, [listed, distances, order == 0, marks], device=self.grid.device)
 
-    def inner(self, low: np.ndarray, high: np.ndarray) -> NodeBox:
+    def inner(self, low: Sequence[int], high: Sequence[int]) -> NodeBox:
         """Return a box of nodes without those that are the low corner of no cell inside the ring."""
-        return np.maximum(low, 1), np.minimum(high, np.array(self.grid.shape[::-1]) - 1)
+        return [max(start, 1) for start in low], [min(stop, end - 1) for stop, end in zip(high, self.grid.shape[::-1], strict=True)]
 
     def list_flat_cells(self, nodes: NodeDistances, window: Window) -> None:
         """List the cells of a window in the open whose corners all have distance 0."""
@@ -304,5 +311,5 @@ def _parts(geometry: Geometry) -> list[Any]:
     return [shape for part in geometry.parts for shape in _parts(part)] if isinstance(geometry, Union) else [geometry]
 
 
-def _kji(corner: np.ndarray) -> tuple[int, int, int]:
+def _kji(corner: Sequence[int]) -> tuple[int, int, int]:
     return int(corner[2]), int(corner[1]), int(corner[0])

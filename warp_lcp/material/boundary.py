@@ -23,7 +23,7 @@ from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.wall import Join, extend_velocity, extend_velocity_cut
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, clear, launch
+from warp_lcp.rows.program import LaunchGraph, clear, copy, launch
 from warp_lcp.rows.readings import Reading
 
 Faces = list[wp.array]  # one field a component
@@ -248,7 +248,8 @@ class CutBoundary:
         self._size = grid.extent
         self._size[grid.dimension :] = 0.0
         self.kinks = tuple(time for motion in self._motions.motions for time in kinks(motion))
-        self._walls = LaunchGraph(grid.device, self._find_walls)
+        if cut.moves:
+            cut.accompany(self._keep_distance, self._find_walls)
         self._find_walls()
         self._join_sides()
 
@@ -280,7 +281,6 @@ class CutBoundary:
         """Advect particles, then move the solids to `time`."""
         self._dt.value = dt
         if self.moves:
-            wp.copy(self._reachable, self.cut.distance)
             self.place(time)
         self._advection.run(fields, position)
         self._counts.changed()
@@ -314,7 +314,6 @@ class CutBoundary:
         if self.moves:
             self._time = time
             self.cut.place(time)
-            self._walls.run()
             self._join_sides()
 
     def shapes(self) -> Sequence[Geometry]:
@@ -356,6 +355,10 @@ class CutBoundary:
         """Return by how much the distances at the two sides of an axis differ, as far as solids are near [cells]."""
         lines = np.moveaxis(np.clip(self.distance.numpy(), -CLOSE, CLOSE), 2 - axis, 0)
         return float(np.abs(lines[1] - lines[-1]).max())
+
+    def _keep_distance(self) -> None:
+        """Launch the copy of the distance before the solids move: particles may go where it is open before or after."""
+        copy(self._reachable, self.cut.distance)
 
     def _find_walls(self) -> None:
         walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third

@@ -301,6 +301,9 @@ class BodyStates(Sequence[RigidBody]):
         Shape (n, k) [N s, N m s]; as `RigidBody.apply_impulse` of each.
         """
         self.given += in_space(impulses)
+        if all(body.hold is None for body in self._bodies):
+            self.push(impulses)
+            return
         held = [impulse if body.hold is None else body.hold @ impulse for body, impulse in zip(self, impulses, strict=True)]
         self.push(np.array(held).reshape(impulses.shape))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -71,6 +72,7 @@ class ContactSolve:
         bodies, shapes = self.bodies, detection.shapes
         self.reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
+        self._near = NEAR * float(self._size.min(initial=np.inf))
         self._friction = np.array([body.friction for body in bodies])
         self._bounce = np.array([body.restitution for body in bodies])
         self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # and the rotations that they are of
@@ -106,7 +108,7 @@ class ContactSolve:
             gravity: [m/s^2], shape (3,); the bodies' velocities are those before it acts.
             gone: bodies that touch nothing, shape (n,); None: there are none.
         """
-        falls, near = float(np.linalg.norm(gravity)) * dt, NEAR * float(self._size.min())
+        falls, near = math.sqrt(gravity @ gravity) * dt, self._near
         brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
         everywhere = gone is None or not gone.any()
         planar = self._planar.find(time, dt, falls, near, brought) if self._planar is not None and everywhere else None

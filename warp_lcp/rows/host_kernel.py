@@ -44,32 +44,36 @@ class HostKernel(threading.local):
         Returns:
             `reals` and each field in `box`: the memory itself, which the next run overwrites.
         """
-        filled, listed = sum(f.size for f in reals), sum(map(len, indices))
-        self._reserve(filled + work, listed + places, tasks)
-        np.concatenate([f.ravel() for f in reals], out=self._reals[:filled])
+        pieces, room = [f.ravel() for f in reals], self._room
+        filled, listed = sum(map(len, pieces)), sum(map(len, indices))
+        if filled + work > room[0] or listed + places > room[1] or tasks > room[2]:
+            self._reserve(filled + work, listed + places, tasks)
+        np.concatenate(pieces, out=self._reals[:filled])
         if listed:
             np.concatenate(indices, out=self._indices[:listed], casting="same_kind")
-        for name, number in numbers.items():
-            self._numbers[name].value = number
-        for field in self._fields.values():
-            field[:tasks] = 0.0
+        for name, value in numbers.items():
+            number = self._numbers[name]
+            if number.value != value:
+                number.value = value
+        fields = [field[:tasks] for field in self._fields]
+        for field in fields:
+            field[:] = 0.0
         if tasks != self._tasks:
             self._tasks = tasks
             self._rows.take(Rows.entries(tasks, self._device).single)
         self._graph.run()
-        return self._reals, [field[:tasks] for field in self._fields.values()]
+        return self._reals, fields
 
     def _launch(self) -> None:
         rows = replace(Rows.entries(self._tasks, self._device), memory=self._rows)
         self._kernel.bind(rows, **self._arrays, **self._numbers).launch()
 
     def _reserve(self, *sizes: int) -> None:
-        if all(size <= room for size, room in zip(sizes, self._room, strict=True)):
-            return
+        """Allocate at least so many reals, indices and tasks, twice those asked for."""
         reals, indices, tasks = self._room = [max(2 * size, room, 1) for size, room in zip(sizes, self._room, strict=True)]
         self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
-        self._fields = {name: np.zeros(tasks) for name in self._kernel.box}
-        self._arrays = {name: _warp(values) for name, values in self._fields.items()}
+        self._fields = [np.zeros(tasks) for _ in self._kernel.box]
+        self._arrays = {name: _warp(values) for name, values in zip(self._kernel.box, self._fields, strict=True)}
         self._arrays |= {"reals": _warp(self._reals), "indices": _warp(self._indices)}
         self._device = wp.get_device("cpu")
         self._rows, self._tasks = rows_memory(self._device), 0  # not before: an import must not start Warp
