@@ -167,7 +167,7 @@ class RigidBodies:
             self.solve_contacts()
         assert self._begun is not None
         begun = self._begun
-        self._solve.memory.keep(begun.contacts, begun.impulses, self.bodies)
+        self._solve.remember(begun.contacts, begun.impulses)
         self.contacts = len(begun.contacts)
         ways = self._solve.separation(begun.contacts, dt, begun.detour)
         self.bodies.release()

@@ -17,10 +17,9 @@ from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, Join
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
-from warp_lcp.rigid.planar_contacts import AHEAD, PlanarContacts
+from warp_lcp.rigid.planar_contacts import AHEAD, SLOP, PlanarContacts, PlanarImpulses
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
-SLOP = 1e-5  # of a body's size: overlap that is left alone
 RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
 BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
@@ -77,6 +76,7 @@ class ContactSolve:
         self._bounce = np.array([body.restitution for body in bodies])
         self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # and the rotations that they are of
         self._last: tuple[Contacts, np.ndarray, ContactProblem] | None = None  # contacts, roots and problem of `push_apart`
+        self._pushed: PlanarImpulses | None = None  # by the last `push_apart`
         self._planar = PlanarContacts(detection, self.reach) if PlanarContacts.holds(detection) else None
         self._roots_of_inertias = np.linalg.cholesky(bodies.inverse_inertia)
 
@@ -245,10 +245,10 @@ class ContactSolve:
             return np.zeros((0, self.dimension))
         if self._planar is not None and not self.joints and self._solver is sweeps_and_newton:
             given = (self.memory.values, False) if start is None else (start, True)
-            solved = self._planar.push(contacts, *given, EXACT, UNSOLVED)
+            self._pushed = solved = self._planar.push(contacts, *given, EXACT, UNSOLVED, dt)
             if solved is not None:
-                impulses, self.residual, self.iterations = solved
-                return impulses
+                self.residual, self.iterations = solved.residual, solved.iterations
+                return solved.impulses
         b = contacts.velocities(self._velocities())
         b[:, 0] -= contacts.target
         start = self.memory.recall(contacts, self.bodies) if start is None else start
@@ -310,6 +310,13 @@ class ContactSolve:
         moved.advance(dt)
         return moved
 
+    def remember(self, contacts: Contacts, impulses: np.ndarray) -> None:
+        """Keep impulses, shape (k, dimension), to start the next step from."""
+        if self._pushed is not None and self._pushed.impulses is impulses:
+            self.memory.take(self._pushed.memory)
+        else:
+            self.memory.keep(contacts, impulses, self.bodies)
+
     def separation(self, contacts: Contacts, dt: float, detour: np.ndarray | None = None) -> np.ndarray | None:
         """Return the smallest displacements that reduce overlaps at the end of a step.
 
@@ -322,8 +329,12 @@ class ContactSolve:
             dt: time step [s].
             detour: of the bodies in the step.
         """
+        pushed, bodies = self._pushed, self.bodies
         if not len(contacts):
             return None
+        if pushed is not None and pushed.contacts is contacts and pushed.dt == dt and detour is None and not pushed.deep:
+            if np.array_equal(pushed.values, bodies.values):  # nothing has pushed them since
+                return None
         velocities = self._velocities() if detour is None else self._velocities() + detour / dt
         gap = contacts.gap + dt * contacts.velocities(velocities)[:, 0]
         deep = gap < -SLOP * contacts.size
@@ -353,7 +364,13 @@ class ContactSolve:
 
         A body that is held holds what bears against it where it cannot move itself: a stack on the floor is held up to its top.
         """
-        if len(contacts):
+        pushed = self._pushed
+        if pushed is not None and pushed.impulses is impulses and pushed.squares is not None:
+            for number, (square, root) in pushed.squares.items():
+                values, V = np.linalg.eigh(square)
+                V = V[:, values > SINGULAR * values.max()]
+                self.bodies[number].hold = np.eye(3) - ((1.0 / root)[:, None] * V) @ V.T * root
+        elif len(contacts):
             firm = Firm.of(contacts, impulses, len(self.bodies))
             roots = self._roots()
             waiting = np.unique(contacts.first[firm.first.any(axis=1)]).tolist()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,7 @@ from warp_lcp.rigid.contact_detection import (
 from warp_lcp.rigid.contact_problem import YIELDS
 from warp_lcp.rigid.contact_shape import ON_SURFACE
 from warp_lcp.rigid.contacts import SAME_PLACE, Contacts
+from warp_lcp.rigid.firm import BEARS
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.host_kernel import HostKernel
@@ -38,7 +41,36 @@ FIND = HostKernel(
     AHEAD=AHEAD, ON_SURFACE=ON_SURFACE, PARALLEL=PARALLEL, FACE_FIRST=FACE_FIRST, LOWER=LOWER, MUCH_LOWER=MUCH_LOWER,
     LEVEL=LEVEL, SAME=SAME, OTHER_SIDE=OTHER_SIDE, FLAT=FLAT[2], MORE=MORE, MOST_OF_PAIR=MOST[2],
 )  # fmt: skip
-PUSH = HostKernel(KERNELS["warp_lcp.rigid.planar_contacts.push"], YIELDS=YIELDS, SAME_PLACE=SAME_PLACE)
+SLOP = 1e-5  # of a body's size: overlap that is left alone
+PUSH = HostKernel(KERNELS["warp_lcp.rigid.planar_contacts.push"], YIELDS=YIELDS, SAME_PLACE=SAME_PLACE, SLOP=SLOP, BEARS=BEARS)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarImpulses:
+    """Result of a push, with what the rest of a step asks for.
+
+    Args:
+        contacts: of the step.
+        impulses: of the contacts [N s], shape (k, 2).
+        residual: the largest of an island, relative to that of no impulses.
+        iterations: the most of an island.
+        dt: of the step [s].
+        values: of the bodies after it.
+        deep: whether a contact will overlap by more than `SLOP` at the end of the step.
+        memory: what a `ContactMemory` keeps of the contacts, shape (k, 8).
+        squares: G'J'JG of the rows J that hold a body against walls and solids, and the diagonal of the root G of its inverse mass,
+            by body; None: bodies that are held touch others.
+    """
+
+    contacts: Contacts
+    impulses: np.ndarray
+    residual: float
+    iterations: int
+    dt: float
+    values: np.ndarray
+    deep: bool
+    memory: np.ndarray
+    squares: dict[int, tuple[np.ndarray, np.ndarray]] | None
 
 
 class PlanarContacts:
@@ -130,8 +162,8 @@ class PlanarContacts:
         return found, Contacts(first, second, point, frames, gap, size, friction, one, other, wall, target, restitution, np.zeros(k))
 
     def push(
-        self, contacts: Contacts, before: np.ndarray, resumed: bool, stopping: StoppingCriteria, unsolved: float
-    ) -> tuple[np.ndarray, float, int] | None:
+        self, contacts: Contacts, before: np.ndarray, resumed: bool, stopping: StoppingCriteria, unsolved: float, dt: float
+    ) -> PlanarImpulses | None:
         """Push the bodies apart by nonlinear conjugate gradients on sweeps.
 
         Args:
@@ -140,19 +172,27 @@ class PlanarContacts:
             resumed: see `before`.
             stopping: of NNCG.
             unsolved: largest residual with which the bodies are pushed.
+            dt: of the step [s].
 
         Returns:
-            Impulses of the contacts [N s], residual and iterations; None: they are not solved for, and the bodies are as before.
+            None: they are not solved for, and the bodies are as before.
         """
         c, n, k = contacts, len(self.bodies), len(contacts)
-        of_contacts = (c.point, c.frames, c.size, c.one, c.other, c.wall, c.target, c.friction)
-        given, work = (self.bodies.values, self._masses, *of_contacts, before), 37 * k + 12 * (n + 1)
-        reals, (worst, iterations) = PUSH.run(
+        of_contacts = (c.point, c.frames, c.size, c.one, c.other, c.wall, c.target, c.friction, c.gap)
+        given, work = (self.bodies.values, self._masses, *of_contacts, before), 45 * k + 23 * (n + 1)
+        reals, (worst, iterations, deep, stacked) = PUSH.run(
             given, (c.first, c.second), work=work, places=5 * k + n + 2, count=n, contacts=k, old=0 if resumed else len(before),
-            resumed=resumed, rtol=stopping.rtol, most=stopping.max_iterations, unsolved=unsolved,
+            resumed=resumed, rtol=stopping.rtol, most=stopping.max_iterations, unsolved=unsolved, dt=dt,
         )  # fmt: skip
         if not worst[0] <= unsolved:
             return None
-        self.bodies.values[:] = reals[: 26 * n].reshape(n, 26)
-        begin = 45 * n + 26 * k + before.size
-        return reals[begin : begin + 2 * k].reshape(k, 2).copy(), float(worst[0]), int(iterations[0])
+        values = reals[: 26 * n].reshape(n, 26).copy()
+        self.bodies.values[:] = values
+        begin = 45 * n + 27 * k + before.size
+        ends = list(accumulate((begin, 2 * k, 8 * k, 9 * n, 3 * (n + 1), n)))
+        impulses, memory, squares, roots, holding = (reals[start:end].copy() for start, end in pairwise(ends))
+        held = np.flatnonzero(holding).tolist() if not stacked[0] else None
+        of_body = None if held is None else {i: (squares[9 * i : 9 * i + 9].reshape(3, 3), roots[3 * i : 3 * i + 3]) for i in held}
+        return PlanarImpulses(
+            contacts, impulses.reshape(k, 2), float(worst[0]), int(iterations[0]), dt, values, bool(deep[0]), memory.reshape(k, 8), of_body
+        )

@@ -378,14 +378,17 @@ for (int t = first; t < last; ++t) total[t] = known ? found : -1;
 
 // kernel warp_lcp.rigid.planar_contacts.push: Impulses of contacts, as `ContactSolve.push_apart` has
 // them. `reals` holds values, masses, inverse inertias and their roots of `count` bodies; `contacts`
-// contacts' points, frames, sizes, rows for both bodies, walls' velocities, targets and frictions;
-// `old` remembered ones, or impulses to start from if `resumed`; then come impulses and work. `indices`
-// holds the contacts' bodies; then come work. Values get the impulses, if `residual` is no more than
-// `unsolved`. `iterations`: the most of an island.
+// contacts' points, frames, sizes, rows for both bodies, walls' velocities, targets, frictions and
+// gaps; `old` remembered ones, or impulses to start from if `resumed`. Then come impulses, what to
+// remember of the contacts, of each body G'J'JG of the rows that hold it, the diagonal of G and whether
+// there are such rows; then work. `indices` holds the contacts' bodies; then comes work. Values get the
+// impulses, if `worst` is no more than `unsolved`. `iterations`: the most of an island. `deep`: how many
+// contacts will overlap in `dt`. `stacked`: how many touch a body that is held, and another one.
 //   compute    float64
 //   whole      float64 reals; int32 indices
-//   box        float64 worst, iterations
-//   numbers    int count, contacts, old; bool resumed; float64 rtol; int most; float64 unsolved, YIELDS, SAME_PLACE
+//   box        float64 worst, iterations, deep, stacked
+//   numbers    int count, contacts, old; bool resumed; float64 rtol; int most; float64 unsolved, dt, YIELDS,
+//              SAME_PLACE, SLOP, BEARS
 //   constants  EACH = 8
 EXACT_MATH
 #include "algebra.h:algebra"
@@ -394,9 +397,9 @@ const int n = count, q = 3, dim = 2, m = 6, size = dim*contacts;
 double *values = reals;
 const double *mass = values + 26*n, *inverse = mass + n, *inertias = inverse + 9*n, *points = inertias + 9*n, *frames = points + 3*contacts;
 const double *sizes = frames + 6*contacts, *ones = sizes + contacts, *others = ones + 6*contacts, *walls = others + 6*contacts;
-const double *targets = walls + 2*contacts, *frictions = targets + contacts, *before = frictions + contacts;
-double *impulses = reals + 45*n + 26*contacts + (resumed ? size : 8*old), *V = impulses + size, *roots = V + 3*(n + 1);
-double *start = roots + 3*(n + 1), *x = start + size, *J = x + size, *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
+const double *targets = walls + 2*contacts, *frictions = targets + contacts, *gaps = frictions + contacts, *before = gaps + contacts;
+double *impulses = reals + 45*n + 27*contacts + (resumed ? size : 8*old), *memory = impulses + size, *squares = memory + 8*contacts;
+double *roots = squares + 9*n, *holding = roots + 3*(n + 1), *largest = holding + n, *V = largest + n + 1, *start = V + 3*(n + 1), *x = start + size, *J = x + size, *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
 double *g = mu + contacts, *way = g + size, *best = way + size, *w = best + size, *places = w + q*(n + 1), *pushes = places + 3*contacts;
 double *far = pushes + 3*(n + 1), *residual = far + contacts, *rounds = residual + contacts;
 const int *first_of = indices, *second_of = first_of + contacts;
@@ -404,10 +407,17 @@ int *order = indices + 2*contacts, *starts = order + contacts, *one = starts + c
 int *least = other + contacts, *nearest = least + n + 1;
 const auto both = [&](const double *x, const double *rows) { return fused(x[0], rows[0], x[1]*rows[3]) + 0.0; };
 for (int i = 0; i <= n; ++i) for (int a = 0; a < 3; ++a) V[3*i + a] = roots[3*i + a] = pushes[3*i + a] = 0.0;
-for (int i = 0; i < n; ++i) {
+const auto find_velocity = [&](int i) {
     double spin[3];
     spin_of(values + 26*i + 3, inverse + 9*i, values + 26*i + 15, spin);
     V[3*i] = values[26*i + 12]/mass[i]; V[3*i + 1] = values[26*i + 13]/mass[i]; V[3*i + 2] = spin[2];
+};
+const auto velocity_of = [&](int k, int r) {
+    const double *u = ones + 6*k + 3*r, *v = others + 6*k + 3*r;
+    return (along(u, 1, V + 3*first_of[k], 1) + along(v, 1, V + 3*second_of[k], 1)) + walls[dim*k + r];
+};
+for (int i = 0; i < n; ++i) {
+    find_velocity(i);
     roots[3*i] = roots[3*i + 1] = 1.0/sqrt(mass[i]);
     roots[3*i + 2] = along(values + 26*i + 9, 1, inertias + 9*i + 2, 3);
     least[i] = i;
@@ -465,7 +475,7 @@ for (int p = 0; p < contacts; ++p) {
         for (int a = 0; a < 3; ++a) { row[a] = u[a]*roots[3*one[p] + a] + 0.0; row[3 + a] = v[a]*roots[3*other[p] + a] + 0.0; }
         const int i = dim*p + r;
         x[i] = start[dim*k + r];
-        b[i] = (along(u, 1, V + 3*one[p], 1) + along(v, 1, V + 3*other[p], 1)) + walls[dim*k + r];
+        b[i] = velocity_of(k, r);
         if (r == 0) b[i] -= targets[k];
         const double own = ((row[0]*row[0] + row[1]*row[1]) + row[2]*row[2]) + ((row[3]*row[3] + row[4]*row[4]) + row[5]*row[5]);
         e[i] = r == 0 ? 0.0 : YIELDS*own;
@@ -489,4 +499,38 @@ if (worst[0] <= unsolved) for (int i = 0; i < n; ++i) {
     double *momentum = values + 26*i + 12;
     momentum[0] += pushes[3*i]; momentum[1] += pushes[3*i + 1]; momentum[2] += 0.0;
     momentum[3] += 0.0; momentum[4] += 0.0; momentum[5] += pushes[3*i + 2];
+    find_velocity(i);
 }
+// what the end of the step asks for: overlaps, and what to remember
+for (int k = 0; k < contacts; ++k) {
+    double *kept = memory + 8*k;
+    kept[0] = first_of[k]; kept[1] = second_of[k];
+    for (int a = 0; a < 3; ++a) {
+        kept[2 + a] = places[3*k + a];
+        kept[5 + a] = fused(impulses[dim*k + 1], frames[6*k + 3 + a], impulses[dim*k]*frames[6*k + a]) + 0.0;
+    }
+    deep[0] += gaps[k] + dt*velocity_of(k, 0) < -SLOP*sizes[k];
+}
+// what walls and other solids hold, see `Firm`: G' J' J G of its rows
+for (int i = 0; i <= n; ++i) largest[i] = 0.0;
+for (int i = 0; i < n; ++i) { holding[i] = 0.0; for (int a = 0; a < 9; ++a) squares[9*i + a] = 0.0; }
+for (int k = 0; k < contacts; ++k) {
+    const double normal = impulses[dim*k];
+    double &mine = largest[first_of[k]], &its = largest[second_of[k]];
+    mine = normal > mine ? normal : mine;
+    its = normal > its ? normal : its;
+}
+largest[n] = INFINITY;
+for (int k = 0; k < contacts; ++k) if (second_of[k] == n) {
+    const int i = first_of[k];
+    const double normal = impulses[dim*k], *g = roots + 3*i;
+    if (!(normal > BEARS*(largest[i] < largest[n] ? largest[i] : largest[n]))) continue;
+    const bool sticks = fabs(impulses[dim*k + 1]) < frictions[k]*normal*(1.0 - BEARS);
+    holding[i] = 1.0;
+    for (int r = 0; r < 1 + sticks; ++r) {
+        double row[3];
+        for (int a = 0; a < 3; ++a) row[a] = ones[6*k + 3*r + a]*g[a];
+        for (int a = 0; a < 9; ++a) squares[9*i + a] = fused(row[a/3], row[a % 3], squares[9*i + a]);
+    }
+}
+for (int k = 0; k < contacts; ++k) stacked[0] += second_of[k] < n && (holding[first_of[k]] > 0.0 || holding[second_of[k]] > 0.0);
