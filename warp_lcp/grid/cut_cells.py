@@ -102,6 +102,8 @@ class CutCells:
             Motions([solid.motion for _, solid in moving if solid.motion is not None]),
             [number for number, _ in moving],
         )
+        next_to_each_other = len(moving) and self._moving[-1] - self._moving[0] == len(moving) - 1
+        self._moves = slice(self._moving[0], self._moving[-1] + 1) if next_to_each_other else self._moving
         if self.moves:
             self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving]))
             self._standing = NodeDistances(grid, second=len(solids) > 1)
@@ -177,7 +179,7 @@ class CutCells:
             return
         if dt == 0.0:
             raise ValueError("dt = 0: a velocity needs two different times")
-        self._turn.host[self._moving], self._shift.host[self._moving] = self.motions.velocity_fields(time, dt)
+        self._turn.host[self._moves], self._shift.host[self._moves] = self.motions.velocity_fields(time, dt)
         self._turn.send()
         self._shift.send()
         near = _around([box for box in (self._moved_from, self._moved_to) if box is not None])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from itertools import accumulate, pairwise
 from operator import is_
 from pathlib import Path
 from typing import cast, overload
@@ -23,6 +22,7 @@ POSITION, ROTATION, MOMENTUM, SPINNING = slice(0, 3), slice(3, 12), slice(12, 15
 ANGLE, TIME, GIVEN = 18, 19, slice(20, 26)
 UNIT, EPSILON = np.eye(3), float(np.finfo(np.float64).eps)
 CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)  # v @ CROSS: entries of the matrix of v x
+NO_TIMES = np.zeros(0)
 AXES = [0, 1, 2]
 PLANAR = [0, 1, 5]  # vx, vy, wz among the six
 KERNELS = KernelFile(Path(__file__).parent / "headers/motion.h", {"MOST_ROUNDS": MOST_ROUNDS})
@@ -284,11 +284,16 @@ class BodyStates(Sequence[RigidBody]):
 
     def inverse_masses(self, dimension: int) -> np.ndarray:
         """Return `RigidBody.inverse_mass` of all, shape (n, k, k)."""
-        turned = self.rotation @ self.inverse_inertia @ self.rotation.swapaxes(-1, -2)
-        result = np.zeros((len(self), 6, 6))
-        result[:, AXES, AXES] = 1.0 / self.mass[:, None]
-        result[:, 3:, 3:] = 0.5 * (turned + turned.swapaxes(-1, -2))
-        result = result if dimension == 3 else result[:, PLANAR][:, :, PLANAR]
+        if dimension == 2:
+            across = self.rotation[:, 2:]  # the last row of R I^-1 R', as far as it counts in the plane
+            result = np.zeros((len(self), 3, 3))
+            result[:, 0, 0] = result[:, 1, 1] = 1.0 / self.mass
+            result[:, 2, 2] = (across @ self.inverse_inertia @ across.swapaxes(-1, -2))[:, 0, 0]
+        else:
+            turned = self.rotation @ self.inverse_inertia @ self.rotation.swapaxes(-1, -2)
+            result = np.zeros((len(self), 6, 6))
+            result[:, AXES, AXES] = 1.0 / self.mass[:, None]
+            result[:, 3:, 3:] = 0.5 * (turned + turned.swapaxes(-1, -2))
         for free, body in zip(result, self, strict=True):
             if body.hold is not None:
                 held = free @ body.hold
@@ -359,8 +364,10 @@ class BodyMotion:
 
         Poses of n bodies at m times [s], see `pose`.
         """
-        rotations, translations, _, _ = _moved(motions, times)
-        return rotations, translations
+        n, m = len(motions), len(times)
+        reals = _moved(motions, times)
+        begin, middle, end = 39 * n + m, 39 * n + m + 9 * m * n, 39 * n + m + 12 * m * n
+        return reals[begin:middle].reshape(m, n, 3, 3).copy(), reals[middle:end].reshape(m, n, 3).copy()
 
     @staticmethod
     def velocity_fields_of(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, np.ndarray]:
@@ -368,19 +375,16 @@ class BodyMotion:
 
         A body's point x moves at turn x + shift now.
         """
-        _, _, turns, shifts = _moved(motions, np.zeros(0))
-        return turns, shifts
+        n = len(motions)
+        reals = _moved(motions, NO_TIMES)
+        return reals[39 * n : 48 * n].reshape(n, 3, 3).copy(), reals[48 * n : 51 * n].reshape(n, 3).copy()
 
 
-def _moved(motions: Sequence[BodyMotion], times: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return rotations and translations at some times, and the turns and shifts of now, of all motions."""
+def _moved(motions: Sequence[BodyMotion], times: np.ndarray) -> np.ndarray:
+    """Return memory of the kernel `poses`: rotations and translations at m times are from 39 n + m on, turns and shifts after them."""
     n, m = len(motions), len(times)
-    shapes = ((m, n, 3, 3), (m, n, 3), (n, 3, 3), (n, 3))
-    sizes = [9 * m * n, 3 * m * n, 9 * n, 3 * n]
-    reals, _ = POSES.run((*_held(motions), times), (), tasks=n, work=sum(sizes), count=n, times=m)
-    found = reals[39 * n + m : 39 * n + m + sum(sizes)].copy()
-    ends = list(accumulate(sizes, initial=0))
-    return tuple(found[begin:end].reshape(shape) for (begin, end), shape in zip(pairwise(ends), shapes, strict=True))
+    reals, _ = POSES.run((*_held(motions), times), (), tasks=n, work=12 * n * (m + 1), count=n, times=m)
+    return reals
 
 
 def _held(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, ...]:
