@@ -425,8 +425,9 @@ def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.nda
         dt: time [s], or one for each, shape (n,).
     """
     count = len(values)
-    inverse = np.broadcast_to(inverse_inertia, (count, 3, 3))
-    reals, _ = ADVANCE.run((values, mass, inverse, np.broadcast_to(dt, count)), (), tasks=count, count=count)
+    inverse = inverse_inertia if inverse_inertia.ndim == 3 else np.broadcast_to(inverse_inertia, (count, 3, 3))
+    each = dt if isinstance(dt, np.ndarray) else np.full(count, dt)
+    reals, _ = ADVANCE.run((values, mass, inverse, each), (), tasks=count, count=count)
     values[:] = reals[: values.size].reshape(values.shape)
 
 

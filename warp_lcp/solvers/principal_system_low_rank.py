@@ -150,13 +150,13 @@ class LowRankCorrection:
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
         power = 1.0 / max(sum(n > 1 for n in self._hierarchy.finest.stencil.padding.counts) - 1, 1)
-        strong = [int(q) for q in np.flatnonzero(np.diag(W) * SPREAD * rows**power * squares >= STRONG)]
+        strong = np.flatnonzero(W.diagonal() * SPREAD * rows**power * squares >= STRONG).tolist()
         if begins:
             self._seen[:] = 0.0
         if strong != self._slot_columns:
             self._choose(strong)
-        seen = self._seen
-        stale = [q for q in strong if not seen[q] / CHANGED <= squares[q] <= seen[q] * CHANGED]
+        seen, now = self._seen.tolist(), squares.tolist()
+        stale = [q for q in strong if not seen[q] / CHANGED <= now[q] <= seen[q] * CHANGED]
         self._fill(stale, squares)
         lost = bool(stale)
         if strong and not self._invert(W) and len(stale) < len(strong):
