@@ -20,6 +20,7 @@ from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import ContactSolve
 from warp_lcp.rigid.mass_properties import MassProperties, mass_properties
 from warp_lcp.rigid.obstacles import domain_walls, obstacle
+from warp_lcp.rigid.planar_contacts import SLOP
 
 ROUNDING = 1e-14  # relative, of a step
 DT, GRAVITY = 4e-3, np.array([0.0, -9.81, 0.0])
@@ -170,6 +171,21 @@ def test_more_contacts_than_there_is_room_for_are_found_all_the_same():
     found, expected = (which.find(0.0, DT, GRAVITY) for which in (solve, plain))
     assert len(expected) > 64
     close(found.gap, expected.gap)
+
+
+def test_overlaps_at_the_end_of_a_step_are_seen():
+    """Contacts that part leave no overlap after a long time, others keep theirs."""
+    seen = []
+    for seed in range(30, 50):
+        _, bodies, shapes, obstacles = drawn_world(seed)
+        solve, dt = solve_of(bodies, shapes, obstacles), 0.5
+        contacts = solve.find(0.0, DT, GRAVITY)
+        impulses = solve.push_apart(contacts, dt=dt)
+        if len(contacts) and solve._pushed is not None and solve._pushed.impulses is impulses:
+            gap = contacts.gap + dt * contacts.velocities(solve.bodies.velocities()[:, [0, 1, 5]])[:, 0]
+            seen.append(bool((gap < -SLOP * contacts.size).any()))
+            assert solve._pushed.deep == seen[-1]
+    assert set(seen) == {True, False}
 
 
 def stepped(seed, loops, steps):
