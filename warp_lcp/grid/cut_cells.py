@@ -91,9 +91,7 @@ class CutCells:
         for number, geometry in standing:
             self._sampler.enter(self._nodes, number, geometry)
         self._marks = wp.array(_ring(grid, open_sides), dtype=wp.int8, device=grid.device)
-        self._sampler.look_at_centers(
-            self._nodes, lambda: [geometry for _, geometry in standing], np.zeros(3, dtype=int), np.array(grid.shape[::-1]), self._marks
-        )
+        self._sampler.look_at_centers(self._nodes, lambda: [geometry for _, geometry in standing], (0, 0, 0), grid.shape[::-1], self._marks)
         wp.copy(self.base, self._marks)
         self._moved_from: NodeBox | None = None  # nodes near the solids that move, where the velocity was filled last
         self._moved_to: NodeBox | None = None  # and where they are

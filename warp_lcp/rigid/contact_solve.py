@@ -111,15 +111,15 @@ class ContactSolve:
         falls, near = math.sqrt(gravity @ gravity) * dt, self._near
         brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
         everywhere = gone is None or not gone.any()
-        planar = self._planar.find(time, dt, falls, near, brought) if self._planar is not None and everywhere else None
-        if planar is not None:
-            found, contacts = planar
-            return contacts if self._planar.still and not self._joined else self.assembled(self._apart(found), time, dt, gravity)
+        planar = self._planar if everywhere else None
+        if planar is not None and (touching := planar.find(time, dt, falls, near, brought)) is not None:
+            found, contacts = touching
+            return contacts if planar.still and not self._joined else self.assembled(self._apart(found), time, dt, gravity)
         six = self.bodies.velocities()
         speeds, spins = lengths(six[:, :3]), lengths(six[:, 3:])
         ways = AHEAD * dt * (speeds + spins * self.reach + falls)
         found = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
-        if not everywhere:
+        if gone is not None and not everywhere:
             out = np.append(gone, False)
             found = found.where(~(out[found.first] | out[found.second]))
         return self.assembled(found, time, dt, gravity)
@@ -244,8 +244,8 @@ class ContactSolve:
         if not len(contacts) and not self.joints:
             return np.zeros((0, self.dimension))
         if self._planar is not None and not self.joints and self._solver is sweeps_and_newton:
-            given = (self.memory.values, False) if start is None else (start, True)
-            self._pushed = solved = self._planar.push(contacts, *given, EXACT, UNSOLVED, dt)
+            before = self.memory.values if start is None else start
+            self._pushed = solved = self._planar.push(contacts, before, start is not None, EXACT, UNSOLVED, dt)
             if solved is not None:
                 self.residual, self.iterations = solved.residual, solved.iterations
                 return solved.impulses

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -88,7 +89,7 @@ class PlanarContacts:
         half = [0.5 * (shape.high - shape.low) - shape.radius for shape in shapes]
         of_bodies = [[body.friction for body in bodies], [body.restitution for body in bodies]]
         of_shapes = [shape.numbers for shape in shapes]
-        fixed = (bodies.mass, bodies.inverse_inertia, bodies.center, middle, half, reach, *of_bodies, of_shapes)
+        fixed: tuple[Any, ...] = (bodies.mass, bodies.inverse_inertia, bodies.center, middle, half, reach, *of_bodies, of_shapes)
         self._fixed = np.concatenate([np.ravel(of) for of in fixed])
         self._planes = np.array([len(obstacle.points) if obstacle.shape is None else -1 for obstacle in self.obstacles], dtype=np.int32)
         self.still = all(obstacle.motion is None for obstacle in self.obstacles)

@@ -26,7 +26,7 @@ class HostKernel(threading.local):
 
     def __init__(self, kernel: RowPass, **numbers: float) -> None:
         self._kernel, self._room, self._tasks = kernel, [0, 0, 0], 0
-        self._numbers = {name: Scalar(numbers.get(name, 0)) for name in kernel.numbers if name not in PLACE}
+        self._numbers: dict[str, Any] = {name: Scalar(numbers.get(name, 0)) for name in kernel.numbers if name not in PLACE}
 
     def run(
         self, reals: Sequence[np.ndarray], indices: Sequence[Any], *, tasks: int = 1, work: int = 0, places: int = 0, **numbers: float
@@ -73,7 +73,7 @@ class HostKernel(threading.local):
         reals, indices, tasks = self._room = [max(2 * size, room, 1) for size, room in zip(sizes, self._room, strict=True)]
         self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
         self._fields = [np.zeros(tasks) for _ in self._kernel.box]
-        self._arrays = {name: _warp(values) for name, values in zip(self._kernel.box, self._fields, strict=True)}
+        self._arrays: dict[str, Any] = {name: _warp(values) for name, values in zip(self._kernel.box, self._fields, strict=True)}
         self._arrays |= {"reals": _warp(self._reals), "indices": _warp(self._indices)}
         self._device = wp.get_device("cpu")
         self._rows, self._tasks = rows_memory(self._device), 0  # not before: an import must not start Warp
