@@ -155,7 +155,7 @@ class CutCells:
         self._refreshing.run()
 
     def accompany(self, before: Callable[[], None], after: Callable[[], None]) -> None:
-        """Have `place` launch something before it changes the distances, and after it has recomputed the fields."""
+        """Have `place` launch more, before distances change and after all else."""
         self._before, self._after = before, after
         self._entering.forget()
         self._refreshing.forget()

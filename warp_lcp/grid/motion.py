@@ -26,7 +26,7 @@ Vector = Sequence[float] | np.ndarray
 ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay near 1e-15
 FASTEST = 1e18  # [m/s] or [degrees/s], between keyframes of a smooth motion: cubics have its square and more
 SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
-TOP_SPEED = HostKernel(KernelFile(Path(__file__).parent / "headers/motion.h")["warp_lcp.grid.motion.top_speed"])
+TOP_SPEED = HostKernel(KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.motion.top_speed"])
 PARTS = np.arange(SPEED_SAMPLES + 1.0)
 UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of a solid without an end
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
@@ -379,7 +379,7 @@ class Motions:
 
 
 def boxes_of(bounds: Sequence[np.ndarray | None]) -> np.ndarray:
-    """Return boxes, shape (2, 3) each, as one array; without limits where there are none."""
+    """Return bounds, shape (2, 3) each, as one array; None: without limits."""
     return np.array([UNLIMITED if box is None else box for box in bounds]).reshape(-1, 2, 3)
 
 

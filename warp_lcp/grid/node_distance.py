@@ -28,7 +28,7 @@ from warp_lcp.rows.program import clear, copy
 NodeBox = tuple[Sequence[int], Sequence[int]]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
 KINDS: dict[Any, int] = {Box: kernels.BOX, Sphere: kernels.SPHERE, Capsule: kernels.CAPSULE, Plane: kernels.PLANE}
-PLACE = HostKernel(KernelFile(Path(__file__).parent / "headers/node_distance.h")["warp_lcp.grid.node_distance.place"])
+PLACE = HostKernel(KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.node_distance.place"])
 SNAP = 1e-6  # of the domain's longest side: distances below it are rounding errors of float32 positions, and count as 0
 
 

@@ -110,7 +110,10 @@ class ContactShape:
 
     @cached_property
     def numbers(self) -> np.ndarray | None:
-        """The shape for the loop in `headers/planar_contacts.h`, shape (55,); None: it does not know the shape."""
+        """Numbers of a disc, capsule or box for `headers/planar_contacts.h`.
+
+        Shape (55,); None: it is another shape.
+        """
         if self.own is None or len(self.points) > len(ALONG):
             return None
         points = np.zeros((len(ALONG), 3))

@@ -125,7 +125,10 @@ class ContactSolve:
         return self.assembled(found, time, dt, gravity)
 
     def approach(self, contacts: Contacts) -> np.ndarray:
-        """Return normal velocities at contacts [m/s], shape (k,), for `bounce`; negative: approaching; 0 where nothing bounces."""
+        """Return normal velocities at contacts [m/s], shape (k,), for `bounce`.
+
+        Negative: approaching; 0 where nothing bounces.
+        """
         bounces = contacts.restitution.any()  # else `bounce` does nothing
         return contacts.velocities(self._velocities())[:, 0] if bounces else np.zeros(len(contacts))
 

@@ -36,14 +36,19 @@ from warp_lcp.rows.host_kernel import HostKernel
 AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for
 FEW = 64  # bodies: with more, pairs are sorted
 WIDTHS = (1, 1, 1, 3, 3, 1, 6, 6, 6, 2, 1, 1, 1, 1)  # numbers of a contact, field by field
-KERNELS = KernelFile(Path(__file__).parent / "headers/planar_contacts.h")
 FIND = HostKernel(
-    KERNELS["warp_lcp.rigid.planar_contacts.find"],
+    KernelFile(Path(__file__).parent / "headers/planar_contacts.h")["warp_lcp.rigid.planar_contacts.find"],
     AHEAD=AHEAD, ON_SURFACE=ON_SURFACE, PARALLEL=PARALLEL, FACE_FIRST=FACE_FIRST, LOWER=LOWER, MUCH_LOWER=MUCH_LOWER,
     LEVEL=LEVEL, SAME=SAME, OTHER_SIDE=OTHER_SIDE, FLAT=FLAT[2], MORE=MORE, MOST_OF_PAIR=MOST[2],
 )  # fmt: skip
 SLOP = 1e-5  # of a body's size: overlap that is left alone
-PUSH = HostKernel(KERNELS["warp_lcp.rigid.planar_contacts.push"], YIELDS=YIELDS, SAME_PLACE=SAME_PLACE, SLOP=SLOP, BEARS=BEARS)
+PUSH = HostKernel(
+    KernelFile(Path(__file__).parent / "headers/planar_impulses.h")["warp_lcp.rigid.planar_impulses.push"],
+    YIELDS=YIELDS,
+    SAME_PLACE=SAME_PLACE,
+    SLOP=SLOP,
+    BEARS=BEARS,
+)
 
 
 @dataclass(frozen=True, eq=False)
