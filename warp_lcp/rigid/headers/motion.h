@@ -8,7 +8,8 @@ const auto spin_of = [&](const double *R, const double *inverse, const double *L
 };
 
 // snippet turns: Matrices of rotations, and the step of `advance_states`.
-const auto cross_matrix = [&](const double *v, double *K) {  // K x = v x x; zeros are products, so that what is not finite spreads
+// K x = v x x; zeros are products, so that what is not finite spreads
+const auto cross_matrix = [&](const double *v, double *K) {
     const double zero = fused(v[2], 0.0, fused(v[1], 0.0, v[0]*0.0));
     K[0] = K[4] = K[8] = zero;
     K[1] = zero - v[2]; K[2] = zero + v[1];
@@ -17,7 +18,8 @@ const auto cross_matrix = [&](const double *v, double *K) {  // K x = v x x; zer
 };
 const auto rotation_by = [&](const double *v, double *R) {  // by |v| about v
     const double pi = 3.141592653589793, angle = length(v)/pi;
-    const auto sinc = [&](double x) { double y = pi*x; y = y != 0.0 ? y : 2.220446049250313e-16; return sin(y)/y; };
+    const auto sinc = [&](double x)
+        { double y = pi*x; y = y != 0.0 ? y : 2.220446049250313e-16; return sin(y)/y; };
     double K[9], H[9], square[9];
     cross_matrix(v, K);
     const double s = sinc(angle), h = sinc(0.5*angle), half = 0.5*(h*h);
@@ -36,7 +38,8 @@ const auto advance = [&](double *values, double mass, const double *inverse, dou
         product(turn, R, turned);
         spin_of(turned, inverse, L, w);
         bool same = true;
-        for (int i = 0; i < 3; ++i) { half[i] = 0.5*dt*w[i]; same &= fabs(half[i] - before[i]) <= 1e-15; }
+        for (int i = 0; i < 3; ++i)
+            { half[i] = 0.5*dt*w[i]; same &= fabs(half[i] - before[i]) <= 1e-15; }
         if (same) break;
     }
     for (int i = 0; i < 3; ++i) half[i] *= 2.0;
@@ -44,7 +47,8 @@ const auto advance = [&](double *values, double mass, const double *inverse, dou
     product(turn, R, turned);
     double scaled[9], rest[9];  // Newton's step to the nearest rotation
     for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) rest[3*i + j] = (i == j ? 3.0 : 0.0) - along(turned + i, 3, turned + j, 3);
+        for (int j = 0; j < 3; ++j) rest[3*i + j] = (i == j ? 3.0 : 0.0)
+            - along(turned + i, 3, turned + j, 3);
     for (int i = 0; i < 9; ++i) scaled[i] = 0.5*turned[i];
     product(scaled, rest, R);
     for (int i = 0; i < 3; ++i) values[i] += dt*(momentum[i]/mass);
@@ -54,7 +58,8 @@ const auto advance = [&](double *values, double mass, const double *inverse, dou
 };
 
 // kernel warp_lcp.rigid.motion.advance: Move bodies along their velocities, each for its own time.
-// `reals` holds values, masses, inverse inertias and times of `count` bodies, of which values change.
+// `reals` holds values, masses, inverse inertias and times of `count` bodies, of which values
+// change.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 found
@@ -79,7 +84,8 @@ EXACT_MATH
 #include "algebra.h:algebra"
 #include "spins"
 #include "turns"
-const double *mass = reals + 26*count, *inverse = mass + count, *centers = inverse + 9*count, *time = centers + 3*count;
+const double *mass = reals + 26*count, *inverse = mass + count, *centers = inverse + 9*count,
+    *time = centers + 3*count;
 double *rotations = reals + 39*count + times, *translations = rotations + 9*count*times;
 double *turns = translations + 3*count*times, *shifts = turns + 9*count;
 for (int t = first; t < last; ++t) {

@@ -1,45 +1,58 @@
 // Impulses of contacts in a plane, see `rigid/planar_contacts.py`: the loops of
 // `ContactSolve.push_apart`, `ContactMemory` and `Firm`, with their bits.
 
-// kernel warp_lcp.rigid.planar_impulses.push: Impulses of contacts, as `ContactSolve.push_apart` has
-// them. `reals` holds values, masses, inverse inertias and their roots of `count` bodies; `contacts`
-// contacts' points, frames, sizes, rows for both bodies, walls' velocities, targets, frictions and
-// gaps; `old` remembered ones, or impulses to start from if `resumed`. Then come impulses, what to
-// remember of the contacts, of each body G'J'JG of the rows that hold it, the diagonal of G and whether
-// there are such rows; then work. `indices` holds the contacts' bodies; then comes work. Values get the
-// impulses, if `worst` is no more than `unsolved`. `iterations`: the most of an island. `deep`: how many
-// contacts will overlap in `dt`. `stacked`: how many touch a body that is held, and another one.
+// kernel warp_lcp.rigid.planar_impulses.push: Impulses of contacts, as `ContactSolve.push_apart`
+// has them. `reals` holds values, masses, inverse inertias and their roots of `count` bodies;
+// `contacts` contacts' points, frames, sizes, rows for both bodies, walls' velocities, targets,
+// frictions and gaps; `old` remembered ones, or impulses to start from if `resumed`. Then come
+// impulses, what to remember of the contacts, of each body G'J'JG of the rows that hold it, the
+// diagonal of G and whether there are such rows; then work. `indices` holds the contacts' bodies;
+// then comes work. Values get the impulses, if `worst` is no more than `unsolved`. `iterations`:
+// the most of an island. `deep`: how many contacts will overlap in `dt`. `stacked`: how many touch
+// a body that is held, and another one.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 worst, iterations, deep, stacked
-//   numbers    int count, contacts, old; bool resumed; float64 rtol; int most; float64 unsolved, dt, YIELDS,
-//              SAME_PLACE, SLOP, BEARS
+//   numbers    int count, contacts, old; bool resumed; float64 rtol; int most;
+//              float64 unsolved, dt, YIELDS, SAME_PLACE, SLOP, BEARS
 //   constants  EACH = 8
 EXACT_MATH
 #include "algebra.h:algebra"
 #include "motion.h:spins"
 const int n = count, q = 3, dim = 2, m = 6, size = dim*contacts;
 double *values = reals;
-const double *mass = values + 26*n, *inverse = mass + n, *inertias = inverse + 9*n, *points = inertias + 9*n, *frames = points + 3*contacts;
-const double *sizes = frames + 6*contacts, *ones = sizes + contacts, *others = ones + 6*contacts, *walls = others + 6*contacts;
-const double *targets = walls + 2*contacts, *frictions = targets + contacts, *gaps = frictions + contacts, *before = gaps + contacts;
-double *impulses = reals + 45*n + 27*contacts + (resumed ? size : 8*old), *memory = impulses + size, *squares = memory + 8*contacts;
-double *roots = squares + 9*n, *holding = roots + 3*(n + 1), *largest = holding + n, *V = largest + n + 1, *start = V + 3*(n + 1), *x = start + size, *J = x + size, *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
-double *g = mu + contacts, *way = g + size, *best = way + size, *w = best + size, *places = w + q*(n + 1), *pushes = places + 3*contacts;
+const double *mass = values + 26*n, *inverse = mass + n, *inertias = inverse + 9*n,
+    *points = inertias + 9*n, *frames = points + 3*contacts;
+const double *sizes = frames + 6*contacts, *ones = sizes + contacts, *others = ones + 6*contacts,
+    *walls = others + 6*contacts;
+const double *targets = walls + 2*contacts, *frictions = targets + contacts,
+    *gaps = frictions + contacts, *before = gaps + contacts;
+double *impulses = reals + 45*n + 27*contacts + (resumed ? size : 8*old),
+    *memory = impulses + size, *squares = memory + 8*contacts;
+double *roots = squares + 9*n, *holding = roots + 3*(n + 1), *largest = holding + n,
+    *V = largest + n + 1, *start = V + 3*(n + 1), *x = start + size, *J = x + size,
+    *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
+double *g = mu + contacts, *way = g + size, *best = way + size, *w = best + size,
+    *places = w + q*(n + 1), *pushes = places + 3*contacts;
 double *far = pushes + 3*(n + 1), *residual = far + contacts, *rounds = residual + contacts;
 const int *first_of = indices, *second_of = first_of + contacts;
-int *order = indices + 2*contacts, *starts = order + contacts, *one = starts + contacts + 1, *other = one + contacts;
+int *order = indices + 2*contacts, *starts = order + contacts, *one = starts + contacts + 1,
+    *other = one + contacts;
 int *least = other + contacts, *nearest = least + n + 1;
-const auto both = [&](const double *x, const double *rows) { return fused(x[0], rows[0], x[1]*rows[3]) + 0.0; };
-for (int i = 0; i <= n; ++i) for (int a = 0; a < 3; ++a) V[3*i + a] = roots[3*i + a] = pushes[3*i + a] = 0.0;
+const auto both = [&](const double *x, const double *rows)
+    { return fused(x[0], rows[0], x[1]*rows[3]) + 0.0; };
+for (int i = 0; i <= n; ++i) for (int a = 0; a < 3; ++a)
+    V[3*i + a] = roots[3*i + a] = pushes[3*i + a] = 0.0;
 const auto find_velocity = [&](int i) {
     double spin[3];
     spin_of(values + 26*i + 3, inverse + 9*i, values + 26*i + 15, spin);
-    V[3*i] = values[26*i + 12]/mass[i]; V[3*i + 1] = values[26*i + 13]/mass[i]; V[3*i + 2] = spin[2];
+    V[3*i] = values[26*i + 12]/mass[i]; V[3*i + 1] = values[26*i + 13]/mass[i];
+        V[3*i + 2] = spin[2];
 };
 const auto velocity_of = [&](int k, int r) {
     const double *u = ones + 6*k + 3*r, *v = others + 6*k + 3*r;
-    return (along(u, 1, V + 3*first_of[k], 1) + along(v, 1, V + 3*second_of[k], 1)) + walls[dim*k + r];
+    return (along(u, 1, V + 3*first_of[k], 1) + along(v, 1, V + 3*second_of[k], 1))
+        + walls[dim*k + r];
 };
 for (int i = 0; i < n; ++i) {
     find_velocity(i);
@@ -60,7 +73,8 @@ const auto distance_to = [&](int k, int o) {
     for (int a = 0; a < 3; ++a) c[a] = places[3*k + a] - before[8*o + 2 + a];
     return length(c);
 };
-const auto same_pair = [&](int k, int o) { return before[8*o] == first_of[k] && before[8*o + 1] == second_of[k]; };
+const auto same_pair = [&](int k, int o)
+    { return before[8*o] == first_of[k] && before[8*o + 1] == second_of[k]; };
 for (int k = 0; k < contacts && !resumed; ++k) {
     nearest[k] = -1;
     for (int o = 0; o < old; ++o) if (same_pair(k, o)) {
@@ -76,7 +90,8 @@ for (int k = 0; k < contacts && !resumed; ++k) {
         const double its = distance_to(c, o);
         mine &= !(its < far[k] || (its == far[k] && c < k));
     }
-    for (int r = 0; r < dim && mine; ++r) start[dim*k + r] = across(frames + 6*k + 3*r, before + 8*o + 5);
+    for (int r = 0; r < dim && mine; ++r)
+        start[dim*k + r] = across(frames + 6*k + 3*r, before + 8*o + 5);
 }
 // contacts sorted by islands, of which each has the number of its least body
 const auto root = [&](int i) { while (least[i] != i) i = least[i]; return i; };
@@ -97,12 +112,15 @@ for (int p = 0; p < contacts; ++p) {
     for (int r = 0; r < dim; ++r) {
         const double *u = ones + 6*k + 3*r, *v = others + 6*k + 3*r;
         double *row = J + m*(dim*p + r);
-        for (int a = 0; a < 3; ++a) { row[a] = u[a]*roots[3*one[p] + a] + 0.0; row[3 + a] = v[a]*roots[3*other[p] + a] + 0.0; }
+        for (int a = 0; a < 3; ++a)
+            { row[a] = u[a]*roots[3*one[p] + a] + 0.0;
+            row[3 + a] = v[a]*roots[3*other[p] + a] + 0.0; }
         const int i = dim*p + r;
         x[i] = start[dim*k + r];
         b[i] = velocity_of(k, r);
         if (r == 0) b[i] -= targets[k];
-        const double own = ((row[0]*row[0] + row[1]*row[1]) + row[2]*row[2]) + ((row[3]*row[3] + row[4]*row[4]) + row[5]*row[5]);
+        const double own = ((row[0]*row[0] + row[1]*row[1]) + row[2]*row[2])
+            + ((row[3]*row[3] + row[4]*row[4]) + row[5]*row[5]);
         e[i] = r == 0 ? 0.0 : YIELDS*own;
         d[i] = own + e[i];
     }
@@ -115,7 +133,8 @@ for (int t = 0; t < islands; ++t) {
     worst[0] = residual[t] > worst[0] ? residual[t] : worst[0];
     iterations[0] = rounds[t] > iterations[0] ? rounds[t] : iterations[0];
 }
-for (int p = 0; p < contacts; ++p) for (int r = 0; r < dim; ++r) impulses[dim*order[p] + r] = x[dim*p + r];
+for (int p = 0; p < contacts; ++p) for (int r = 0; r < dim; ++r)
+    impulses[dim*order[p] + r] = x[dim*p + r];
 for (int k = 0; k < contacts; ++k) for (int a = 0; a < 3; ++a)
     pushes[3*first_of[k] + a] += both(impulses + dim*k, ones + 6*k + a);
 for (int k = 0; k < contacts; ++k) for (int a = 0; a < 3; ++a)
@@ -132,13 +151,15 @@ for (int k = 0; k < contacts; ++k) {
     kept[0] = first_of[k]; kept[1] = second_of[k];
     for (int a = 0; a < 3; ++a) {
         kept[2 + a] = places[3*k + a];
-        kept[5 + a] = fused(impulses[dim*k + 1], frames[6*k + 3 + a], impulses[dim*k]*frames[6*k + a]) + 0.0;
+        kept[5 + a] = fused(impulses[dim*k + 1], frames[6*k + 3 + a],
+            impulses[dim*k]*frames[6*k + a]) + 0.0;
     }
     deep[0] += gaps[k] + dt*velocity_of(k, 0) < -SLOP*sizes[k];
 }
 // what walls and other solids hold, see `Firm`: G' J' J G of its rows
 for (int i = 0; i <= n; ++i) largest[i] = 0.0;
-for (int i = 0; i < n; ++i) { holding[i] = 0.0; for (int a = 0; a < 9; ++a) squares[9*i + a] = 0.0; }
+for (int i = 0; i < n; ++i)
+    { holding[i] = 0.0; for (int a = 0; a < 9; ++a) squares[9*i + a] = 0.0; }
 for (int k = 0; k < contacts; ++k) {
     const double normal = impulses[dim*k];
     double &mine = largest[first_of[k]], &its = largest[second_of[k]];
@@ -155,7 +176,9 @@ for (int k = 0; k < contacts; ++k) if (second_of[k] == n) {
     for (int r = 0; r < 1 + sticks; ++r) {
         double row[3];
         for (int a = 0; a < 3; ++a) row[a] = ones[6*k + 3*r + a]*g[a];
-        for (int a = 0; a < 9; ++a) squares[9*i + a] = fused(row[a/3], row[a % 3], squares[9*i + a]);
+        for (int a = 0; a < 9; ++a)
+            squares[9*i + a] = fused(row[a/3], row[a % 3], squares[9*i + a]);
     }
 }
-for (int k = 0; k < contacts; ++k) stacked[0] += second_of[k] < n && (holding[first_of[k]] > 0.0 || holding[second_of[k]] > 0.0);
+for (int k = 0; k < contacts; ++k)
+    stacked[0] += second_of[k] < n && (holding[first_of[k]] > 0.0 || holding[second_of[k]] > 0.0);
