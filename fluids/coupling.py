@@ -61,6 +61,7 @@ class BodyCoupling:
         rows = grid.shape[0] * grid.shape[1]
         self._counts, self._offsets = (wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2))
         self._low: wl.LowRankOperator | None = None
+        self._flat: wp.array | None = None  # of the last solution
         self._beside, self._enclosing = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
         self._counting = LaunchGraph(grid.device, self._launch_count)
         self._entering = LaunchGraph(grid.device, self._launch_entries)
@@ -92,13 +93,13 @@ class BodyCoupling:
             self._beside.move_to(window)
             self._enter(kind)
         if self._low is not None:
-            self._low.update(self._weights())
+            self._low.update(self._weights(), symmetric=True)
 
     def _enter(self, kind: wp.array) -> None:
         """Write the entries of U for the cells of the window."""
         columns = self.columns
         self._counting.run(kind)
-        total = int(columns.count.numpy()[0])
+        total = columns.counted()
         if total > columns.capacity:
             columns.reserve(round(SPARE * total))
             columns.count.fill_(total)
@@ -122,8 +123,10 @@ class BodyCoupling:
 
     def push(self, x: wp.array) -> None:
         """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""
-        self._gathering.run(x.flatten(), variant=self.columns.rows.ptr)
-        self.bodies.bodies.apply_impulses(self._scale * self.columns.sums.numpy().reshape(-1, self.width))
+        if self._flat is None or self._flat.ptr != x.ptr:
+            self._flat = x.flatten()
+        self._gathering.run(self._flat, variant=self.columns.rows.ptr)
+        self.bodies.bodies.apply_impulses(self._scale * self.columns.summed().reshape(-1, self.width))
 
     def _launch_gather(self, x: wp.array) -> None:
         self.columns.gather(x, launch=launch)

@@ -13,7 +13,7 @@ from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.motion import Motions
-from warp_lcp.grid.node_distance import NodeBox, NodeDistances, ShapeTable, nodes_near
+from warp_lcp.grid.node_distance import NodeDistances, ShapeTable, nodes_near
 from warp_lcp.grid.node_distance_kernels import claim_nodes
 from warp_lcp.grid.sides import PeriodicSides, side_bits, with_periodic
 from warp_lcp.grid.solids import Geometry, TriangleMesh
@@ -75,7 +75,7 @@ class CutCellsOfPart(CutCells):
             end = self.grid.domain_counts[axis] + 1 - self.grid.origin[axis]  # the domain's upper side, where the part reaches it
             self.unlikeness[axis] = float(np.moveaxis(apart, 2 - axis, 0)[end : end + 1].max(initial=0.0))
 
-    def _layer(self, geometry: Geometry, box: NodeBox) -> np.ndarray:
+    def _layer(self, geometry: Geometry, box: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """Return the distances of a solid at this rank's layer of a box of nodes [cells], as many numbers as the thickest layer has."""
         size, ranks, grid = _layer(box, 0, self._part.ranks.size).cells, self._part.ranks, self.grid
         layer, found = _layer(box, ranks.rank, ranks.size), np.empty(size, dtype=np.float32)
@@ -99,7 +99,7 @@ class CutCellsOfPart(CutCells):
             wp.launch(claim_nodes, len(given), [block, given, 0.0, number, self._nodes.struct], device=grid.device)
 
 
-def _layer(box: NodeBox, rank: int, ranks: int) -> CellBox:
+def _layer(box: tuple[np.ndarray, np.ndarray], rank: int, ranks: int) -> CellBox:
     """Return the layer of a box of nodes that a rank measures: across its longest axis, the first one the thickest."""
     low, high = (corner.copy() for corner in box)
     axis = int(np.argmax(high - low))

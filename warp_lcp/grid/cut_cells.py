@@ -6,8 +6,9 @@ second order for smooth walls; at a solid's edges, and where it or a gap is thin
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
+from operator import le, lt
 
 import numpy as np
 import warp as wp
@@ -15,7 +16,7 @@ import warp as wp
 from warp_lcp.grid import cut_cells_kernels as kernels
 from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motions, Pose
-from warp_lcp.grid.node_distance import NodeBox, NodeDistances, NodeSampler, ShapeTable, node_window, nodes_near
+from warp_lcp.grid.node_distance import NodeBox, NodeDistances, NodeSampler, ShapeTable, box_near, node_window
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
@@ -23,6 +24,8 @@ from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import LaunchGraph, clear, copy
+
+NOWHERE: NodeBox = (0, 0, 0), (0, 0, 0)  # a box without nodes
 
 DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
 
@@ -88,9 +91,7 @@ class CutCells:
         for number, geometry in standing:
             self._sampler.enter(self._nodes, number, geometry)
         self._marks = wp.array(_ring(grid, open_sides), dtype=wp.int8, device=grid.device)
-        self._sampler.look_at_centers(
-            self._nodes, lambda: [geometry for _, geometry in standing], np.zeros(3, dtype=int), np.array(grid.shape[::-1]), self._marks
-        )
+        self._sampler.look_at_centers(self._nodes, lambda: [geometry for _, geometry in standing], (0, 0, 0), grid.shape[::-1], self._marks)
         wp.copy(self.base, self._marks)
         self._moved_from: NodeBox | None = None  # nodes near the solids that move, where the velocity was filled last
         self._moved_to: NodeBox | None = None  # and where they are
@@ -99,6 +100,8 @@ class CutCells:
             Motions([solid.motion for _, solid in moving if solid.motion is not None]),
             [number for number, _ in moving],
         )
+        next_to_each_other = len(moving) and self._moving[-1] - self._moving[0] == len(moving) - 1
+        self._moves = slice(self._moving[0], self._moving[-1] + 1) if next_to_each_other else self._moving
         if self.moves:
             self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving]))
             self._standing = NodeDistances(grid, second=len(solids) > 1)
@@ -107,7 +110,8 @@ class CutCells:
             # a mesh is measured in parts, and the host decides about each
             measured = any(not isinstance(run, ShapeTable) for run in self._runs)
             self._entering = LaunchGraph(grid.device, self._launch_entering, at_once=measured)
-            self._refreshing = LaunchGraph(grid.device, self._refresh)
+            self._refreshing = LaunchGraph(grid.device, self._launch_refreshing)
+            self._before = self._after = lambda: None
             self._filling = LaunchGraph(grid.device, self._launch_velocity)
             self.moving = kernels.Moving()
             self.moving.nodes, self.moving.standing = self._nodes.struct, self._standing.near
@@ -150,6 +154,12 @@ class CutCells:
         self._join()
         self._refreshing.run()
 
+    def accompany(self, before: Callable[[], None], after: Callable[[], None]) -> None:
+        """Have `place` launch more, before distances change and after all else."""
+        self._before, self._after = before, after
+        self._entering.forget()
+        self._refreshing.forget()
+
     def set_velocity(self, time: float, dt: float) -> None:
         """Set the velocity: displacement of the solids' points over a time, divided by it.
 
@@ -167,14 +177,15 @@ class CutCells:
             return
         if dt == 0.0:
             raise ValueError("dt = 0: a velocity needs two different times")
-        self._turn.host[self._moving], self._shift.host[self._moving] = self.motions.velocity_fields(time, dt)
+        self._turn.host[self._moves], self._shift.host[self._moves] = self.motions.velocity_fields(time, dt)
         self._turn.send()
         self._shift.send()
         near = _around([box for box in (self._moved_from, self._moved_to) if box is not None])
         if near is None:
             return
-        first, end = np.maximum(near[0], 1), np.minimum(near[1], np.array(self.grid.counts) + 2)
-        if (first < end).all():
+        first = [max(start, 1) for start in near[0]]
+        end = [min(stop, count + 2) for stop, count in zip(near[1], self.grid.counts, strict=True)]
+        if all(map(lt, first, end)):
             self._swept.move_to(node_window(self.grid, first, end))
             self._filling.run()
         self._moved_from = self._moved_to
@@ -194,9 +205,8 @@ class CutCells:
         """
         if self._moved_to is None:
             return None
-        low, high = self._moved_to
-        first, last = np.maximum(low - 1, 1), np.minimum(high, self.grid.counts)
-        return (first.tolist(), last.tolist()) if (first <= last).all() else None
+        first, last = [max(start - 1, 1) for start in self._moved_to[0]], list(map(min, self._moved_to[1], self.grid.counts))
+        return (first, last) if all(map(le, first, last)) else None
 
     def _enter_moving(self, time: float) -> None:
         """Enter the solids that move into the distances, and mark again the cells that only their centers tell about."""
@@ -205,16 +215,20 @@ class CutCells:
         for run in self._runs:
             if isinstance(run, ShapeTable):
                 run.place(rotations[0, run.places], translations[0, run.places])
-        boxes = [run.box if isinstance(run, ShapeTable) else nodes_near(self.grid, self._placed(run)) for run in self._runs]
+        boxes = [run.box if isinstance(run, ShapeTable) else box_near(self.grid, self._placed(run)) for run in self._runs]
         self._moved_to = _around([box for box in boxes if box is not None])
-        nowhere = np.zeros(3, dtype=np.int64)
-        self._near.move_to(node_window(self.grid, *self._sampler.inner(*(self._moved_to or (nowhere, nowhere)))))
+        self._near.move_to(node_window(self.grid, *self._sampler.inner(*(self._moved_to or NOWHERE))))
         self._entering.run()
         if self._moved_to is not None:
             self._sampler.look_at_centers(self._nodes, self._all_placed, *self._moved_to, self.base, listed=True)
 
+    def _launch_refreshing(self) -> None:
+        self._refresh()
+        self._after()
+
     def _launch_entering(self) -> None:
         """Enter the moving solids into the distances of the standing ones; list the cells that only their centers tell about."""
+        self._before()
         self._nodes.copy_from(self._standing)
         copy(self.base, self._marks)
         self._enter()
@@ -316,9 +330,8 @@ def _ring(grid: StaggeredGrid, open_sides: int) -> np.ndarray:
 
 def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
     """Return the box around boxes of nodes; None: there are none."""
-    if len(boxes) < 2:
-        return boxes[0] if boxes else None
-    return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+    lows, highs = zip(*boxes, strict=True) if boxes else ((), ())
+    return (tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True)))) if boxes else None
 
 
 def _runs(grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]) -> Iterator[ShapeTable | int]:

@@ -11,18 +11,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.spatial import transform
 
+from warp_lcp.rows import KernelFile
+from warp_lcp.rows.host_kernel import HostKernel
+
 Vector = Sequence[float] | np.ndarray
 
 ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay near 1e-15
 FASTEST = 1e18  # [m/s] or [degrees/s], between keyframes of a smooth motion: cubics have its square and more
 SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
-ENDS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)  # of a box along each axis, of its corners
+TOP_SPEED = HostKernel(KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.motion.top_speed"])
+PARTS = np.arange(SPEED_SAMPLES + 1.0)
+UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of a solid without an end
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
 
 
@@ -307,6 +313,7 @@ class Motions:
         self._groups: list[tuple[Any, list[int], list[Any]]] = [
             (kind, numbers, [motions[n] for n in numbers]) for kind, numbers in of_kind.items()
         ]
+        self._alone: Any = next(iter(kinds)) if len(kinds) == 1 and all(rigid) else None  # the kind of all
         self._prescribed = [n for n, is_rigid in enumerate(rigid) if not is_rigid]
 
     def __len__(self) -> int:
@@ -320,6 +327,8 @@ class Motions:
             times: m of them [s].
         """
         times = np.asarray(times, dtype=np.float64)
+        if self._alone is not None:
+            return cast(tuple[np.ndarray, np.ndarray], self._alone.poses_of(self.motions, times))
         rotations, translations = np.empty((len(times), len(self), 3, 3)), np.empty((len(times), len(self), 3))
         for kind, numbers, members in self._groups:
             rotations[:, numbers], translations[:, numbers] = kind.poses_of(members, times)
@@ -335,6 +344,8 @@ class Motions:
         A point x of a solid moves at turn x + shift: its displacement from `time` on divided by the
         time dt [s] that it takes, or the velocity of the state of a `RigidMotion`.
         """
+        if self._alone is not None:
+            return cast(tuple[np.ndarray, np.ndarray], self._alone.velocity_fields_of(self.motions))
         turns, shifts = np.empty((len(self), 3, 3)), np.empty((len(self), 3))
         for kind, numbers, members in self._groups:
             turns[numbers], shifts[numbers] = kind.velocity_fields_of(members)
@@ -344,50 +355,32 @@ class Motions:
             turns[number], shifts[number] = (way.rotation - np.eye(3)) / dt, way.translation / dt
         return turns, shifts
 
-    def top_speed(self, bounds: Sequence[np.ndarray | None], size: np.ndarray, time: float, span: float) -> float:
+    def top_speed(self, bounds: Sequence[np.ndarray | None] | np.ndarray, size: np.ndarray, time: float, span: float) -> float:
         """Return the largest future speed of a point of a solid in the domain [m/s].
 
         A rigid body is fastest at a corner of a box around it; velocities are means over a few parts of the span.
 
         Args:
-            bounds: low and high corner [m] of a box around each solid as it is placed, shape (2, 3); None: it has no limits.
+            bounds: low and high corner [m] of a box around each solid as it is placed, shape (2, 3); None: it has no limits. Or
+                these in one array, see `boxes_of`.
             size: of the domain [m], shape (3,), z = 0 in 2-D.
             time: [s].
             span: time to look ahead [s], > 0.
         """
         if not self.motions:
             return 0.0
-        limited = np.array([box is not None for box in bounds])[:, None]
-        boxes = np.array([np.zeros((2, 3)) if box is None else np.where(size > 0.0, box, 0.0) for box in bounds])
-        R, t = self.poses(np.linspace(time, time + span, SPEED_SAMPLES + 1))
-        placed = _applied((R, t), _corners(boxes))
-        low = np.where(limited, np.maximum(0.0, placed.min(axis=-2)), 0.0)
-        high = np.where(limited, np.minimum(size, placed.max(axis=-2)), size)
-        corners, inside = _corners(np.stack([low, high], axis=-2)), np.all(low <= high, axis=-1)
-        way = _after((R[1:], t[1:]), _inverse((R[:-1], t[:-1])))
-        fastest = 0.0
-        for step, ends in ((way, slice(None, -1)), (_inverse(way), slice(1, None))):  # it may be in the domain at one end only
-            ways = _applied(step, corners[ends]) - corners[ends]
-            speeds = np.sqrt(np.square(ways).sum(axis=-1)).max(axis=-1) * SPEED_SAMPLES / span
-            fastest = max(fastest, float(speeds.max(initial=0.0, where=inside[ends])))
-        return fastest
+        n, m = len(self), SPEED_SAMPLES
+        boxes = bounds if isinstance(bounds, np.ndarray) else boxes_of(bounds)
+        times = PARTS * ((time + span - time) / m) + time  # as np.linspace, which takes longer
+        times[-1] = time + span
+        R, t = self.poses(times)
+        _, (fastest,) = TOP_SPEED.run((R, t, boxes, size), (), tasks=n, count=n, parts=m, span=span)
+        return float(fastest.max())
 
 
-def _applied(pose: tuple[np.ndarray, np.ndarray], points: np.ndarray) -> np.ndarray:
-    """Return points, shape (..., k, 3), transformed by poses, shapes (..., 3, 3) and (..., 3)."""
-    rotation, translation = pose
-    return np.asarray(points @ rotation.swapaxes(-1, -2) + translation[..., None, :])
-
-
-def _after(pose: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the compositions of poses, as `Pose.after`."""
-    return pose[0] @ other[0], (pose[0] @ other[1][..., None])[..., 0] + pose[1]
-
-
-def _inverse(pose: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverse poses, as `Pose.inverse`."""
-    back = pose[0].swapaxes(-1, -2)
-    return back, (-back @ pose[1][..., None])[..., 0]
+def boxes_of(bounds: Sequence[np.ndarray | None]) -> np.ndarray:
+    """Return bounds, shape (2, 3) each, as one array; None: without limits."""
+    return np.array([UNLIMITED if box is None else box for box in bounds]).reshape(-1, 2, 3)
 
 
 def kinks(motion: Motion) -> tuple[float, ...]:
@@ -472,11 +465,6 @@ class _Turns:
         size = self._size[step]
         within = (angle - float(self._angle.values[step, 0])) / size if size > 0.0 else 0.0
         return cast(np.ndarray, self._slerp(step + min(max(within, 0.0), 1.0)).as_matrix())
-
-
-def _corners(bounds: np.ndarray) -> np.ndarray:
-    """Return the corners of boxes, shape (..., 8, 3), from their low and high one, shape (..., 2, 3)."""
-    return bounds[..., ENDS, np.arange(3)]
 
 
 def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:

@@ -7,23 +7,28 @@ nearest to its center. Distances below `FAR` cells are exact, others are at leas
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from operator import ge
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid import node_distance_kernels as kernels
+from warp_lcp.grid.motion import UNLIMITED
 from warp_lcp.grid.node_distance_kernels import COARSE, FAR, Nearest
 from warp_lcp.grid.solids import Box, Capsule, Geometry, Plane, Sphere, TriangleMesh, Union
 from warp_lcp.grid.solids_kernels import block_of, item_points
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.rows import KernelFile
 from warp_lcp.rows.host_array import HostArray
+from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.rows.program import clear, copy
 
-NodeBox = tuple[np.ndarray, np.ndarray]  # the first node (x, y, z) and one past the last
+NodeBox = tuple[Sequence[int], Sequence[int]]  # the first node (x, y, z) and one past the last
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
 KINDS: dict[Any, int] = {Box: kernels.BOX, Sphere: kernels.SPHERE, Capsule: kernels.CAPSULE, Plane: kernels.PLANE}
-UNLIMITED = np.array([[-np.inf], [np.inf]]) * np.ones(3)  # bounds of a solid without an end
+PLACE = HostKernel(KernelFile(Path(__file__).parent / "headers/moving_solids.h")["warp_lcp.grid.node_distance.place"])
 SNAP = 1e-6  # of the domain's longest side: distances below it are rounding errors of float32 positions, and count as 0
 
 
@@ -63,9 +68,9 @@ class NodeDistances:
             copy(target, source)
 
 
-def node_window(grid: StaggeredGrid, low: np.ndarray, high: np.ndarray) -> Window:
+def node_window(grid: StaggeredGrid, low: Sequence[int], high: Sequence[int]) -> Window:
     """Return the window of nodes low <= (x, y, z) < high, without cells where there are none."""
-    if (low >= high).any():
+    if any(map(ge, low, high)):
         return Window((1, 1, 1), (1, 1, 2), grid.device)
     return Window(_kji(low), _kji(high), grid.device)
 
@@ -75,6 +80,12 @@ def nodes_near(grid: StaggeredGrid, geometry: Geometry, reach: float = FAR) -> t
     bounds = geometry.bounds()
     low, high = nodes_within(grid, UNLIMITED if bounds is None else bounds, reach)
     return (low, high) if (low < high).all() else None
+
+
+def box_near(grid: StaggeredGrid, geometry: Geometry) -> NodeBox | None:
+    """Return the box of `nodes_near`."""
+    near = nodes_near(grid, geometry)
+    return None if near is None else (near[0].tolist(), near[1].tolist())
 
 
 def nodes_within(grid: StaggeredGrid, bounds: np.ndarray, reach: float = FAR) -> tuple[np.ndarray, np.ndarray]:
@@ -108,20 +119,23 @@ class ShapeTable:
     def __init__(self, grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]], places: Sequence[int]) -> None:
         self.grid, self.places = grid, list(places)
         shapes = [part for _, geometry in solids for part in _parts(geometry)]
-        counts = np.array([len(_parts(geometry)) for _, geometry in solids])
-        self._starts = np.cumsum(counts) - counts
-        self._rotation = np.array([shape.placement.rotation for shape in shapes])
-        self._translation = np.array([shape.placement.translation for shape in shapes])
-        self._scale = np.array([shape.placement.scale for shape in shapes])
-        self._origin = np.array([shape.origin() for shape in shapes])
-        self._owner = np.repeat(np.arange(len(solids)), counts)
+        counts = [len(_parts(geometry)) for _, geometry in solids]
+        starts = np.cumsum([0, *counts])
         hulls = [shape.hull() for shape in shapes]
         most = max(1, *(len(corners) for corners, _ in hulls))
-        unlimited = np.zeros((most, 3))
-        self._corners = np.array([np.resize(c, (most, 3)) if len(c) else unlimited for c, _ in hulls])
-        self._margin = np.array([margin for _, margin in hulls])
+        corners = [np.resize(c, (most, 3)) if len(c) else np.zeros((most, 3)) for c, _ in hulls]
         limits = [UNLIMITED if (box := shape.bounds()) is None else np.where(np.isfinite(box), 0.0, box) for shape in shapes]
-        self._limits = np.array(limits)  # infinite where a shape has no end
+        placements = [shape.placement for shape in shapes]
+        of_placements = [[getattr(p, name) for p in placements] for name in ("rotation", "translation", "scale")]
+        of_shapes = [
+            [shape.origin() for shape in shapes],
+            corners,
+            [margin for _, margin in hulls],
+            limits,
+        ]  # infinite where without an end
+        self._fixed = np.concatenate([np.ravel(of) for of in (*of_placements, *of_shapes, [grid.spacing, FAR])])
+        self._places = np.concatenate([starts, grid.origin, grid.shape[::-1]])
+        self._numbers = {"count": len(solids), "shapes": len(shapes), "corners": most, "flat": grid.dimension == 2}
         self._solids = HostArray(len(solids), kernels.ShapeGroup, grid.device)
         self._shapes = HostArray(len(shapes), kernels.PlacedShape, grid.device)
         for row, shape in zip(self._shapes.host, shapes, strict=True):
@@ -130,7 +144,7 @@ class ShapeTable:
             for number in numbers:
                 row["radius" if isinstance(number, float) else "way"] = number
         groups = self._solids.host
-        groups["number"], groups["first"], groups["end"] = [number for number, _ in solids], self._starts, self._starts + counts
+        groups["number"], groups["first"], groups["end"] = [number for number, _ in solids], starts[:-1], starts[1:]
         self._block = block_of(np.zeros(3), np.ones(3), grid.spacing, grid.dimension, grid.origin)
         self.low = self.high = np.zeros((len(solids), 3), dtype=np.int64)
         self.box: NodeBox | None = None
@@ -143,23 +157,22 @@ class ShapeTable:
 
     def place(self, rotation: np.ndarray, translation: np.ndarray) -> None:
         """Place the solids by poses, shapes (n, 3, 3) and (n, 3) [m]."""
-        turn = rotation[self._owner]
-        R = turn @ self._rotation
-        t = (self._translation[:, None] @ turn.swapaxes(-1, -2))[:, 0] + translation[self._owner]
-        scaled, frame = self._scale[:, None, None], self._shapes.host["frame"]
-        frame["inverse_rotation"] = R.swapaxes(-1, -2)
-        frame["translation"] = t + ((scaled * R) @ self._origin[..., None])[..., 0]
-        corners = scaled * self._corners @ R.swapaxes(-1, -2) + t[:, None]
-        margin = (self._margin * self._scale)[:, None]
-        boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin], axis=1) + self._limits
-        bounds = np.stack([np.minimum.reduceat(boxes[:, 0], self._starts), np.maximum.reduceat(boxes[:, 1], self._starts)], axis=1)
-        self.low, self.high = nodes_within(self.grid, bounds)
-        self._solids.host["low"], self._solids.host["high"] = self.low, self.high
+        n, shapes = self._numbers["count"], self._numbers["shapes"]
+        given = (rotation, translation, self._fixed)
+        reals, (near,) = PLACE.run(given, (self._places,), work=12 * shapes + 6 * n + 6, **self._numbers)
+        begin = 12 * n + len(self._fixed)
+        middle, after = begin + 9 * shapes, begin + 12 * shapes
+        inverse, origin = reals[begin:middle], reals[middle:after]
+        nodes, around = reals[after : after + 6 * n], reals[after + 6 * n : after + 6 * n + 6].tolist()
+        frame, solids, boxes = self._shapes.host["frame"], self._solids.host, nodes.reshape(n, 2, 3).astype(np.int64)
+        frame["inverse_rotation"], frame["translation"] = inverse.reshape(-1, 3, 3), origin.reshape(-1, 3)
+        self.low, self.high = boxes[:, 0], boxes[:, 1]
+        solids["low"], solids["high"] = self.low, self.high
         self._solids.send()
         self._shapes.send()
-        near = (self.low < self.high).all(axis=1)
-        self.box = (self.low[near].min(axis=0), self.high[near].max(axis=0)) if near.any() else None
-        self._window.move_to(node_window(self.grid, *(self.box or (self.low[0], self.low[0]))))
+        low, high = map(int, around[:3]), map(int, around[3:])
+        self.box = (tuple(low), tuple(high)) if near[0] else None
+        self._window.move_to(node_window(self.grid, *(self.box or ((0, 0, 0), (0, 0, 0)))))
 
     def enter(self, nodes: NodeDistances, snap: float) -> None:
         """Enter the solids' distances; those within `snap` [cells] of a surface are 0."""
@@ -213,7 +226,7 @@ class NodeSampler:
                     wp.launch(kernels.claim_listed, count, inputs, device=self.grid.device)
 
     def look_at_centers(
-        self, nodes: NodeDistances, solids: Callable[[], Sequence[Geometry]], low: np.ndarray, high: np.ndarray, marks: wp.array,
+        self, nodes: NodeDistances, solids: Callable[[], Sequence[Geometry]], low: Sequence[int], high: Sequence[int], marks: wp.array,
         listed: bool = False,
     ) -> None:  # fmt: skip
         """Mark as HOLLOW the cells in the open whose corners all have distance 0: gaps of one cell, where plates have no mark.
@@ -227,27 +240,27 @@ class NodeSampler:
             listed: whether `list_flat_cells` has listed the cells.
         """
         low, high = self.inner(low, high)
-        if (low >= high).any():
+        if any(map(ge, low, high)):
             return
         if not listed:
             self.list_flat_cells(nodes, node_window(self.grid, low, high))
         found = int(self._listed.numpy()[0])
         if found > len(self._list):
-            longest = int(np.argmax(high - low))
-            middle = int(low[longest] + high[longest]) // 2
+            longest = int(np.argmax(np.subtract(high, low)))
+            middle = (low[longest] + high[longest]) // 2
             for part in (slice(None, middle), slice(middle, None)):
-                begin, end = low.copy(), high.copy()
+                begin, end = list(low), list(high)
                 begin[longest], end[longest] = part.start or begin[longest], part.stop or end[longest]
                 self.look_at_centers(nodes, solids, begin, end, marks)
         elif found:
-            block, listed = self._block(low, high, offset=0.5), self._list[:found]
+            block, listed = self._block(np.array(low), np.array(high), offset=0.5), self._list[:found]
             for order, geometry in enumerate(solids()):
                 distances = self._measure(geometry, found, kernels.listed_points, [block, listed])
                 wp.launch(kernels.mark_listed, found, [listed, distances, order == 0, marks], device=self.grid.device)
 
-    def inner(self, low: np.ndarray, high: np.ndarray) -> NodeBox:
+    def inner(self, low: Sequence[int], high: Sequence[int]) -> NodeBox:
         """Return a box of nodes without those that are the low corner of no cell inside the ring."""
-        return np.maximum(low, 1), np.minimum(high, np.array(self.grid.shape[::-1]) - 1)
+        return [max(start, 1) for start in low], [min(stop, end - 1) for stop, end in zip(high, self.grid.shape[::-1], strict=True)]
 
     def list_flat_cells(self, nodes: NodeDistances, window: Window) -> None:
         """List the cells of a window in the open whose corners all have distance 0."""
@@ -298,5 +311,5 @@ def _parts(geometry: Geometry) -> list[Any]:
     return [shape for part in geometry.parts for shape in _parts(part)] if isinstance(geometry, Union) else [geometry]
 
 
-def _kji(corner: np.ndarray) -> tuple[int, int, int]:
+def _kji(corner: Sequence[int]) -> tuple[int, int, int]:
     return int(corner[2]), int(corner[1]), int(corner[0])

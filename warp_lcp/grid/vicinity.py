@@ -67,7 +67,7 @@ class Vicinity:
             grow: cells that they reach beyond their own.
             step: number of the step; what it has reached before counts as well.
         """
-        whole = math.prod(np.subtract(box.high, box.low))
+        whole = math.prod(end - start for start, end in zip(box.low, box.high, strict=True))
         if not self.active or whole < LEAST_CELLS or step < self._rest:
             self._step, self._now, self._before = step, None, None
             return box

@@ -15,7 +15,7 @@ import warp as wp
 from warp_lcp.grid.advection import MARGIN, advect, advect_with_distance, clearance, push_out
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.level_set import whole_cell_capacity
-from warp_lcp.grid.motion import kinks
+from warp_lcp.grid.motion import boxes_of, kinks
 from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -23,7 +23,7 @@ from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.wall import Join, extend_velocity, extend_velocity_cut
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph, clear, launch
+from warp_lcp.rows.program import LaunchGraph, clear, copy, launch
 from warp_lcp.rows.readings import Reading
 
 Faces = list[wp.array]  # one field a component
@@ -243,9 +243,13 @@ class CutBoundary:
         self._counts, self._dt = Reading(grid.device, 3, wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
-        self._motions, self._bounds = cut.motions, [solid.geometry.bounds() for solid in cut.solids if solid.motion is not None]
+        self._motions = cut.motions
+        self._bounds = boxes_of([solid.geometry.bounds() for solid in cut.solids if solid.motion is not None])
+        self._size = grid.extent
+        self._size[grid.dimension :] = 0.0
         self.kinks = tuple(time for motion in self._motions.motions for time in kinks(motion))
-        self._walls = LaunchGraph(grid.device, self._find_walls)
+        if cut.moves:
+            cut.accompany(self._keep_distance, self._find_walls)
         self._find_walls()
         self._join_sides()
 
@@ -254,9 +258,7 @@ class CutBoundary:
 
         From `time` to `time` + `span` [s].
         """
-        size = self.grid.extent
-        size[self.grid.dimension :] = 0.0
-        return self._motions.top_speed(self._bounds, size, time, span)
+        return self._motions.top_speed(self._bounds, self._size, time, span)
 
     def begin_step(self, time: float, dt: float) -> None:
         """Compute the velocity of the solids from `time` on [s]."""
@@ -279,7 +281,6 @@ class CutBoundary:
         """Advect particles, then move the solids to `time`."""
         self._dt.value = dt
         if self.moves:
-            wp.copy(self._reachable, self.cut.distance)
             self.place(time)
         self._advection.run(fields, position)
         self._counts.changed()
@@ -313,7 +314,6 @@ class CutBoundary:
         if self.moves:
             self._time = time
             self.cut.place(time)
-            self._walls.run()
             self._join_sides()
 
     def shapes(self) -> Sequence[Geometry]:
@@ -359,6 +359,10 @@ class CutBoundary:
         """Return by how much the distances at the two sides of an axis differ, as far as solids are near [cells]."""
         lines = np.moveaxis(np.clip(self.distance.numpy(), -CLOSE, CLOSE), 2 - axis, 0)
         return float(np.abs(lines[1] - lines[-1]).max())
+
+    def _keep_distance(self) -> None:
+        """Launch the copy of the distance before the solids move: particles may go where it is open before or after."""
+        copy(self._reachable, self.cut.distance)
 
     def _find_walls(self) -> None:
         walls = (*self.cut.wall, *self.cut.wall[1:2])[:3]  # in 2-D nothing is asked of the third

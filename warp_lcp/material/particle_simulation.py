@@ -198,7 +198,7 @@ class ParticleSimulation(ParticleCheckpoints):
             totals = self.particles.totals() if self.band is None else self.band.with_interior(self.particles.totals())
         driven = [part.top_speed(self.time, self.scene.time.dt_max) for part in (self.boundary, self.sources) if part is not None]
         # gravity's own speed counts, so that a material at rest does not take off
-        speed = max(totals.max_speed, *driven) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
+        speed = max(totals.max_speed, *driven) + math.sqrt(cfl * math.sqrt(self.gravity @ self.gravity) * dx)
         return cfl * dx / speed if speed > 0.0 else math.inf
 
     def events(self, until: float) -> list[float]:
@@ -274,7 +274,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
     def top_speed(self, totals: ParticleTotals) -> float:
         """Return the scale of the velocities that `particles_to_grid` leaves [m/s]."""
-        return totals.max_speed + self.kick_dt * float(np.linalg.norm(self.gravity))
+        return totals.max_speed + self.kick_dt * math.sqrt(self.gravity @ self.gravity)
 
     def particles_to_grid(self, window: Window) -> None:
         """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""

@@ -16,6 +16,7 @@ from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
 from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import Launch
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Across, Reduction, add_across
 
 
@@ -81,8 +82,8 @@ class BlockColumns:
 
     def __init__(self, size: int, blocks: int, width: int, dtype: Any, device: wp.Device) -> None:
         self.size, self.width, self.rank, self.dtype, self.device = size, width, blocks * width, dtype, device
-        self.count = wp.zeros(1, dtype=wp.int32, device=device)
-        self.sums = wp.zeros(self.rank, dtype=wp.float64, device=device)
+        self._count, self._sums = Reading(device, 1, wp.int32), Reading(device, self.rank)
+        self.count, self.sums = self._count.array, self._sums.array
         self.reserve(0)
 
     def reserve(self, entries: int) -> None:
@@ -113,9 +114,19 @@ class BlockColumns:
             self.values[: n * self.width].assign(values.astype(wp.dtype_to_numpy(self.dtype)).ravel())
         self.count.fill_(n)
 
+    def counted(self) -> int:
+        """Return how many entries a kernel has written; waits for the device."""
+        self._count.changed()
+        return int(self._count.numpy()[0])
+
+    def summed(self) -> np.ndarray:
+        """Return what the last `gather` has written, not to be written to, shape (rank,); waits for the device."""
+        self._sums.changed()
+        return self._sums.numpy()
+
     def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return rows, blocks and values as host arrays, as `assign` takes them."""
-        n = int(self.count.numpy()[0])
+        n = self.counted()
         return self.rows.numpy()[:n], self.blocks.numpy()[:n], self.values.numpy()[: n * self.width].reshape(n, self.width)
 
     def gather(
@@ -221,18 +232,24 @@ class LowRankOperator(Pickled):
         sizes = (self.shape, self.columns.rank // self.columns.width, self.columns.width)
         return made_again(_of_entries, sizes, entries, self.weights.numpy(), device=self.device, dtype=self.dtype)
 
-    def update(self, weights: Any = None) -> None:
+    @property
+    def host_weights(self) -> np.ndarray:
+        """W on the host, not to be written to, shape (k, k)."""
+        return np.asarray(self._weights.host)
+
+    def update(self, weights: Any = None, *, symmetric: bool | None = None) -> None:
         """Replace the weights, and read columns that have changed in place.
 
         Args:
             weights: as of the constructor; None: they stay.
+            symmetric: whether the weights are; None: it is looked at.
 
         Raises:
             ValueError: they have another shape, or are not finite.
         """
         if weights is not None:
             W = self._checked_weights(weights)
-            self.symmetric = _is_symmetric(W)
+            self.symmetric = _is_symmetric(W) if symmetric is None else symmetric
             self._weights.host[:], self._turned.host[:] = W, W.T
             self._weights.send()
             self._turned.send()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -75,6 +75,8 @@ class RigidBodies:
     Raises:
         ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
     """
+
+    _columns: tuple[str, ...] | None = None  # of the log, once they are asked for
 
     def __init__(
         self,
@@ -150,7 +152,7 @@ class RigidBodies:
             self.bodies.momentum[:], self.bodies.angular_momentum[:] = momenta[:, :3], momenta[:, 3:]
             impulses = self._solve.push_apart(begun.contacts, begun.impulses, dt=begun.dt, kick_dt=begun.kick_dt)
             self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
-        self._begun = replace(begun, impulses=impulses, settled=True)
+        self._begun = _Begun(begun.states, begun.free, begun.contacts, impulses, begun.detour, begun.dt, begun.kick_dt, True)
 
     def end_step(self, dt: float) -> None:
         """Move the bodies; calls `solve_contacts` if it has not been called.
@@ -165,7 +167,7 @@ class RigidBodies:
             self.solve_contacts()
         assert self._begun is not None
         begun = self._begun
-        self._solve.memory.keep(begun.contacts, begun.impulses, self.bodies)
+        self._solve.remember(begun.contacts, begun.impulses)
         self.contacts = len(begun.contacts)
         ways = self._solve.separation(begun.contacts, dt, begun.detour)
         self.bodies.release()
@@ -179,7 +181,7 @@ class RigidBodies:
         """Return which bodies have left the domain, bool, shape (n,)."""
         size, sides = self.exits
         beyond = np.zeros(len(self.bodies), dtype=bool)
-        for axis, length in enumerate(size):
+        for axis, length in enumerate(size if sides else ()):
             at = self.bodies.position[:, axis]
             beyond |= bool(sides >> 2 * axis & 1) & (at < 0.0) | bool(sides >> 2 * axis + 1 & 1) & (at > length)
         return beyond
@@ -187,7 +189,7 @@ class RigidBodies:
     def leave(self) -> None:
         """Remove bodies that have crossed an open side; they rest outside."""
         size, sides = self.exits
-        for number in np.flatnonzero(self.gone()):
+        for number in np.flatnonzero(self.gone()) if sides else ():
             position, way = self.bodies.position[number], OUTSIDE * self._solve.reach[number]
             self.bodies.momentum[number], self.bodies.angular_momentum[number] = 0.0, 0.0
             for axis, length in enumerate(size):
@@ -211,7 +213,7 @@ class RigidBodies:
             size: of the domain [m].
             endless: axes without an end, at whose sides solids must be alike.
         """
-        finite = np.isfinite(self._states()).all(axis=1)
+        finite = np.isfinite(self.bodies.values[:, :STATE]).all(axis=1)
         if not finite.all():
             return f"{self.bodies[int(finite.argmin())].name} has a velocity that is not finite"
         for body, shape, motion in zip(self.bodies, self.shapes, self.motions, strict=True) if len(endless) else ():
@@ -306,7 +308,9 @@ class RigidBodies:
             columns = [bodies.position[:, :2], six[:, :2], np.degrees(bodies.angle)[:, None], six[:, 5:]]
         numbers = np.concatenate(columns, axis=1).ravel().tolist()
         gone = [int(self.gone().sum())] if self.exits[1] else []
-        return dict(zip(self.columns(), [*numbers, self.contacts, float(self.contact_residual), *gone, *self._joint_row()], strict=True))
+        if self._columns is None:
+            self._columns = self.columns()
+        return dict(zip(self._columns, [*numbers, self.contacts, float(self.contact_residual), *gone, *self._joint_row()], strict=True))
 
     def surfaces(self) -> BodySurface:
         """Return the surfaces of all bodies for a frame.

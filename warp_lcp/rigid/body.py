@@ -4,23 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from operator import is_
+from pathlib import Path
 from typing import cast, overload
 
 import numpy as np
 
 from warp_lcp.grid.motion import Pose
 from warp_lcp.rigid.mass_properties import MassProperties
+from warp_lcp.rows import KernelFile
+from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.settings import NonNegative, Part, checked
 
-SAME_TURN = 1e-15  # [rad]: half a step's turn that no longer changes
 MOST_ROUNDS = 60  # of the fixed point; a step turns a body by far less than a radian, and each round by a factor of that less
 STATE, VALUES = 20, 26  # numbers of a body's state, and with the impulses given
 POSITION, ROTATION, MOMENTUM, SPINNING = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 18)  # where in the state
 ANGLE, TIME, GIVEN = 18, 19, slice(20, 26)
 UNIT, EPSILON = np.eye(3), float(np.finfo(np.float64).eps)
 CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9)  # v @ CROSS: entries of the matrix of v x
+NO_TIMES = np.zeros(0)
 AXES = [0, 1, 2]
 PLANAR = [0, 1, 5]  # vx, vy, wz among the six
+KERNELS = KernelFile(Path(__file__).parent / "headers/motion.h", {"MOST_ROUNDS": MOST_ROUNDS})
+ADVANCE, POSES = (HostKernel(KERNELS[f"warp_lcp.rigid.motion.{name}"]) for name in ("advance", "poses"))
 
 
 def _part(columns: slice, shape: tuple[int, ...] = (-1,)) -> property:
@@ -89,6 +95,7 @@ class RigidBody:
         self.friction, self.restitution = checked("friction", friction, NonNegative), checked("restitution", restitution, Part)
         self.properties, self.name = properties, name
         self.values = np.zeros(VALUES)
+        self.states: BodyStates | None = None  # that `values` are a row of
         self.position, self.rotation = properties.center, np.eye(3)
         self.momentum = properties.mass * _three(velocity)
         self.angular_momentum = properties.inertia @ _three(angular_velocity)
@@ -238,7 +245,7 @@ class BodyStates(Sequence[RigidBody]):
         self._bodies = tuple(bodies)
         self.values = np.array([body.values for body in bodies]).reshape(-1, VALUES)
         for body, row in zip(self._bodies, self.values, strict=True):
-            body.values = row
+            body.values, body.states = row, self
         each = [body.properties for body in bodies]
         self.mass = np.array([properties.mass for properties in each])
         self.center = np.array([properties.center for properties in each]).reshape(-1, 3)
@@ -277,11 +284,16 @@ class BodyStates(Sequence[RigidBody]):
 
     def inverse_masses(self, dimension: int) -> np.ndarray:
         """Return `RigidBody.inverse_mass` of all, shape (n, k, k)."""
-        turned = self.rotation @ self.inverse_inertia @ self.rotation.swapaxes(-1, -2)
-        result = np.zeros((len(self), 6, 6))
-        result[:, AXES, AXES] = 1.0 / self.mass[:, None]
-        result[:, 3:, 3:] = 0.5 * (turned + turned.swapaxes(-1, -2))
-        result = result if dimension == 3 else result[:, PLANAR][:, :, PLANAR]
+        if dimension == 2:
+            across = self.rotation[:, 2:]  # the last row of R I^-1 R', as far as it counts in the plane
+            result = np.zeros((len(self), 3, 3))
+            result[:, 0, 0] = result[:, 1, 1] = 1.0 / self.mass
+            result[:, 2, 2] = (across @ self.inverse_inertia @ across.swapaxes(-1, -2))[:, 0, 0]
+        else:
+            turned = self.rotation @ self.inverse_inertia @ self.rotation.swapaxes(-1, -2)
+            result = np.zeros((len(self), 6, 6))
+            result[:, AXES, AXES] = 1.0 / self.mass[:, None]
+            result[:, 3:, 3:] = 0.5 * (turned + turned.swapaxes(-1, -2))
         for free, body in zip(result, self, strict=True):
             if body.hold is not None:
                 held = free @ body.hold
@@ -294,6 +306,9 @@ class BodyStates(Sequence[RigidBody]):
         Shape (n, k) [N s, N m s]; as `RigidBody.apply_impulse` of each.
         """
         self.given += in_space(impulses)
+        if all(body.hold is None for body in self._bodies):
+            self.push(impulses)
+            return
         held = [impulse if body.hold is None else body.hold @ impulse for body, impulse in zip(self, impulses, strict=True)]
         self.push(np.array(held).reshape(impulses.shape))
 
@@ -349,16 +364,10 @@ class BodyMotion:
 
         Poses of n bodies at m times [s], see `pose`.
         """
-        values, mass, center, inverse_inertia = _stacked(motions)
-        states, dt = np.repeat(values[None], len(times), axis=0), times[:, None] - values[:, TIME]
-        later, number = np.nonzero(dt)
-        if len(later):
-            moved = states[later, number]
-            advance_states(moved, mass[number], inverse_inertia[number], dt[later, number])
-            states[later, number] = moved
-        rotation = states[..., ROTATION].reshape(*states.shape[:2], 3, 3)
-        turned = (rotation @ center[..., None])[..., 0]
-        return rotation, center - turned + (states[..., POSITION] - center)
+        n, m = len(motions), len(times)
+        reals = _moved(motions, times)
+        begin, middle, end = 39 * n + m, 39 * n + m + 9 * m * n, 39 * n + m + 12 * m * n
+        return reals[begin:middle].reshape(m, n, 3, 3).copy(), reals[middle:end].reshape(m, n, 3).copy()
 
     @staticmethod
     def velocity_fields_of(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, np.ndarray]:
@@ -366,17 +375,25 @@ class BodyMotion:
 
         A body's point x moves at turn x + shift now.
         """
-        values, mass, _, inverse_inertia = _stacked(motions)
-        turn = cross_matrix(spins(values[:, ROTATION].reshape(-1, 3, 3), inverse_inertia, values[:, SPINNING]))
-        shift = values[:, MOMENTUM] / mass[:, None] - (turn @ values[:, POSITION, None])[..., 0]
-        return turn, shift
+        n = len(motions)
+        reals = _moved(motions, NO_TIMES)
+        return reals[39 * n : 48 * n].reshape(n, 3, 3).copy(), reals[48 * n : 51 * n].reshape(n, 3).copy()
 
 
-def _stacked(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return values, mass, center and inverse inertia of the bodies, shapes (n, 26), (n,), (n, 3) and (n, 3, 3)."""
-    each = [motion.body.properties for motion in motions]
-    values, mass = np.array([motion.body.values for motion in motions]), np.array([of.mass for of in each])
-    return values, mass, np.array([of.center for of in each]), np.array([of.inverse_inertia for of in each])
+def _moved(motions: Sequence[BodyMotion], times: np.ndarray) -> np.ndarray:
+    """Return memory of the kernel `poses`: rotations and translations at m times are from 39 n + m on, turns and shifts after them."""
+    n, m = len(motions), len(times)
+    reals, _ = POSES.run((*_held(motions), times), (), tasks=n, work=12 * n * (m + 1), count=n, times=m)
+    return reals
+
+
+def _held(motions: Sequence[BodyMotion]) -> tuple[np.ndarray, ...]:
+    """Return values, masses, inverse inertias and centers of the bodies."""
+    bodies, states = [motion.body for motion in motions], motions[0].body.states
+    if states is not None and len(states) == len(bodies) and all(map(is_, bodies, states)):
+        return states.values, states.mass, states.inverse_inertia, states.center
+    each, values = [body.properties for body in bodies], np.array([body.values for body in bodies])
+    return values, *(np.array([getattr(of, name) for of in each]) for name in ("mass", "inverse_inertia", "center"))
 
 
 def in_space(values: np.ndarray) -> np.ndarray:
@@ -407,22 +424,11 @@ def advance_states(values: np.ndarray, mass: np.ndarray, inverse_inertia: np.nda
         inverse_inertia: shape (n, 3, 3), or (3, 3) for all.
         dt: time [s], or one for each, shape (n,).
     """
-    R, L = values[:, ROTATION].reshape(-1, 3, 3), values[:, SPINNING]
-    inverse = inverse_inertia if np.shape(inverse_inertia) == R.shape else np.broadcast_to(inverse_inertia, R.shape)
-    each = np.asarray(dt) if np.ndim(dt) else np.full(len(R), dt)
-    time = each[:, None]
-    half, left = 0.5 * time * spins(R, inverse, L), np.arange(len(R))
-    for _ in range(MOST_ROUNDS):
-        before = half[left]
-        half[left] = 0.5 * time[left] * spins(rotation_by(before) @ R[left], inverse[left], L[left])
-        left = left[~(np.abs(half[left] - before).max(axis=1) <= SAME_TURN)]
-        if not len(left):
-            break
-    turned = orthonormal(rotation_by(2.0 * half) @ R)
-    values[:, POSITION] += time * (values[:, MOMENTUM] / mass[:, None])
-    values[:, ROTATION] = turned.reshape(-1, 9)
-    values[:, ANGLE] += each * spins(turned, inverse, L)[:, 2]
-    values[:, TIME] += dt
+    count = len(values)
+    inverse = inverse_inertia if inverse_inertia.ndim == 3 else np.broadcast_to(inverse_inertia, (count, 3, 3))
+    each = dt if isinstance(dt, np.ndarray) else np.full(count, dt)
+    reals, _ = ADVANCE.run((values, mass, inverse, each), (), tasks=count, count=count)
+    values[:] = reals[: values.size].reshape(values.shape)
 
 
 def shift_states(values: np.ndarray, ways: np.ndarray) -> None:

@@ -291,7 +291,7 @@ class ContactDetection:
         every: bool = False,
     ) -> None:
         self.bodies = BodyStates.of(bodies)
-        self.shapes, self.obstacles, self.dimension, self._every = shapes, obstacles, dimension, every
+        self.shapes, self.obstacles, self.dimension, self.every = shapes, obstacles, dimension, every
         self._middle = np.array([0.5 * (shape.low + shape.high) for shape in shapes])
         self._half = np.array([0.5 * (shape.high - shape.low) - shape.radius for shape in shapes])
         self._radius = np.array([shape.radius for shape in shapes])
@@ -341,7 +341,7 @@ class ContactDetection:
         return FoundContacts(i, j, np.full(len(i), NONE), ContactPoints(point, normal, gap))
 
     def _kept(self, points: ContactPoints, size: float) -> ContactPoints:
-        return points if self._every else spread(points, size, self.dimension)
+        return points if self.every else spread(points, size, self.dimension)
 
     def _with_obstacle(
         self, number: int, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray

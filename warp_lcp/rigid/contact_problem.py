@@ -10,21 +10,17 @@ square of a stack's height; the rest is solved by sparse systems in `contact_new
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import warp as wp
 
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_newton import ContactNewton
-from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.memory import Scalar, rows_memory
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.rows import KernelFile
+from warp_lcp.rows.host_kernel import HostKernel
 
 if TYPE_CHECKING:
     from warp_lcp.rigid.joints import JointRows
@@ -60,63 +56,6 @@ class JointPart:
 
     rows: JointRows
     b: np.ndarray
-
-
-class SweepWorkspace(threading.local):
-    """Arrays and recorded launch of the NNCG kernel; each Python thread has its own."""
-
-    def __init__(self) -> None:
-        self._room = [0, 0, 0]
-        self._q, self._dim, self._contacts, self._rtol, self._most = (Scalar() for _ in range(5))
-        self._islands = 0
-
-    def run(
-        self, fields: Sequence[np.ndarray], work: int, indices: Sequence[np.ndarray], shape: tuple[int, int, int],
-        stopping: StoppingCriteria,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-        """Return impulses, shape (contacts, dim), and residuals and rounds of the islands.
-
-        Args:
-            fields: what `reals` of the kernel holds before its work, impulses to start from first.
-            work: size of the kernel's work in `reals`.
-            indices: what `indices` of the kernel holds, the islands' starts last.
-            shape: number of contacts, of a contact's rows, and of a body's velocities.
-            stopping: the tolerance and the most iterations.
-        """
-        contacts, dim, q = shape
-        filled, numbers, islands = sum(f.size for f in fields), sum(map(len, indices)), len(indices[-1]) - 1
-        self._reserve(filled + work, numbers, islands)
-        np.concatenate([np.ravel(field) for field in fields], out=self._reals[:filled])
-        self._reals[filled : filled + work] = 0.0
-        np.concatenate(indices, out=self._indices[:numbers], casting="same_kind")
-        self._q.value, self._dim.value, self._contacts.value = q, dim, contacts
-        self._rtol.value, self._most.value = stopping.rtol, stopping.max_iterations
-        self._residual[:islands] = self._rounds[:islands] = 0.0
-        if islands != self._islands:
-            self._islands = islands
-            self._rows.take(Rows.entries(islands, self._device).single)
-        self._graph.run()
-        x = self._reals[: contacts * dim].reshape(contacts, dim)
-        return x.copy(), self._residual[:islands].copy(), self._rounds[:islands].copy()
-
-    def _launch(self) -> None:
-        rows = replace(Rows.entries(self._islands, self._device), memory=self._rows)
-        reals, indices, residual, rounds = self._arrays
-        NNCG.bind(
-            rows, reals=reals, indices=indices, residual=residual, rounds=rounds, q=self._q, dim=self._dim, contacts=self._contacts,
-            rtol=self._rtol, most=self._most,
-        ).launch()  # fmt: skip
-
-    def _reserve(self, *sizes: int) -> None:
-        if all(size <= room for size, room in zip(sizes, self._room, strict=True)):
-            return
-        reals, indices, islands = self._room = [max(2 * size, room) for size, room in zip(sizes, self._room, strict=True)]
-        self._reals, self._indices = np.zeros(reals), np.zeros(indices, dtype=np.int32)
-        self._residual, self._rounds = np.zeros(islands), np.zeros(islands)
-        self._arrays = [_warp(values) for values in (self._reals, self._indices, self._residual, self._rounds)]
-        self._device = wp.get_device("cpu")
-        self._rows, self._islands = rows_memory(self._device), 0  # not before: an import must not start Warp
-        self._graph = LaunchGraph(self._device, self._launch)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +153,10 @@ class ContactProblem:
         order, starts, J, *others = self.sorted_rows
         x = np.zeros((k, rows)) if start is None else start[order]
         fields = (x, J, self.b[order], *others)
-        work, indices = 3 * k * rows + (self.bodies + 1) * q, (self.first[order], self.second[order], starts)
-        x, residual, rounds = SWEEPS.run(fields, work, indices, (k, rows, q), stopping)
+        work, indices = np.zeros(3 * k * rows + (self.bodies + 1) * q), (self.first[order], self.second[order], starts)
+        sizes = {"tasks": len(starts) - 1, "q": q, "dim": rows, "contacts": k}
+        reals, found = SWEEPS.run((*fields, work), indices, **sizes, rtol=stopping.rtol, most=stopping.max_iterations)
+        x, residual, rounds = reals[: k * rows].reshape(k, rows).copy(), *(field.copy() for field in found)
         for island in np.flatnonzero(residual > unsolved):
             mine = slice(starts[island], starts[island + 1])
             x[mine], residual[island], more = self.part(order[mine])._go_on(stopping.rtol, x[mine])
@@ -242,7 +183,7 @@ class ContactProblem:
         return ContactImpulses(newton.x.reshape(x.shape), newton.residual, newton.steps + sweeps)
 
 
-SWEEPS = SweepWorkspace()
+SWEEPS = HostKernel(NNCG)
 
 
 def _components(first: list[int], second: list[int], bodies: int) -> np.ndarray:
@@ -262,8 +203,3 @@ def _root(least: list[int], body: int) -> int:
     while least[body] != end:
         least[body], body = end, least[body]
     return end
-
-
-def _warp(values: np.ndarray) -> wp.array[Any]:
-    """Return contiguous values as Warp sees them, in the same memory."""
-    return wp.array(values, dtype=wp.float64 if values.dtype == np.float64 else wp.int32, device="cpu", copy=False)

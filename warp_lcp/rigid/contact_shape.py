@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -38,6 +39,7 @@ class ContactShape:
         closed: whether the inside has an end; contacts with others than such need points of theirs.
         signed: the signed distance alone, where that takes less time.
         edges: in space, segments that may be nearer to another surface between their ends than at `points`: shape (m, 2, 3) [m].
+        own: of discs, capsules and boxes of a plane, what `distance` knows; see `numbers`.
 
     Attributes:
         low, high: bounds of the closed ones [m], shape (3,).
@@ -51,6 +53,7 @@ class ContactShape:
     closed: bool = True
     signed: Callable[[np.ndarray], np.ndarray] | None = None
     edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    own: np.ndarray | None = None
     low: np.ndarray = field(init=False)
     high: np.ndarray = field(init=False)
 
@@ -104,6 +107,20 @@ class ContactShape:
         made = tuple(box for part in parts for box in part.boxes)
         corners = np.concatenate([box.corners() for box in made])
         return cls(points=corners, radius=0.0, distance=nearest, size=max(part.size for part in parts), boxes=made)
+
+    @cached_property
+    def numbers(self) -> np.ndarray | None:
+        """Numbers of a disc, capsule or box for `headers/planar_contacts.h`.
+
+        Shape (55,); None: it is another shape.
+        """
+        if self.own is None or len(self.points) > len(ALONG):
+            return None
+        points = np.zeros((len(ALONG), 3))
+        points[: len(self.points)] = self.points
+        kind, ball = float(bool(self.boxes)), float(len(self.points) == 1 and not self.boxes)
+        first = [kind, self.radius, self.size, len(self.points), ball, 1.0]
+        return np.concatenate([first, self.low, self.high, points.ravel(), self.own, np.zeros(16 - len(self.own))])
 
     def nearest_on(self, edges: np.ndarray, margin: float) -> np.ndarray:
         """Return the point of each edge nearest to this shape, shape (n, 3).
@@ -165,6 +182,7 @@ def _box(shape: Box, dimension: int) -> ContactShape:
         points=center + np.concatenate(points) @ R.T, radius=0.0, distance=distance, size=float(flat.max()),
         boxes=(OrientedBox(center, R.copy(), thick),),
         edges=center + np.concatenate(edges) @ R.T if edges else np.zeros((0, 2, 3)),
+        own=np.concatenate([center, R.ravel(), thick, [ON_SURFACE * flat.max()]]) if dimension == 2 else None,
     )  # fmt: skip
 
 
@@ -195,6 +213,7 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
     edges = np.stack([start, end], axis=1) if square and len(along) > 1 else np.zeros((0, 2, 3))
     return ContactShape(
         points=start + along[:, None] * axis, radius=radius, distance=distance, size=radius + 0.5 * float(np.sqrt(square)), edges=edges,
+        own=np.concatenate([start[0], axis, [square], other / np.linalg.norm(other), [ON_SURFACE * radius]]),
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -16,10 +17,9 @@ from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, Join
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
+from warp_lcp.rigid.planar_contacts import AHEAD, SLOP, PlanarContacts, PlanarImpulses
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
-AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for
-SLOP = 1e-5  # of a body's size: overlap that is left alone
 RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
 BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
@@ -71,10 +71,13 @@ class ContactSolve:
         bodies, shapes = self.bodies, detection.shapes
         self.reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
+        self._near = NEAR * float(self._size.min(initial=np.inf))
         self._friction = np.array([body.friction for body in bodies])
         self._bounce = np.array([body.restitution for body in bodies])
         self._found_roots: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # and the rotations that they are of
         self._last: tuple[Contacts, np.ndarray, ContactProblem] | None = None  # contacts, roots and problem of `push_apart`
+        self._pushed: PlanarImpulses | None = None  # by the last `push_apart`
+        self._planar = PlanarContacts(detection, self.reach) if PlanarContacts.holds(detection) else None
         self._roots_of_inertias = np.linalg.cholesky(bodies.inverse_inertia)
 
     def check_start(self, time: float) -> None:
@@ -105,21 +108,29 @@ class ContactSolve:
             gravity: [m/s^2], shape (3,); the bodies' velocities are those before it acts.
             gone: bodies that touch nothing, shape (n,); None: there are none.
         """
-        falls = float(np.linalg.norm(gravity)) * dt
+        falls, near = math.sqrt(gravity @ gravity) * dt, self._near
+        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
+        everywhere = gone is None or not gone.any()
+        planar = self._planar if everywhere else None
+        if planar is not None and (touching := planar.find(time, dt, falls, near, brought)) is not None:
+            found, contacts = touching
+            return contacts if planar.still and not self._joined else self.assembled(self._apart(found), time, dt, gravity)
         six = self.bodies.velocities()
         speeds, spins = lengths(six[:, :3]), lengths(six[:, 3:])
         ways = AHEAD * dt * (speeds + spins * self.reach + falls)
-        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
-        near = NEAR * float(self._size.min())
         found = self._apart(self.detection.find(time, ways, near + np.array(brought), near))
-        if gone is not None and gone.any():
+        if gone is not None and not everywhere:
             out = np.append(gone, False)
             found = found.where(~(out[found.first] | out[found.second]))
         return self.assembled(found, time, dt, gravity)
 
     def approach(self, contacts: Contacts) -> np.ndarray:
-        """Return normal velocities at contacts [m/s], shape (k,); negative: approaching."""
-        return contacts.velocities(self._velocities())[:, 0] if len(contacts) else np.zeros(0)
+        """Return normal velocities at contacts [m/s], shape (k,), for `bounce`.
+
+        Negative: approaching; 0 where nothing bounces.
+        """
+        bounces = contacts.restitution.any()  # else `bounce` does nothing
+        return contacts.velocities(self._velocities())[:, 0] if bounces else np.zeros(len(contacts))
 
     def bounce(self, contacts: Contacts, approach: np.ndarray, dt: float, kick_dt: float, gravity: np.ndarray) -> np.ndarray:
         """Set the rebound velocity and time of impacts (updates the contacts).
@@ -140,6 +151,8 @@ class ContactSolve:
             Impulses of the other contacts before the impacts [N s], shape (k, dimension).
         """
         before = np.zeros((len(contacts), self.dimension))
+        if not contacts.restitution.any():
+            return before
         g, gap, e = float(np.linalg.norm(gravity)), contacts.gap, contacts.restitution
         may = (e > 0.0) & (approach < -BOUNCE * g * dt) & (gap + dt * (approach - FALL * g * kick_dt) < 0.0)
         if not may.any():
@@ -233,6 +246,12 @@ class ContactSolve:
         self.residual, self.iterations = 0.0, 0
         if not len(contacts) and not self.joints:
             return np.zeros((0, self.dimension))
+        if self._planar is not None and not self.joints and self._solver is sweeps_and_newton:
+            before = self.memory.values if start is None else start
+            self._pushed = solved = self._planar.push(contacts, before, start is not None, EXACT, UNSOLVED, dt)
+            if solved is not None:
+                self.residual, self.iterations = solved.residual, solved.iterations
+                return solved.impulses
         b = contacts.velocities(self._velocities())
         b[:, 0] -= contacts.target
         start = self.memory.recall(contacts, self.bodies) if start is None else start
@@ -294,6 +313,13 @@ class ContactSolve:
         moved.advance(dt)
         return moved
 
+    def remember(self, contacts: Contacts, impulses: np.ndarray) -> None:
+        """Keep impulses, shape (k, dimension), to start the next step from."""
+        if self._pushed is not None and self._pushed.impulses is impulses:
+            self.memory.take(self._pushed.memory)
+        else:
+            self.memory.keep(contacts, impulses, self.bodies)
+
     def separation(self, contacts: Contacts, dt: float, detour: np.ndarray | None = None) -> np.ndarray | None:
         """Return the smallest displacements that reduce overlaps at the end of a step.
 
@@ -306,8 +332,12 @@ class ContactSolve:
             dt: time step [s].
             detour: of the bodies in the step.
         """
+        pushed, bodies = self._pushed, self.bodies
         if not len(contacts):
             return None
+        if pushed is not None and pushed.contacts is contacts and pushed.dt == dt and detour is None and not pushed.deep:
+            if np.array_equal(pushed.values, bodies.values):  # nothing has pushed them since
+                return None
         velocities = self._velocities() if detour is None else self._velocities() + detour / dt
         gap = contacts.gap + dt * contacts.velocities(velocities)[:, 0]
         deep = gap < -SLOP * contacts.size
@@ -337,7 +367,13 @@ class ContactSolve:
 
         A body that is held holds what bears against it where it cannot move itself: a stack on the floor is held up to its top.
         """
-        if len(contacts):
+        pushed = self._pushed
+        if pushed is not None and pushed.impulses is impulses and pushed.squares is not None:
+            for number, (square, root) in pushed.squares.items():
+                values, V = np.linalg.eigh(square)
+                V = V[:, values > SINGULAR * values.max()]
+                self.bodies[number].hold = np.eye(3) - ((1.0 / root)[:, None] * V) @ V.T * root
+        elif len(contacts):
             firm = Firm.of(contacts, impulses, len(self.bodies))
             roots = self._roots()
             waiting = np.unique(contacts.first[firm.first.any(axis=1)]).tolist()

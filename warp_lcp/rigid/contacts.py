@@ -102,7 +102,11 @@ class ContactMemory:
     def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: BodyStates) -> None:
         """Remember impulses, shape (k, dimension)."""
         world = (impulses[:, None] @ contacts.frames)[:, 0]
-        self.values = np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])[: self._most]
+        self.take(np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world]))
+
+    def take(self, values: np.ndarray) -> None:
+        """Take values, shape (k, 8), as many as are kept."""
+        self.values = values[: self._most]
 
     def recall(self, contacts: Contacts, bodies: BodyStates) -> np.ndarray:
         """Return impulses to start from, shape (k, dimension).

@@ -64,6 +64,8 @@ class Firm:
         )
         for rows, mine, J, beyond in sides:
             here = np.flatnonzero((mine == number) & (beyond < self.bodies))
+            if not len(here):
+                continue
             yields = [np.square(J[here] @ root).sum(axis=2) for root in (left, free)]
             fresh = self.held[here] & (yields[0] < STILL * yields[1])
             rows[here] |= fresh

@@ -13,6 +13,7 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy
 from warp_lcp.rows.program import launch as launch_recorded
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers.projected_multigrid_kernels import ENERGY, ZAP, ZAZ
 
@@ -109,7 +110,7 @@ class LowRankCorrection:
         n, device = low.rank, hierarchy.device
         self._S, self._E = (wp.zeros(n * n, dtype=wp.float64, device=device) for _ in range(2))
         self._sums, self._kept, self._force, self._t = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4))
-        self._squares = wp.zeros(n + n // low.columns.width, dtype=wp.float64, device=device)
+        self._squares = Reading(device, n + n // low.columns.width)
         self._of_slot = wp.zeros(n, dtype=wp.int32, device=device)
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
@@ -142,19 +143,20 @@ class LowRankCorrection:
         Returns:
             Whether the finest right-hand side was lost.
         """
-        low, W = self._low, self._low.weights.numpy()
+        low, W = self._low, self._low.host_weights
         self._squaring.run(variant=self._columns.rows.ptr)
+        self._squares.changed()
         found, width, across = self._squares.numpy().copy(), self._columns.width, low.layout.across
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
         power = 1.0 / max(sum(n > 1 for n in self._hierarchy.finest.stencil.padding.counts) - 1, 1)
-        strong = [int(q) for q in np.flatnonzero(np.diag(W) * SPREAD * rows**power * squares >= STRONG)]
+        strong = np.flatnonzero(W.diagonal() * SPREAD * rows**power * squares >= STRONG).tolist()
         if begins:
             self._seen[:] = 0.0
         if strong != self._slot_columns:
             self._choose(strong)
-        seen = self._seen
-        stale = [q for q in strong if not seen[q] / CHANGED <= squares[q] <= seen[q] * CHANGED]
+        seen, now = self._seen.tolist(), squares.tolist()
+        stale = [q for q in strong if not seen[q] / CHANGED <= now[q] <= seen[q] * CHANGED]
         self._fill(stale, squares)
         lost = bool(stale)
         if strong and not self._invert(W) and len(stale) < len(strong):
@@ -243,7 +245,7 @@ class LowRankCorrection:
     def _launch_squares(self) -> None:
         """Launch the sums U_q' U_q over the free set, and the rows that each body touches there."""
         one, d = Rows.flat(1, self._low.device), self._hierarchy.finest.stencil.d
-        SQUARES.bind(one, self._columns.entry_fields, rank=self._low.rank, d=d, squares=self._squares).launch()
+        SQUARES.bind(one, self._columns.entry_fields, rank=self._low.rank, d=d, squares=self._squares.array).launch()
 
     def _launch_unit_force(self) -> None:
         """Make U f the finest right-hand side."""

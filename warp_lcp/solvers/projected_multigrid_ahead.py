@@ -125,10 +125,18 @@ class RunAhead:
 
     def _launch(self, kernel: Any, memory: list[Any], given: list[Any]) -> None:
         """Launch a kernel of one thread whose last arguments differ from launch to launch."""
-        made = self._launches.get(kernel)
+        made, device = self._launches.get(kernel), self._work.A.device
+        if not device.is_cuda:
+            if made is None:
+                made = self._launches[kernel] = Program(device), [Scalar() for _ in given]
+                made[0].launch(kernel, 1, [*memory, *made[1]], device=device)
+            for number, value in zip(made[1], given, strict=True):
+                number.value = value
+            made[0].run()
+            return
         if made is None:
             inputs = [*memory, *given]
-            made = self._launches[kernel] = wp.launch(kernel, 1, inputs, device=self._work.A.device, record_cmd=True)
+            made = self._launches[kernel] = wp.launch(kernel, 1, inputs, device=device, record_cmd=True)
         else:
             for place, value in enumerate(given, len(memory)):
                 made.set_param_at_index(place, value)

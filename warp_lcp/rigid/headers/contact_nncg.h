@@ -1,24 +1,8 @@
 // Kernel of contacts between rigid bodies. one, other: a contact's bodies; starts: an island's
 // first contact.
 
-// kernel warp_lcp.rigid.contacts.nncg: Solve the islands first <= t < last, whose contacts follow
-// each other, by nonlinear conjugate gradients on projected sweeps. `reals` holds x, J, b, e, d, mu,
-// then room for g, way, best and w. J: rows, 2 q entries each, for the first and the second body of
-// the row's contact; w = J' x, q entries a body. `indices` holds a contact's bodies, and an island's
-// first contact. `residual` and `rounds` are of each island: relative to the residual of x = 0, and
-// iterations taken. EACH iterations lie between looks at the residual, which costs as much as a
-// sweep.
-//   compute    float64
-//   whole      float64 reals; int32 indices
-//   box        float64 residual, rounds
-//   numbers    int q, dim, contacts; float64 rtol; int most
-//   constants  EACH = 8
-EXACT_MATH
-const int m = 2*q, size = dim*contacts;
-double *x = reals, *J = x + size, *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
-double *g = mu + contacts, *way = g + size, *best = way + size, *w = best + size;
-const int *one = indices, *other = one + contacts, *starts = other + contacts;
-for (int t = first; t < last; ++t) {
+// snippet island: One island t of the kernel below: its x, `residual[t]` and `rounds[t]`.
+for (;;) {
     const int low = dim*starts[t], high = dim*starts[t + 1];
     auto velocity = [&](int i) {
         const double *r = J + i*m, *u = w + q*one[i/dim], *v = w + q*other[i/dim];
@@ -57,7 +41,7 @@ for (int t = first; t < last; ++t) {
         for (int i = low; i < high; ++i) x[i] = 0.0;
         residual[t] = 0.0;
         rounds[t] = 0.0;
-        continue;
+        break;
     }
     for (int i = low; i < high; ++i) { x[i] = clipped(i, x[i]); way[i] = 0.0; }
     gather();
@@ -94,4 +78,26 @@ for (int t = first; t < last; ++t) {
     for (int i = low; i < high; ++i) x[i] = best[i];
     residual[t] = least/reference;
     rounds[t] = done;
+    break;
+}
+
+// kernel warp_lcp.rigid.contacts.nncg: Solve the islands first <= t < last, whose contacts follow
+// each other, by nonlinear conjugate gradients on projected sweeps. `reals` holds x, J, b, e, d, mu,
+// then room for g, way, best and w. J: rows, 2 q entries each, for the first and the second body of
+// the row's contact; w = J' x, q entries a body. `indices` holds a contact's bodies, and an island's
+// first contact. `residual` and `rounds` are of each island: relative to the residual of x = 0, and
+// iterations taken. EACH iterations lie between looks at the residual, which costs as much as a
+// sweep.
+//   compute    float64
+//   whole      float64 reals; int32 indices
+//   box        float64 residual, rounds
+//   numbers    int q, dim, contacts; float64 rtol; int most
+//   constants  EACH = 8
+EXACT_MATH
+const int m = 2*q, size = dim*contacts;
+double *x = reals, *J = x + size, *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
+double *g = mu + contacts, *way = g + size, *best = way + size, *w = best + size;
+const int *one = indices, *other = one + contacts, *starts = other + contacts;
+for (int t = first; t < last; ++t) {
+#include "island"
 }
