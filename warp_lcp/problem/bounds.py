@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import warp as wp
 from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
+from warp_lcp.rows.fields import LARGE, Array, Layout, overwrite, real_array
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
 
@@ -76,6 +78,24 @@ class Bounds:
         """Whether a lower and an upper bound may be finite, now or after the caller changed a field."""
         below, above = (self.varying[side] or bool(np.isfinite(self.values[side])) for side in (0, 1))
         return below, above
+
+    @property
+    def form(self) -> Hashable | None:
+        """What a copy must have in common that can `take` these bounds; None: they have no copies."""
+        if self.affine is not None or self.in_place:
+            return None
+        return tuple(field.size for field in (*self.fields, self.code)), self.varying, *map(float.hex, self.values)
+
+    def replica(self) -> Bounds:
+        """Return the same bounds in memory of their own."""
+        twin = copy.copy(self)
+        twin.fields, twin.code = [wp.clone(field) for field in self.fields], wp.clone(self.code)
+        return twin
+
+    def take(self, other: Bounds) -> None:
+        """Copy bounds of the same form."""
+        for to, source in zip((*self.fields, self.code), (*other.fields, other.code), strict=True):
+            overwrite(to, source)
 
     @property
     def operands(self) -> list[Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Hashable
 from functools import cached_property, singledispatch
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from warp_lcp.problem.pickling import OnHost, Pickled
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
+from warp_lcp.rows.fields import LARGE, Array, Layout, overwrite, real_array
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import ADD, Sums, rows_of
@@ -122,6 +124,34 @@ class LCP(Pickled):
     def upper(self) -> wp.array[Any]:
         """u as a stored field, float64."""
         return self.bounds.as_field(1)
+
+    @property
+    def form(self) -> Hashable | None:
+        """What a copy must have in common that can `take` this problem: sizes, types and numbers; None: it has no copies.
+
+        Problems with copies are those of a `GridPoisson` on the CPU whose fields are not used in place.
+        """
+        form = getattr(self.A, "form", None)
+        if form is None or self.bounds.form is None or self.in_place or self.preconditioner is not None or type(self) is not LCP:
+            return None
+        return form, self.bounds.form
+
+    def replica(self) -> LCP:
+        """Return the same problem in memory of its own."""
+        twin = copy.copy(self)
+        for cached in ("lower", "upper", "_counts"):
+            twin.__dict__.pop(cached, None)
+        twin.A, twin.b, twin.bounds = self.A.replica(), wp.clone(self.b), self.bounds.replica()  # type: ignore[attr-defined]  # has a form
+        twin.unknown = twin.A.cells.flatten()
+        return twin
+
+    def take(self, other: LCP) -> None:
+        """Copy the data of a problem of the same form."""
+        self.A.take(other.A)  # type: ignore[attr-defined]
+        self.bounds.take(other.bounds)
+        overwrite(self.b, other.b)
+        for cached in ("lower", "upper"):
+            self.__dict__.pop(cached, None)
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
         """Evaluate out = A x + b on flat stored fields of one type.

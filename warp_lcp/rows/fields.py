@@ -5,6 +5,7 @@ A user's field has the operator's shape; a *stored* field is a flat array of `si
 
 from __future__ import annotations
 
+import ctypes
 import math
 import mmap
 from dataclasses import dataclass, replace
@@ -83,6 +84,12 @@ def real_array(values: Any, name: str) -> np.ndarray:
     if host.dtype.kind not in "biuf":
         raise ValueError(f"{name} is a {type(values).__name__} of type {host.dtype}: expected real numbers")
     return host
+
+
+def overwrite(to: wp.array[Any], source: wp.array[Any]) -> None:
+    """Copy an array of the CPU to another one of the same type and size, both contiguous: in a tenth of the time of `wp.copy`."""
+    if source.size:
+        ctypes.memmove(to.ptr, source.ptr, source.capacity)
 
 
 def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:

@@ -117,6 +117,11 @@ class RunAhead:
             r.take(self.rows.popleft(), size)
         return reference
 
+    def forget_guess(self) -> None:
+        """Keep no guess alive: the launches that begin a solve from one are made again."""
+        self._beginning = None
+        self.rows.clear()
+
     def _judge_first(self, counted: wp.array[Any] | None, launch: Launch) -> None:
         """Record the kernel that decides whether the guess is good enough."""
         *given, noise = self._numbers

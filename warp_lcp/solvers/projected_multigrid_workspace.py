@@ -184,6 +184,13 @@ class MultigridWorkspace(IterateMemory):
         self._ahead = RunAhead(self) if type(self) is MultigridWorkspace and RunAhead.suits(self) else None
         self._allowed, self._begun = 0, False  # steps without the host; whether the device has begun the solve
 
+    def forget_solve(self) -> None:
+        """Free what only the last solve needed, and the search direction, which no step must see again."""
+        self._algebraic = self.floating = None
+        self._p.zero_()
+        if self._ahead is not None:
+            self._ahead.forget_guess()
+
     def allow(self, steps: int) -> None:
         """Say how many steps of the next solve may be taken without the host."""
         self._allowed = steps
