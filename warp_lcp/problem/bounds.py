@@ -14,7 +14,7 @@ import warp as wp
 from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import LARGE, Array, Layout, overwrite, real_array
+from warp_lcp.rows.fields import LARGE, Array, Layout, nothing, overwrite, real_array
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
 
@@ -48,8 +48,7 @@ class Bounds:
 
     def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
         self.layout, self.device = layout, layout.device
-        self._none = wp.empty(0, dtype=wp.float64, device=self.device)
-        self._no_code = wp.empty(0, dtype=wp.uint8, device=self.device)
+        self._none, self._no_code = nothing(wp.float64, self.device), nothing(wp.uint8, self.device)
         self.fields, self.values, self.code = [self._none, self._none], list(INFINITE), self._no_code
         self._memory: wp.array[Any] | None = None
         self.affine = affine_fields(layout, lower, upper)

@@ -129,6 +129,21 @@ def together(device: wp.Device) -> Iterator[Launch]:
     program.run()
 
 
+@contextmanager
+def as_one_table(device: wp.Device, across: Any = None) -> Iterator[None]:
+    """Record what is launched within by `warp_lcp.rows`; the team works through it as one table afterwards. Nothing is read within.
+
+    On CUDA, and where fields are shared `across` ranks, launches are done at once.
+    """
+    if device.is_cuda or across is not None or is_recording() or team() is None:
+        yield
+        return
+    program = Program(device)
+    with recording(program):
+        yield
+    program.run()
+
+
 def run_table(table: Table) -> None:
     """Have the team work through a table."""
     at_work = team()

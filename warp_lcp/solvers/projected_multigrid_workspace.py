@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,9 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Bound, Rows
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.fields import nothing
+from warp_lcp.rows.program import Launch, Program, as_one_table
+from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
@@ -87,7 +90,9 @@ class AssessedResidual(NaturalResidual):
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute the norm of the natural residual at x, the free set and the right-hand side."""
-        self.assess(x)
+        plain = type(self).assess is AssessedResidual.assess  # others may launch by Warp alone
+        with as_one_table(x.device, self.problem.layout.across) if plain else nullcontext():
+            self.assess(x)
         return self.read()
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
@@ -169,7 +174,7 @@ class MultigridWorkspace(IterateMemory):
         real, self.A, self.settings, self.bounded = precision.correction, A, settings, problem.bounded
         self._p = problem.layout.zeros(real)
         # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
-        upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
+        upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else nothing(real, A.device)
         options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
         self.hierarchy = make_hierarchy(A.stencil, real, **options)
         super().__init__(problem, precision, residual=self._residual(problem, precision is Precision.SINGLE))
@@ -334,16 +339,17 @@ class MultigridWorkspace(IterateMemory):
     def monotone_step(self) -> Step:
         """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
         p, finest, descent = self.problem, self.hierarchy.finest, self.descent
-        self.rebuild()
         self._leave()
-        lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
-        kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(wp.launch)
-        (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
-        self._plan_monotone_step()
         self._cycles_left -= 1
         self._allowed -= 1
-        self._classify_next()
-        self._advance()
+        lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
+        with as_one_table(p.device) if self._ahead is not None else nullcontext():
+            self.rebuild()
+            kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(wp.launch)
+            (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
+            self._plan_monotone_step()
+            self._classify_next()
+            self._advance()
         self.residual.read()
         if self.floating is not None and self._cycles_left == 0:
             self._project()
@@ -354,7 +360,7 @@ class MultigridWorkspace(IterateMemory):
         """Take the projected cycle's correction as it is."""
         finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x)
-        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, False], device=self.problem.device)
+        launch_recorded(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, False], device=self.problem.device)
 
     def truncated_step(self) -> Step:
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
