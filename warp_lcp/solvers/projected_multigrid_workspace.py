@@ -61,14 +61,17 @@ class AssessedResidual(NaturalResidual):
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u); a guess is classified, a cold start is not."""
         self.renew()
-        super().start(x, keep=keep)
+        with as_one_table(x.device, self.problem.layout.across):
+            super().start(x, keep=keep)
+            if not keep:
+                self.launch_square_of_b()
         ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
         for bound in (lower, upper, code):
             if ghosts is not None and bound.size:
                 ghosts.fill(bound)  # x's ghost cells will move as the cells do that they stand for
         self.classify = keep
         if not keep:
-            self._norm_of_b = super().norm_of_b()
+            self._norm_of_b = float(np.sqrt(self.square_of_b.numpy()[0]))
             self.set(kernels.SIZE, self._norm_of_b or 1.0)
             self.set(kernels.STEP, 0.0)
 
