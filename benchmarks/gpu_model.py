@@ -103,7 +103,7 @@ def heard(make: Callable[[], Callable[[], object]]) -> Work:
 
     def binding(declared: RowPass, rows: Any, *structs: Any, stencil: Any = None, bounds: Any = None, **arguments: Any) -> Bound:
         bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **arguments)
-        taken = {name: getattr(bound.fields, name) for name in declared.arrays}
+        taken = {name: bound.given[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
         if stencil is not None:
             fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}

@@ -160,7 +160,7 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Heard], Heard]:
         declared: RowPass, rows: Rows, *structs: Any, stencil: Any = None, bounds: list[Any] | None = None, **given: Any
     ) -> Bound:
         bound = bind(declared, rows, *structs, stencil=stencil, bounds=bounds, **given)
-        taken = {name: getattr(bound.fields, name) for name in declared.arrays}
+        taken = {name: bound.given[name] for name in declared.arrays}
         fields = {name: value for name, value in taken.items() if isinstance(value, wp.array)}
         if stencil is not None:
             fields |= {"d": stencil.d} | {f"w{axis}": w for axis, w in zip("xyz", stencil.weights or (), strict=False)}

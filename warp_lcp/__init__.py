@@ -53,6 +53,7 @@ from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
 from warp_lcp.solvers.psor import ProjectedSOR, advised_omega
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.registry import METHODS
+from warp_lcp.solvers.spare_workspace import release_workspace
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
@@ -143,6 +144,7 @@ __all__ = [
     "print_progress",
     "read_frame",
     "recommend",
+    "release_workspace",
     "set_threads",
     "solve",
     "solve_coupled",

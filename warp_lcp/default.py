@@ -68,7 +68,8 @@ def solve(
             order, x first, are then solved as a grid problem; the result's `grid` has its shape.
         stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that `wl.recommend` gives if there is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
-        workspace: result of `solver.init(problem)`, to reuse its memory.
+        workspace: result of `solver.init(problem)`, to reuse its memory. Without it, one of a grid may be kept for later solves, see
+            `wl.release_workspace`.
         callback: called with each Record, such as `wl.print_progress`; if it raises StopIteration,
             the solve ends with STOPPED.
         misplaced: other options are refused, with a hint where they belong.

@@ -1,5 +1,6 @@
 """A team of threads: the bits of one, whoever calls, forks, interrupts or leaves; and the same without it."""
 
+import math
 import os
 import shutil
 import subprocess
@@ -280,3 +281,49 @@ def test_threads_race_for_nothing(control, tmp_path):
         pytest.skip("ThreadSanitizer cannot run here")
     assert ("data race" in done.stderr) == control, done.stderr
     assert control or done.returncode == 0
+
+
+@wp.struct
+class Mixed:
+    """Members of several sizes, with a gap between them."""
+
+    flag: wp.bool
+    values: wp.array(dtype=wp.float64)
+    place: wp.vec3i
+    weight: wp.float64
+
+
+@wp.kernel(enable_backward=False, module="tests.rows.packing")
+def packing_kernel(
+    flag: wp.bool, a: wp.array(dtype=wp.float32), n: int, b: wp.array3d(dtype=wp.uint8), x: wp.float64, place: wp.vec3i, y: float,
+    many: wp.int64, m: Mixed, point: wp.vec2d, turn: wp.mat22, c: wp.array2d(dtype=wp.vec2i), last: bool,
+):  # fmt: skip
+    """a[n] = y, of arguments of all kinds."""
+    a[n] = y
+
+
+def drawn_arguments(rng):
+    """Return arguments of `packing_kernel`: arrays, some of them strided or empty, vectors, a struct, numbers."""
+    m, sizes = Mixed(), rng.integers(0, 6, 7)
+    m.flag, m.weight, m.place = bool(rng.integers(2)), rng.standard_normal(), wp.vec3i(*map(int, rng.integers(-9, 9, 3)))
+    m.values = wp.zeros(int(sizes[0]), dtype=wp.float64, device=CPU)
+    a = wp.zeros(2 * int(sizes[1]) + 8, dtype=wp.float32, device=CPU)[:: int(rng.integers(1, 3))]
+    b = wp.zeros(tuple(map(int, sizes[2:5])), dtype=wp.uint8, device=CPU)
+    c = wp.zeros(tuple(map(int, sizes[5:7])), dtype=wp.vec2i, device=CPU)
+    point, turn = wp.vec2d(*rng.standard_normal(2)), wp.mat22(*rng.standard_normal(4))
+    y = rng.choice([0.1, -0.0, math.inf, 1e-46, 1e39, 3.0000001])
+    number = int(rng.integers(-(1 << 62), 1 << 62))
+    flag, last = bool(rng.integers(2)), bool(rng.integers(2))
+    return [flag, a, int(rng.integers(-9, 4)), b, rng.standard_normal(), m.place, float(y), number, m, point, turn, c, last]
+
+
+def test_arguments_are_packed_as_warp_packs_them():
+    """Arguments of all kinds that the team packs by itself; whatever else comes is left to Warp, which converts or refuses it."""
+    signature = team.signature_of(packing_kernel)
+    for seed in range(50):
+        inputs = drawn_arguments(np.random.default_rng(seed))
+        recorded = wp.launch(packing_kernel, 1, inputs, device=CPU, record_cmd=True)
+        assert signature.pack(inputs) == bytes(team.arguments_of(recorded))
+    others = {1: inputs[3], 2: 1 << 31, 3: inputs[1], 5: (1, 2, 3), 8: wp.vec3i(), 9: wp.vec2f(), 11: None}
+    for place, other in others.items():
+        assert signature.pack([*inputs[:place], other, *inputs[place + 1 :]]) is None, f"argument {place}"

@@ -51,8 +51,8 @@ class DenseInverse:
 
     def __init__(self, counts: Counts, device: wp.Device) -> None:
         m, self._counts, self._device = math.prod(counts), counts, device
-        self.matrix, self.inverse = (wp.zeros((m, m), dtype=wp.float64, device=device) for _ in range(2))
-        self._own = wp.zeros(m, dtype=wp.float64, device=device)
+        self.matrix, self.inverse = (zeros((m, m), wp.float64, device) for _ in range(2))
+        self._own = zeros(m, wp.float64, device)
 
     def making(self, stencil: PaddedStencil, real: Any, launch: Launch) -> None:
         """Launch the passes that make the inverse."""

@@ -19,7 +19,7 @@ from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.operators.padded_stencil import PaddedStencil, coarsen_spans_kernel
 from warp_lcp.rows import Bound, RowPass, Rows
-from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.fields import Padding, nothing, zeros
 from warp_lcp.rows.program import Launch, Program, Task
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.sequence import CUDA_THREADS
@@ -42,16 +42,16 @@ class Level:
         self.stencil, self.real = stencil, real
         field: Callable[[], wp.array[Any]] = lambda: stencil.padding.zeros(real, stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
-        nothing = wp.empty(0, dtype=real, device=stencil.device)
-        self.lower, self.upper = (bounds or (field(), field() if upper else nothing)) if bounded else (self.x, self.x)
+        self.lower, self.upper = (bounds or (field(), field() if upper else nothing(real, stencil.device))) if bounded else (self.x, self.x)
         self.form = stencil.weights is not None, stencil.d.dtype, real, stencil.pattern
         self.block: wp.array[Any] | None = None  # weights of a compact level, one field after another
         self.factors = 1, 1, 1  # cells of the finer level along x, y and z that one of this level stands for
         self._bound: dict[Any, Any] = {}  # passes by what tells them apart: a W-cycle repeats few of them many times
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
         rows = stencil.padding.counts[:2]
-        self.changed = wp.ones(rows, dtype=wp.uint8, device=stencil.device)  # rows, since the last rebuild
-        self._spans = None if stencil.spans is None else wp.zeros(rows, dtype=wp.vec2i, device=stencil.device)  # of the fields' contents
+        self.changed = zeros(rows, wp.uint8, stencil.device)  # rows, since the last rebuild
+        self.changed.fill_(1)
+        self._spans = None if stencil.spans is None else zeros(rows, wp.vec2i, stencil.device)  # of the fields' contents
 
     def renewing(self, *, keeps_weights: bool) -> Bound:
         """Return the pass that clears the fields outside the rows' new spans and marks rows whose span has changed.
@@ -217,7 +217,7 @@ class Hierarchy:
         self._prepare_coarsest()
         s = self.finest.stencil
         signed = s.weights is not None and s.spans is not None and s.pattern is None
-        self._signs = wp.zeros(s.padding.counts[:2], dtype=wp.uint64, device=self.device) if signed else None  # of rows of weights
+        self._signs = zeros(s.padding.counts[:2], wp.uint64, self.device) if signed else None  # of rows of weights
         self._descents: dict[tuple[int, bool, bool], Program] = {}
         self.refresh()
 
@@ -472,7 +472,7 @@ class Hierarchy:
         block, weights = weights_block(pattern, padding, self.real, self.device) if pattern else (None, None)
         new = [padding.zeros(self.real, self.device) for _ in range(1 if pattern else 4)]
         periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(padding.counts), strict=True))
-        spans = None if s.spans is None else wp.zeros(padding.counts[:2], dtype=wp.vec2i, device=self.device)
+        spans = None if s.spans is None else zeros(padding.counts[:2], wp.vec2i, self.device)
         weights = weights or (new[1], new[2], new[3])
         ghosts = None if s.ghosts is None else s.ghosts.coarser(factors)
         numbers = () if pattern else (0.0, 0.0, 0.0)

@@ -16,7 +16,17 @@ from warp_lcp.operators.padded_stencil import SPAN_CELLS, Ghosts, PaddedStencil
 from warp_lcp.problem.pickling import Pickled
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import Bound, KernelFile, Rows
-from warp_lcp.rows.fields import CPU_CHUNK, LARGE, PaddedLayout, check_kept, check_storable, checked_device, real_array, relative_rounding
+from warp_lcp.rows.fields import (
+    CPU_CHUNK,
+    LARGE,
+    PaddedLayout,
+    check_kept,
+    check_storable,
+    checked_device,
+    real_array,
+    relative_rounding,
+    zeros,
+)
 from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.rows.program import copy as copy_array
 from warp_lcp.rows.vectors import Across
@@ -69,10 +79,10 @@ class GridOperator(Pickled):
         padded[1:-1, 1:-1, 1:-1] = host.reshape(counts)
         self.cells = wp.array(padded, device=self.device, copy=self.device.is_cuda)
         self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) or self._ghosts is not None else self.cells
-        self._spans, self._reach = (wp.zeros(counts[:2], dtype=wp.vec2i, device=self.device) for _ in range(2))
+        self._spans, self._reach = (zeros(counts[:2], wp.vec2i, self.device) for _ in range(2))
         whole = self.device.is_cuda or self.cells_around is not self.cells or self.layout.size < LARGE
         chunks = 0 if whole else -(-self.layout.size // CPU_CHUNK)
-        self._chunks = wp.zeros((chunks, 1), dtype=wp.vec2i, device=self.device)
+        self._chunks = zeros((chunks, 1), wp.vec2i, self.device)
         self.layout.chunks = self._chunks if chunks else None
         self._find_rows()
         self.layout.find_use(self._reach.numpy()[..., 1] > 0)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Hashable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,7 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import real_array
+from warp_lcp.rows.fields import overwrite, real_array
 from warp_lcp.rows.vectors import Sums
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/grid_poisson.h")
@@ -146,6 +149,41 @@ class GridPoisson(GridOperator):
 
     def _component_finder(self) -> ComponentFinder:
         return ComponentFinder(self)
+
+    @property
+    def form(self) -> Hashable | None:
+        """What a copy must have in common that can `take` this operator; None: it has no copies (subclasses, GPUs, ranks, large grids)."""
+        plain = type(self) is GridPoisson and self._mask is None and self._ghosts is None and self.layout.across is None
+        if not plain or self.device.is_cuda or self.layout.chunks is not None:
+            return None
+        s = self.stencil
+        numbers = map(float.hex, map(float, (*self.uniform, s.unit, *(s.strength or ()))))
+        sizes = tuple(field.size for field in (*self.faces, self.shift, *(s.weights or ())))
+        return self.shape, self.periodic, self.dtype, s.d.dtype, sizes, *numbers
+
+    def _held(self) -> list[wp.array[Any]]:
+        """Return all that a solve reads of it."""
+        s = self.stencil
+        return [self.cells, self.cells_around, self._spans, s.d, *(s.weights or ()), *self.faces, self.shift]
+
+    def replica(self) -> GridPoisson:
+        """Return the same operator in memory of its own."""
+        twin = copy.copy(self)
+        twin._refills, twin._finder = {}, None
+        for cached in ("_search", "_rows_in_reach"):
+            twin.__dict__.pop(cached, None)
+        s, kept = self.stencil, {id(field): wp.clone(field) for field in self._held()}
+        own: Any = lambda field: kept[id(field)]  # noqa: E731
+        twin.cells, twin.cells_around, twin._spans, twin.shift = map(own, (self.cells, self.cells_around, self._spans, self.shift))
+        twin.faces, weights = list(map(own, self.faces)), None if s.weights is None else tuple(map(own, s.weights))
+        twin.stencil = replace(s, d=own(s.d), weights=weights, spans=twin._spans)
+        return twin
+
+    def take(self, other: GridPoisson) -> None:
+        """Copy an operator of the same form."""
+        for to, source in zip(self._held(), other._held(), strict=True):
+            overwrite(to, source)
+        self.version += 1
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle cells and coefficients; these come back in the padded shape."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import warp as wp
 from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
+from warp_lcp.rows.fields import LARGE, Array, Layout, nothing, overwrite, real_array
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
 
@@ -46,8 +48,7 @@ class Bounds:
 
     def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
         self.layout, self.device = layout, layout.device
-        self._none = wp.empty(0, dtype=wp.float64, device=self.device)
-        self._no_code = wp.empty(0, dtype=wp.uint8, device=self.device)
+        self._none, self._no_code = nothing(wp.float64, self.device), nothing(wp.uint8, self.device)
         self.fields, self.values, self.code = [self._none, self._none], list(INFINITE), self._no_code
         self._memory: wp.array[Any] | None = None
         self.affine = affine_fields(layout, lower, upper)
@@ -76,6 +77,24 @@ class Bounds:
         """Whether a lower and an upper bound may be finite, now or after the caller changed a field."""
         below, above = (self.varying[side] or bool(np.isfinite(self.values[side])) for side in (0, 1))
         return below, above
+
+    @property
+    def form(self) -> Hashable | None:
+        """What a copy must have in common that can `take` these bounds; None: they have no copies."""
+        if self.affine is not None or self.in_place:
+            return None
+        return tuple(field.size for field in (*self.fields, self.code)), self.varying, *map(float.hex, self.values)
+
+    def replica(self) -> Bounds:
+        """Return the same bounds in memory of their own."""
+        twin = copy.copy(self)
+        twin.fields, twin.code = [wp.clone(field) for field in self.fields], wp.clone(self.code)
+        return twin
+
+    def take(self, other: Bounds) -> None:
+        """Copy bounds of the same form."""
+        for to, source in zip((*self.fields, self.code), (*other.fields, other.code), strict=True):
+            overwrite(to, source)
 
     @property
     def operands(self) -> list[Any]:

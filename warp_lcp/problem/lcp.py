@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Hashable
 from functools import cached_property, singledispatch
 from pathlib import Path
 from typing import Any
@@ -9,18 +11,19 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem.bounds import INFINITE, LAUNCHED, Bounds
+from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.pickling import OnHost, Pickled
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.fields import LARGE, Array, Layout, real_array
+from warp_lcp.rows.fields import LARGE, Array, Layout, overwrite, real_array
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/residual.h")
 CHECK = KERNELS["problem.check"]
+CHECKED_BY_NUMPY = 12_000  # most elements of fields of the CPU that NumPy checks in less time than a launch takes: 45 of 75 us
 
 
 @singledispatch
@@ -123,6 +126,34 @@ class LCP(Pickled):
         """u as a stored field, float64."""
         return self.bounds.as_field(1)
 
+    @property
+    def form(self) -> Hashable | None:
+        """What a copy must have in common that can `take` this problem: sizes, types and numbers; None: it has no copies.
+
+        Problems with copies are those of a `GridPoisson` on the CPU whose fields are not used in place.
+        """
+        form = getattr(self.A, "form", None)
+        if form is None or self.bounds.form is None or self.in_place or self.preconditioner is not None or type(self) is not LCP:
+            return None
+        return form, self.bounds.form
+
+    def replica(self) -> LCP:
+        """Return the same problem in memory of its own."""
+        twin = copy.copy(self)
+        for cached in ("lower", "upper", "_counts"):
+            twin.__dict__.pop(cached, None)
+        twin.A, twin.b, twin.bounds = self.A.replica(), wp.clone(self.b), self.bounds.replica()  # type: ignore[attr-defined]  # has a form
+        twin.unknown = twin.A.cells.flatten()
+        return twin
+
+    def take(self, other: LCP) -> None:
+        """Copy the data of a problem of the same form."""
+        self.A.take(other.A)  # type: ignore[attr-defined]
+        self.bounds.take(other.bounds)
+        overwrite(self.b, other.b)
+        for cached in ("lower", "upper"):
+            self.__dict__.pop(cached, None)
+
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
         """Evaluate out = A x + b on flat stored fields of one type.
 
@@ -148,7 +179,7 @@ class LCP(Pickled):
 
     def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
         """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""
-        if self.device.is_cpu and self.layout.size <= LAUNCHED:
+        if self.device.is_cpu and self.layout.size <= CHECKED_BY_NUMPY:
             inside = self.unknown.numpy() == 1
             b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
             faults = (~np.isfinite(b), np.isnan(lower), np.isnan(upper), lower > upper, lower == np.inf, upper == -np.inf)

@@ -230,6 +230,27 @@ class Solver(Protocol):
         """Move x once. `work.residual` is current at x; leave `work.residual.current` False unless it is at the new x."""
 
 
+class Spare(Protocol):
+    """A workspace of an earlier solve that has taken a problem's data.
+
+    Attributes:
+        work: the workspace; its problem is a copy.
+    """
+
+    work: Any
+
+    def give_back(self, result: SolveResult) -> None:
+        """Keep the workspace for later solves, if nothing of the result lies in it."""
+
+
+@runtime_checkable
+class KeepsWorkspace(Protocol):
+    """A method that keeps the workspace of a solve for later ones."""
+
+    def spare(self, problem: Any) -> Spare | None:
+        """Return a workspace for the problem; None: `init` makes one."""
+
+
 def solve(
     problem: LCP | VariationalInequality, solver: Solver, *, stopping: StoppingCriteria | MeanCriteria | None = None,
     x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None,
@@ -255,6 +276,10 @@ def solve(
             raise ValueError(f"{type(solver).__name__} does not work on several ranks: use ProjectedMultigrid or MinimumMapNewton")
     stopping = stopping or StoppingCriteria()
     deadline = Deadline(stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, across)
+    if workspace is None and isinstance(solver, KeepsWorkspace) and (spare := solver.spare(problem)) is not None:
+        result = loop(problem, solver, stopping, deadline, spare.work, callback).run(x0)
+        spare.give_back(result)
+        return result
     work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
     return loop(problem, solver, stopping, deadline, work, callback).run(x0)
 

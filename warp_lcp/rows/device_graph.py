@@ -161,7 +161,7 @@ class DeviceProgram(Program):
             return
         struct, kernel = pass_from_memory(bound.form)
         room = threads(layout) if bound.rows.memory is None else self._hold(bound.rows.memory)
-        memory = bytes(layout.__ctype__()).ljust(LAYOUT_BYTES, b"\0") + bytes(bound.fields.__ctype__())
+        memory = bytes(layout.__ctype__()).ljust(LAYOUT_BYTES, b"\0") + bound.arguments
         self._add(kernel, struct, room, memory, patches, bound)
 
     def _hold(self, memory: Any) -> tuple[int, ...]:

@@ -5,9 +5,11 @@ A user's field has the operator's shape; a *stored* field is a flat array of `si
 
 from __future__ import annotations
 
+import ctypes
 import math
 import mmap
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -35,8 +37,8 @@ def checked_device(device: Any) -> wp.Device:
         raise ValueError(f"device = {device!r}: there is no such device, expected one of {there}") from reason
 
 
-def zeros(n: int, dtype: Any, device: wp.Device, *, small_pages: bool = False) -> wp.array[Any]:
-    """Return a flat field of zeros, whose memory on the CPU is taken when it is first written.
+def zeros(n: int | tuple[int, ...], dtype: Any, device: wp.Device, *, small_pages: bool = False) -> wp.array[Any]:
+    """Return a field of zeros, flat or of a shape, whose memory on the CPU is taken when it is first written.
 
     On the CPU it is NumPy's memory: NumPy asks for huge pages, Warp does not. At 128^3 that makes a workspace in 5 instead of 20 ms, and
     solves 10 % faster, for a pass over many fields misses in the table of small pages. `small_pages` are for fields of which so little is
@@ -44,20 +46,44 @@ def zeros(n: int, dtype: Any, device: wp.Device, *, small_pages: bool = False) -
     """
     if not device.is_cpu:
         return wp.zeros(n, dtype=dtype, device=device)
-    kind = np.dtype(wp.dtype_to_numpy(dtype))
-    if small_pages and n * kind.itemsize > HUGE_PAGE and hasattr(mmap, "MAP_ANONYMOUS"):
-        memory = mmap.mmap(-1, n * kind.itemsize, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    shape = n if isinstance(n, tuple) else (n,)
+    size = math.prod(shape) * _width(dtype)
+    if not size:
+        return nothing(dtype, device) if shape == (0,) else wp.empty(shape, dtype=dtype, device=device)
+    if small_pages and size > HUGE_PAGE and hasattr(mmap, "MAP_ANONYMOUS"):
+        memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         if hasattr(mmap, "MADV_NOHUGEPAGE"):
             memory.madvise(mmap.MADV_NOHUGEPAGE)
-        host: np.ndarray = np.frombuffer(memory, dtype=kind)
+        host: np.ndarray = np.frombuffer(memory, dtype=np.uint8)
     else:
-        host = np.zeros(n, dtype=kind)
-    return wp.array(host, dtype=dtype, device=device, copy=False)
+        host = np.zeros(size, dtype=np.uint8)
+    where = ctypes.addressof(ctypes.c_char.from_buffer(host))
+    return wp.array(ptr=where, dtype=dtype, shape=shape, device=device, deleter=partial(_release, host))
+
+
+def _release(host: np.ndarray, pointer: int, size: int) -> None:
+    """Do nothing: the array of the host goes with the deleter that has it."""
+
+
+@cache
+def _width(dtype: Any) -> int:
+    """Return the bytes of an element."""
+    return int(wp.types.type_size_in_bytes(dtype))
+
+
+def nothing(dtype: Any, device: wp.Device) -> wp.array[Any]:
+    """Return the flat array of a type without elements, which all share."""
+    return _nothing(dtype, device.alias)
+
+
+@cache
+def _nothing(dtype: Any, alias: str) -> wp.array[Any]:
+    return wp.empty(0, dtype=dtype, device=alias)
 
 
 def zeros_like(field: wp.array[Any]) -> wp.array[Any]:
     """Return zeros in the shape of a field, by `zeros`."""
-    return zeros(field.size, field.dtype, field.device).reshape(field.shape)
+    return zeros(tuple(field.shape), field.dtype, field.device)
 
 
 def kept(host: np.ndarray, dtype: Any, device: wp.Device) -> wp.array[Any]:
@@ -83,6 +109,12 @@ def real_array(values: Any, name: str) -> np.ndarray:
     if host.dtype.kind not in "biuf":
         raise ValueError(f"{name} is a {type(values).__name__} of type {host.dtype}: expected real numbers")
     return host
+
+
+def overwrite(to: wp.array[Any], source: wp.array[Any]) -> None:
+    """Copy an array of the CPU to another one of the same type and size, both contiguous: in a tenth of the time of `wp.copy`."""
+    if source.size:
+        ctypes.memmove(to.ptr, source.ptr, source.capacity)
 
 
 def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:

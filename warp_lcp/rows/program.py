@@ -16,7 +16,7 @@ import warp as wp
 
 from warp_lcp.deadline import check_time, is_collective
 from warp_lcp.rows.memory import ARRAY_BYTES, Scalar, value_of
-from warp_lcp.rows.team import ALONE, CELLS, Entry, Operation, Patch, Stage, Table, arguments_of, copied, get_threads, ranges, team
+from warp_lcp.rows.team import ALONE, CELLS, Operation, Patch, Stage, Table, copied, get_threads, prepared, ranges, team
 
 
 class _Recording(threading.local):
@@ -129,6 +129,21 @@ def together(device: wp.Device) -> Iterator[Launch]:
     program.run()
 
 
+@contextmanager
+def as_one_table(device: wp.Device, across: Any = None) -> Iterator[None]:
+    """Record what is launched within by `warp_lcp.rows`; the team works through it as one table afterwards. Nothing is read within.
+
+    On CUDA, and where fields are shared `across` ranks, launches are done at once.
+    """
+    if device.is_cuda or across is not None or is_recording() or team() is None:
+        yield
+        return
+    program = Program(device)
+    with recording(program):
+        yield
+    program.run()
+
+
 def run_table(table: Table) -> None:
     """Have the team work through a table."""
     at_work = team()
@@ -167,27 +182,33 @@ def launch_ranges(
     if device.is_cuda or team() is None or (launch is None and not recorded and tasks * cells < 4 * CELLS):
         (launch or wp.launch)(kernel, dim, [value_of(v) for v in inputs], device=device)
     elif tasks or (recorded and sized):
-        made = wp.launch(kernel, (1,) * len(dim), [value_of(v) for v in inputs], device=device, record_cmd=True)
-        memory = arguments_of(made)
-        patches = [*([first] if first else ()), *_patches(inputs, kernel, memory)] if recorded else ()
-        stage = Stage(Entry(made), memory, (inputs, extent), tasks // dim[0] if dim[0] else 0, dim[0], patches=patches)
+        entry, arguments, native = prepared(kernel, (1,) * len(dim), [value_of(v) for v in inputs])
+        patches = [*([first] if first else ()), *_patches(inputs, kernel, native)] if recorded else ()
+        stage = Stage(entry, arguments, (inputs, extent), tasks // dim[0] if dim[0] else 0, dim[0], patches=patches)
         perform(ranges(stage, cells, ordered=ordered, sized=sized if recorded else 0), launch or wp.launch)
 
 
-def _patches(inputs: Sequence[Any], kernel: Any, memory: Any) -> Iterator[Patch]:
-    """Return what of a kernel's arguments is read from memory: numbers and arrays that others replace."""
+def _patches(inputs: Sequence[Any], kernel: Any, native: Any) -> Iterator[Patch]:
+    """Return what of a kernel's arguments, a struct in C, is read from memory: numbers and arrays that others replace."""
     for i, value in enumerate(inputs):
-        offset = getattr(type(memory), f"p{i}").offset
         if type(value) is Scalar:
-            yield (offset, *value.address(kernel.adj.args[i].type))
+            yield (getattr(native, f"p{i}").offset, *value.address(kernel.adj.args[i].type))
         elif (slot := getattr(value, "slot", None)) is not None:
-            yield offset, slot.address, ARRAY_BYTES
+            yield getattr(native, f"p{i}").offset, slot.address, ARRAY_BYTES
+
+
+def _alone(kernel: Any, dim: Any, inputs: Sequence[Any]) -> Operation:
+    """Return the launch of a kernel on the CPU as an operation that is not cut."""
+    entry, arguments, native = prepared(kernel, dim, [value_of(v) for v in inputs])
+    return Operation(ALONE, [Stage(entry, arguments, inputs, patches=list(_patches(inputs, kernel, native)))])
 
 
 def launch(kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
     """Launch a Warp kernel, now or among recorded launches; numbers may be `Scalar`."""
     program = RECORDING.program
-    if program is None:
+    if program is None and device.is_cpu and team() is not None:
+        run_table(Table([_alone(kernel, dim, inputs)]))
+    elif program is None:
         wp.launch(kernel, dim, [value_of(v) for v in inputs], device=device, block_dim=block_dim)
     else:
         program.launch(kernel, dim, inputs, device=device, block_dim=block_dim)
@@ -279,14 +300,11 @@ class Program:
     def launch(self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
         """Record a launch, and keep its arguments alive; numbers may be `Scalar` on the CPU."""
         self._arguments.append(inputs)
-        listed = [value_of(v) for v in inputs]
-        made = wp.launch(kernel, dim, listed, device=device, block_dim=block_dim, record_cmd=True)
         if self.device.is_cuda or team() is None:
-            self.record(made)
-            return
-        memory = arguments_of(made)
-        patches = list(_patches(inputs, kernel, memory))
-        self.record(Operation(ALONE, [Stage(Entry(made), memory, (made, inputs), patches=patches)]))
+            listed = [value_of(v) for v in inputs]
+            self.record(wp.launch(kernel, dim, listed, device=device, block_dim=block_dim, record_cmd=True))
+        else:
+            self.record(_alone(kernel, dim, inputs))
 
     def record(self, what: Any) -> None:
         """Record a recorded launch, an operation of the team, a task of the host or, where loops run on the device, a conditional."""

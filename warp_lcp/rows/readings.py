@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.rows.fields import zeros
+
 BYTES = 1 << 15  # of a board: as long under way as eight
 LINE = 64  # bytes that no two readings share
 
@@ -31,7 +33,7 @@ class Reading:
         self.array: wp.array[Any]
         self._board, self._change = None, 0
         if not device.is_cuda:
-            self.array = wp.zeros(count, dtype=dtype, device=device)
+            self.array = zeros(count, dtype, device)
             self._view = self.array.numpy()
             return
         size = count * wp.types.type_size_in_bytes(dtype)

@@ -15,18 +15,18 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, joined, make_struct, put, stencil_struct, threads
+from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, make_struct, packed, put, stencil_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
 from warp_lcp.rows.native import HEADERS, sections, shared, text
 from warp_lcp.rows.program import Launch, device_program, is_recording, perform
-from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, memory_of, ranges, team
+from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, ranges, team
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
 INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
-NO_BOUNDS, SIDES = BoundFields(), struct.Struct("dd")
+SIDES = struct.Struct("dd")  # the two numbers that end the struct of bounds
 LARGEST = 4  # passes of a wave
 SLAB_PIECES, SLAB_PLANES = 4, 8  # of waves: their pieces beside each other have work to finish together
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
@@ -211,7 +211,7 @@ class RowPass:
             made = self._forms[key] = _form(self, letters, numbers, shape, kind)
             _make_kernels_of_module(made, letters, shape, kind)
         self._check_memory(rows, given)
-        return Bound(made, rows, made.fill(stencil, bounds, given))
+        return Bound(made, rows, made.fill(stencil, bounds, given), given, (stencil, bounds))
 
     def _with_members(self, structs: tuple[Any, ...], given: dict[str, Any]) -> dict[str, Any]:
         """Return the members of structs that are arguments, and what is given."""
@@ -341,8 +341,8 @@ class Form:
         words: what tells it from other forms.
         joins: whether it is compiled with other passes.
         name: of its kernel.
-        blank: its arguments, none of them given.
         fields: struct of its arguments.
+        native: that struct in C.
         run: native function (layout, fields, slab, row, chunk of the first task, number of tasks).
     """
 
@@ -363,7 +363,9 @@ class Form:
 
         def run(L: RowLayout, given: Fields, slab_: int, row_: int, chunk_: int, count_: int): ...
 
-        self.blank, self._entry = Fields(), None
+        blank = Fields()
+        self._struct, self.native, self._entry = type(blank), type(blank.__ctype__()), None
+        self._size = ctypes.sizeof(self.native)
         area, _, last = d.name.rpartition(".")
         variant = ".".join(["warp_lcp", *([d.module] if self.joins else d.name.split(".")), "_".join(self.words)])
         run.__module__ = area if d.box else variant  # apart from other forms, which Warp would take for overloads
@@ -424,23 +426,26 @@ class Form:
         tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
         return "\n".join(["", *before, *common, *body, *closed, '#line 1 "sums"', *(sums if d.found else []), *tail])
 
-    def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
-        """Return the struct of arguments."""
-        parts = {} if stencil is None else {"stencil": stencil.struct}
+    def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> bytes:
+        """Return the struct of arguments as C has it: structs and arrays, which fill whole eight bytes, side by side, then numbers."""
+        parts = [] if stencil is None else [stencil.struct.__ctype__()]
         if bounds is not None:
             lower, least, upper, most, code = bounds
-            numbers = {"least": least.value, "most": most.value}
-            parts["bounds"] = joined(NO_BOUNDS, {"lower": lower, "upper": upper, "code": code}, SIDES, numbers)
-        for name in self.types:
-            parts[name] = given[name]
-        values = {name: given[name] for name in self.declared.numbers}
-        scalars = {name: v for name, v in values.items() if type(v) is Scalar}
+            parts += [*packed((lower, upper, code)), SIDES.pack(least.value, most.value)]
+        parts += packed([given[name] for name in self.types])
+        values = [value_of(given[name]) for name in self.declared.numbers]
         try:
-            made = joined(self.blank, parts, self._numbers, {n: value_of(v) for n, v in values.items()} if scalars else values)
-            made.__dict__.update(scalars)  # which recorded launches read
-            return made
+            parts.append(self._numbers.pack(*values))
         except struct.error as error:
-            raise TypeError(f"{self.declared.label}: {', '.join(f'{n} = {v!r}' for n, v in values.items())}: {error}") from None
+            named = zip(self.declared.numbers, values, strict=True)
+            raise TypeError(f"{self.declared.label}: {', '.join(f'{n} = {v!r}' for n, v in named)}: {error}") from None
+        return b"".join(parts).ljust(self._size, b"\0")
+
+    def struct_of(self, arguments: bytes, kept: Any) -> Any:
+        """Return the struct of arguments for Warp; `kept` must live as long."""
+        made = object.__new__(self._struct)
+        made.__dict__.update(_kept=kept, _ctype=self.native.from_buffer_copy(arguments))
+        return made
 
     @functools.cached_property
     def kernel(self) -> Any:
@@ -464,10 +469,10 @@ class Form:
         alone.__name__ = alone.__qualname__ = self.name
         return wp.kernel(enable_backward=False, module=run.module.name)(alone)
 
-    def entry(self, layout: Any, fields: Any) -> Entry:
+    def entry(self, bound: "Bound") -> Entry:
         """Return the kernel as the team calls it."""
         if self._entry is None:
-            self._entry = Entry(wp.launch(self.kernel, (1, 1, 1), [layout, fields], device="cpu", record_cmd=True))
+            self._entry = Entry(wp.launch(self.kernel, (1, 1, 1), [bound.layout, bound.fields], device="cpu", record_cmd=True))
         return self._entry
 
 
@@ -483,11 +488,26 @@ def first_task(L: RowLayout) -> wp.vec3i:
 
 
 class Bound(NamedTuple):
-    """A pass with its arguments."""
+    """A pass with its arguments.
+
+    Attributes:
+        form: the pass.
+        rows: which it visits.
+        arguments: struct of its arguments, as bytes.
+        given: arrays and numbers by name.
+        kept: what else has memory in it: the stencil, the operands of bounds.
+    """
 
     form: Form
     rows: Rows
-    fields: Any
+    arguments: bytes
+    given: dict[str, Any]
+    kept: Any
+
+    @property
+    def fields(self) -> Any:
+        """The struct of arguments for Warp, which keeps their memory."""
+        return self.form.struct_of(self.arguments, self)
 
     @property
     def layout(self) -> Any:
@@ -513,14 +533,14 @@ class Bound(NamedTuple):
 
     def patches(self) -> list[Patch]:
         """Return what a recorded launch reads from memory: rows, numbers, and arrays that others replace."""
-        d, native, patches = self.form.declared, type(self.fields.__ctype__()), []
+        d, native, patches = self.form.declared, self.form.native, []
         if self.rows.memory is not None:
             patches += self.rows.memory.patches(LAYOUT_BYTES + native.k0.offset if d.box else None)
         for name in self.form.types:
-            if (slot := getattr(getattr(self.fields, name), "slot", None)) is not None:
+            if (slot := getattr(self.given[name], "slot", None)) is not None:
                 patches.append((LAYOUT_BYTES + getattr(native, name).offset, slot.address, ARRAY_BYTES))
         for name, kind in d.numbers.items():
-            if type(number := self.fields.__dict__[name]) is Scalar:
+            if type(number := self.given[name]) is Scalar:
                 kind = self.form.letters[kind] if isinstance(kind, str) else kind
                 patches.append((LAYOUT_BYTES + getattr(native, name).offset, *number.address(kind)))
         return patches
@@ -528,11 +548,18 @@ class Bound(NamedTuple):
     def stage(self, lag: int = 0, **members: int) -> Stage:
         """Return the pass for the team, as a stage of a wave whose layout has these members."""
         L = put(copy_of(self.layout), members) if members else self.layout
-        values = bytes(L.__ctype__()) + bytes(self.fields.__ctype__())
-        memory = memory_of(ctypes.c_char, len(values)).from_buffer_copy(values)
-        entry = self.form.entry(L, self.fields)
         patches = self.patches() if is_recording() else ()
-        return Stage(entry, memory, self, L.rows * L.chunks, threads(L)[0], lag, max(L.fz, 1), L.n1, patches)
+        return Stage(
+            self.form.entry(self),
+            bytes(L.__ctype__()) + self.arguments,
+            self,
+            L.rows * L.chunks,
+            threads(L)[0],
+            lag,
+            max(L.fz, 1),
+            L.n1,
+            patches,
+        )
 
 
 def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:

@@ -17,7 +17,7 @@ MOST = 5  # forms
 
 @wp.struct
 class Nothing:
-    """Fields of a form that a sequence does not have; of eight bytes, as `joined` asks for."""
+    """Fields of a form that a sequence does not have; of eight bytes, as all structs of arguments are."""
 
     unused: wp.int64
 
@@ -58,7 +58,7 @@ class Sequence:
         for bound in {id(stage): stage for stage in self._stages}.values():
             which = self._forms.index(bound.form)
             places[id(bound)] = which, len(kept[which])
-            kept[which].append(bytes(bound.layout.__ctype__()) + bytes(bound.fields.__ctype__()))
+            kept[which].append(bytes(bound.layout.__ctype__()) + bound.arguments)
         made = self._Tables()
         made.order = wp.array([places[id(stage)] for stage in self._stages], dtype=wp.vec2i, device=self.device)
         for table, struct, pieces in zip(TABLES, self._structs, kept, strict=False):

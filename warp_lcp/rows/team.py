@@ -12,9 +12,11 @@ import copy
 import ctypes
 import functools
 import os
+import struct
 import threading
 import time
 import warnings
+from array import array
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -38,6 +40,8 @@ DONE_ALONE, SHARED, RESUMED = 0, 1, 2
 TABLE, IDLE_SPINS, CALLS, THREADS, TABLE_WORDS, OPERATION_WORDS, LANE_WORDS = 1, 2, 56, 64, 24, 13, 8
 COUNT, TOTAL, OPERATIONS, SHARED_TIME, UNFINISHED, AGAIN = range(16, 22)
 WITHIN, BETWEEN = 1, 2  # where a table is unfinished: within a run, between two
+MOST_ENTRIES = 64  # launch dimensions of a kernel whose entries are kept
+FORMATS = {wp.float32: "f", wp.float64: "d", float: "f", wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}  # of `struct`
 MADE = {"pthread_mutex_init": 24, "pthread_cond_init": 40}  # words of a team that these make
 LOCKS = ("pthread_mutex_lock", "pthread_mutex_unlock", "pthread_cond_wait", "pthread_cond_broadcast")
 SYSTEM = ("sched_yield", "clock_gettime", "nanosleep", *LOCKS)
@@ -66,12 +70,6 @@ class Arguments(ctypes.Structure):
     )  # fmt: skip
 
 
-@functools.cache
-def memory_of(kind: Any, count: int) -> Any:
-    """Return the type of an array of C: one that Python does not keep takes it longer to make than a table to run."""
-    return kind * count
-
-
 class Entry:
     """A kernel on the CPU: what C calls, and the bounds of a launch.
 
@@ -91,7 +89,7 @@ class Stage:
 
     Args:
         entry: the kernel.
-        memory: its arguments; they begin with the range of tasks if it can be cut.
+        arguments: their bytes, which begin with the range of tasks if it can be cut.
         kept: what must live as long.
         plane_tasks: tasks of a plane.
         planes: how many there are.
@@ -102,17 +100,17 @@ class Stage:
     """
 
     def __init__(
-        self, entry: Entry, memory: Any, kept: Any, plane_tasks: int = 1, planes: int = 1, lag: int = 0, finer: int = 1,
+        self, entry: Entry, arguments: bytes, kept: Any, plane_tasks: int = 1, planes: int = 1, lag: int = 0, finer: int = 1,
         finer_planes: int = 0, patches: Sequence[Patch] = (),
     ) -> None:  # fmt: skip
-        listed = _words(len(patches), *(word for patch in patches for word in patch)) if patches else None
+        memory, size = array("B", arguments), len(arguments)
+        listed = array("Q", [len(patches), *(word for patch in patches for word in patch)]) if patches else None
         self.kept, self.tasks, self.planes = (entry, memory, kept, listed), plane_tasks * planes, planes
         self.patches = tuple(patches)
-        size = ctypes.sizeof(memory)
         if size > ROOM:
             raise ValueError(f"a kernel's arguments take {size} bytes: expected at most {ROOM}")
-        where = 0 if listed is None else ctypes.addressof(listed)
-        self.words = entry.call, entry.bounds, ctypes.addressof(memory), size, plane_tasks, planes, lag, finer, finer_planes, where
+        where = 0 if listed is None else listed.buffer_info()[0]
+        self.words = entry.call, entry.bounds, memory.buffer_info()[0], size, plane_tasks, planes, lag, finer, finer_planes, where
 
     def content(self) -> tuple[Any, ...]:
         """Return what it does: the kernel, its arguments but for what is patched, and the patches; of a copy, its words."""
@@ -122,10 +120,6 @@ class Stage:
         for offset, _, size in self.patches:
             memory[offset : offset + size] = bytes(size)
         return self.words[0], bytes(memory), self.patches
-
-
-def _words(*words: int) -> Any:
-    return (ctypes.c_uint64 * len(words))(*words)
 
 
 class Operation:
@@ -150,11 +144,10 @@ class Operation:
     def __init__(
         self, kind: int, stages: list[Stage], chunks: int = 1, each: int = 0, everything: int = 0, margin: int = 0, sized: int = 0
     ) -> None:
-        made = [word for stage in stages for word in stage.words]
-        self._stages, self._kept, self.chunks = memory_of(ctypes.c_uint64, len(made))(*made), stages, chunks
+        self._stages, self._kept, self.chunks = array("Q", [word for stage in stages for word in stage.words]), stages, chunks
         self.check: Callable[[], object] | None = None
         self.condition, self.sized = 0, sized
-        self.words = kind, ctypes.addressof(self._stages), len(stages), each, everything, margin, chunks
+        self.words = kind, self._stages.buffer_info()[0], len(stages), each, everything, margin, chunks
 
     def content(self) -> tuple[Any, ...]:
         """Return what it does, but for what it reads from memory in each run."""
@@ -223,15 +216,15 @@ class Table:
         lanes = [min(get_threads(), operation.chunks) for operation in self._kept]
         sizes = [LANE_WORDS * n + operation.chunks for n, operation in zip(lanes, self._kept, strict=True)]  # what is left, and the cuts
         at = TABLE_WORDS + OPERATION_WORDS * len(self._kept)
-        self.words = memory_of(ctypes.c_uint64, 1 << (at + sum(sizes)).bit_length())()
-        self.address = ctypes.addressof(self.words)
+        self.words = array("Q", bytes(8 * (at + sum(sizes))))
+        self.address = self.words.buffer_info()[0]
         total, made = 0, []
         for operation, count, size in zip(self._kept, lanes, sizes, strict=True):
             total += operation.chunks
             places = self.address + 8 * at, self.address + 8 * (at + LANE_WORDS * count)
             made += [total, *operation.words, count, *places, operation.sized, operation.condition]
             at += size
-        self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = made
+        self.words[TABLE_WORDS : TABLE_WORDS + len(made)] = array("Q", made)  # of the same length, so it stays where it is
         self.words[COUNT], self.words[TOTAL], self.words[OPERATIONS] = len(self._kept), total, self.address + 8 * TABLE_WORDS
         self.again, self.words[AGAIN] = again, 0 if again is None else again.ptr
         self.cut = total > len(self._kept)
@@ -319,7 +312,7 @@ class Team:
     def _retire(self, words: Any) -> None:
         """Keep the words before as long as a thread that came late may read them: what they tell of is done, and may go."""
         seen = {self.words[THREADS + 8 * me] for me in range(1, self.size)}
-        self._retired = [old for old in self._retired if ctypes.addressof(old) in seen]
+        self._retired = [old for old in self._retired if old.buffer_info()[0] in seen]
         if self._posted is not None:
             self._retired.append(self._posted)
         self._posted = words
@@ -347,9 +340,85 @@ def _arguments(*types: Any) -> Any:
     return type("LaunchArguments", (ctypes.Structure,), {"_fields_": [(f"p{i}", kind) for i, kind in enumerate(types)]})
 
 
+class Signature:
+    """Types of a Warp kernel's arguments: packs them as C has them, in a tenth of the time that Warp takes to record a launch.
+
+    Attributes:
+        entries: by launch dimensions: the kernel as C calls it, and the struct of its arguments.
+
+    Args:
+        kernel: with arrays, vectors, structs, and numbers of `FORMATS`; others are left to Warp.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self.entries: dict[Any, tuple[Entry, Any]] = {}
+        self._kinds = [argument.type for argument in kernel.adj.args]
+        formats = [] if kernel.is_generic else [_format(kind) for kind in self._kinds]
+        self._packing = struct.Struct("".join(formats) + "0Q") if formats and all(formats) else None
+        structs = [kind for kind in self._kinds if isinstance(getattr(kind, "ctype", None), type)]
+        self._structs = {kind: type(kind()) for kind in structs} if self._packing else {}
+
+    def pack(self, inputs: Sequence[Any]) -> bytes | None:
+        """Return arguments as C has them; None where Warp should convert or refuse one."""
+        if self._packing is None:
+            return None
+        values = []
+        for kind, value in zip(self._kinds, inputs, strict=False):
+            if kind in FORMATS:
+                plain = type(value) in (int, float, bool)
+            elif type(value) is wp.array:
+                plain = isinstance(kind, wp.array) and value.dtype is kind.dtype and value.ndim == kind.ndim and value.device.is_cpu
+                value = bytes(value.__ctype__())
+            elif kind in self._structs:
+                plain = type(value) is self._structs[kind]
+                value = bytes(value.__ctype__()) if plain else b""
+            else:
+                plain = type(value) is kind
+                value = bytes(value) if plain else b""
+            if not plain:
+                return None
+            values.append(value)
+        try:
+            return self._packing.pack(*values)
+        except (struct.error, OverflowError):
+            return None
+
+
+def _format(kind: Any) -> str:
+    """Return how `struct` packs an argument of a type, aligned as in C; "" for one that it does not."""
+    if kind in FORMATS:
+        return FORMATS[kind]
+    if isinstance(kind, wp.array):
+        return f"0Q{ctypes.sizeof(kind.__ctype__())}s"
+    if isinstance(getattr(kind, "ctype", None), type):  # a struct
+        return f"0Q{ctypes.sizeof(kind.ctype)}s"
+    of = kind._type_ if isinstance(kind, type) and issubclass(kind, ctypes.Array) else None  # a vector's or a matrix's numbers
+    of = getattr(of, "_type_", "")
+    return f"0{of}{ctypes.sizeof(kind)}s" if isinstance(of, str) and of else ""
+
+
+@functools.lru_cache(maxsize=256)
+def signature_of(kernel: Any) -> Signature:
+    """Return the types of a kernel's arguments, and its entries."""
+    return Signature(kernel)
+
+
+def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[Entry, bytes, Any]:
+    """Return a Warp kernel on the CPU as C calls it, its arguments, and the struct of them."""
+    signature = signature_of(kernel)
+    if (known := signature.entries.get(dim)) is not None and (arguments := signature.pack(inputs)) is not None:
+        return known[0], arguments, known[1]
+    launch = wp.launch(kernel, dim, inputs, device="cpu", record_cmd=True)
+    memory = arguments_of(launch)
+    if len(signature.entries) >= MOST_ENTRIES:
+        signature.entries.clear()
+    signature.entries[dim] = made = Entry(launch), type(memory)
+    return made[0], bytes(memory), made[1]
+
+
 def launched_alone(launch: Any, kept: Any = None) -> Operation:
     """Return a recorded launch as an operation that is not cut; `kept` must live as long."""
-    return Operation(ALONE, [Stage(Entry(launch), arguments_of(launch), (launch, kept))])
+    return Operation(ALONE, [Stage(Entry(launch), bytes(arguments_of(launch)), (launch, kept))])
 
 
 @functools.cache

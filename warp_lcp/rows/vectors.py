@@ -15,9 +15,10 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.native import HEADERS, text
-from warp_lcp.rows.program import Launch, Task, copy, is_recording
+from warp_lcp.rows.program import Launch, Task, as_one_table, copy, is_recording
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.team import Operation
@@ -147,8 +148,8 @@ class Reduction:
     ) -> None:  # fmt: skip
         self.scalars, self.columns, self._across = scalars, columns, across
         self.threads = threads or Rows.flat(n, device).places
-        self.partials = wp.zeros(columns * self.threads, dtype=wp.float64, device=device)
-        self._folded = wp.zeros(columns * segments_of(self.threads) if device.is_cuda else 0, dtype=wp.float64, device=device)
+        self.partials = zeros(columns * self.threads, wp.float64, device)
+        self._folded = zeros(columns * segments_of(self.threads) if device.is_cuda else 0, wp.float64, device)
 
     def add_up(self, slot: int, columns: int = 1, *, launch: Launch = wp.launch) -> None:
         """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
@@ -183,7 +184,8 @@ class Sums(Reduction):
 
     def of(self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, **given: Any) -> np.ndarray:
         """Launch a pass, bound as by `RowPass.bind`; return its sums, which are in `scalars` from a slot on."""
-        self._launch(declared, structs, given, slot, wp.launch)
+        with as_one_table(self.rows.device, self._across):
+            self._launch(declared, structs, given, slot, wp.launch)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
 
     def launch(self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, launch: Launch = wp.launch, **given: Any) -> None:

@@ -15,6 +15,7 @@ from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings
 from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
 from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
+from warp_lcp.solvers.spare_workspace import SpareWorkspace, lend
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +67,13 @@ class ProjectedMultigrid(Settings):
         if terms is None:
             raise ValueError("A is not symmetric: ProjectedMultigrid needs a symmetric low-rank part; use MinimumMapNewton")
         return CoupledWorkspace(problem, *terms, self)
+
+    def spare(self, problem: LCP) -> SpareWorkspace | None:
+        """Return the workspace of an earlier solve, with a problem's data; None: `init` makes one.
+
+        From the second solve of a form in succession on one workspace is kept, see `wl.release_workspace`.
+        """
+        return lend(problem, self)
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle or a truncated one.

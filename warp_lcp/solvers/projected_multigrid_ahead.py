@@ -16,6 +16,7 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem.solve import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Rows
+from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Conditional, Launch, LaunchGraph, Program, copy, launch, loops_on_device
 from warp_lcp.rows.readings import Reading
@@ -50,7 +51,7 @@ class RunAhead:
         self._work, self._rebuilds, device = work, rebuilds, work.A.device
         self.rows = deque[np.ndarray]()
         self._found, self._judged = Reading(device, ROWS * int(kernels.ROW)), Reading(device, kernels.JUDGED)
-        self._going, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self._going, self._stale = (zeros(1, wp.int32, device) for _ in range(2))
         self._numbers = [Scalar() for _ in range(5)]  # of the kernel that begins: stale, most, both tolerances, noise
         self._loops: dict[int, Program] = {}  # by the step's program
         self._launches: dict[Any, Any] = {}  # recorded, by their kernel
@@ -116,6 +117,11 @@ class RunAhead:
         for _ in range(2):
             r.take(self.rows.popleft(), size)
         return reference
+
+    def forget_guess(self) -> None:
+        """Keep no guess alive: the launches that begin a solve from one are made again."""
+        self._beginning = None
+        self.rows.clear()
 
     def _judge_first(self, counted: wp.array[Any] | None, launch: Launch) -> None:
         """Record the kernel that decides whether the guess is good enough."""
@@ -187,7 +193,7 @@ class Beginning:
         self._judge, self._graph = judge, LaunchGraph(device, self._launch)  # on CUDA
         self._program = None if device.is_cuda else Program(device)
         if self._program is not None:
-            self._searches, search = wp.zeros(1, dtype=wp.int32, device=device), Program(device)
+            self._searches, search = zeros(1, wp.int32, device), Program(device)
             self._finder.record(work.scratch, search.launch)
             self._record(self._program.launch, Conditional(self._searches, search))
             judge(counted, self._program.launch)

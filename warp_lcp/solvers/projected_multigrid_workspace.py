@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,9 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Bound, Rows
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.fields import nothing
+from warp_lcp.rows.program import Launch, Program, as_one_table
+from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
@@ -58,14 +61,17 @@ class AssessedResidual(NaturalResidual):
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u); a guess is classified, a cold start is not."""
         self.renew()
-        super().start(x, keep=keep)
+        with as_one_table(x.device, self.problem.layout.across):
+            super().start(x, keep=keep)
+            if not keep:
+                self.launch_square_of_b()
         ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
         for bound in (lower, upper, code):
             if ghosts is not None and bound.size:
                 ghosts.fill(bound)  # x's ghost cells will move as the cells do that they stand for
         self.classify = keep
         if not keep:
-            self._norm_of_b = super().norm_of_b()
+            self._norm_of_b = float(np.sqrt(self.square_of_b.numpy()[0]))
             self.set(kernels.SIZE, self._norm_of_b or 1.0)
             self.set(kernels.STEP, 0.0)
 
@@ -87,7 +93,9 @@ class AssessedResidual(NaturalResidual):
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute the norm of the natural residual at x, the free set and the right-hand side."""
-        self.assess(x)
+        plain = type(self).assess is AssessedResidual.assess  # others may launch by Warp alone
+        with as_one_table(x.device, self.problem.layout.across) if plain else nullcontext():
+            self.assess(x)
         return self.read()
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
@@ -169,7 +177,7 @@ class MultigridWorkspace(IterateMemory):
         real, self.A, self.settings, self.bounded = precision.correction, A, settings, problem.bounded
         self._p = problem.layout.zeros(real)
         # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
-        upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
+        upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else nothing(real, A.device)
         options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
         self.hierarchy = make_hierarchy(A.stencil, real, **options)
         super().__init__(problem, precision, residual=self._residual(problem, precision is Precision.SINGLE))
@@ -183,6 +191,13 @@ class MultigridWorkspace(IterateMemory):
         self._algebraic: AlgebraicSteps | None = None
         self._ahead = RunAhead(self) if type(self) is MultigridWorkspace and RunAhead.suits(self) else None
         self._allowed, self._begun = 0, False  # steps without the host; whether the device has begun the solve
+
+    def forget_solve(self) -> None:
+        """Free what only the last solve needed, and the search direction, which no step must see again."""
+        self._algebraic = self.floating = None
+        self._p.zero_()
+        if self._ahead is not None:
+            self._ahead.forget_guess()
 
     def allow(self, steps: int) -> None:
         """Say how many steps of the next solve may be taken without the host."""
@@ -327,16 +342,17 @@ class MultigridWorkspace(IterateMemory):
     def monotone_step(self) -> Step:
         """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
         p, finest, descent = self.problem, self.hierarchy.finest, self.descent
-        self.rebuild()
         self._leave()
-        lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
-        kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(wp.launch)
-        (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
-        self._plan_monotone_step()
         self._cycles_left -= 1
         self._allowed -= 1
-        self._classify_next()
-        self._advance()
+        lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
+        with as_one_table(p.device) if self._ahead is not None else nullcontext():
+            self.rebuild()
+            kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(wp.launch)
+            (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
+            self._plan_monotone_step()
+            self._classify_next()
+            self._advance()
         self.residual.read()
         if self.floating is not None and self._cycles_left == 0:
             self._project()
@@ -347,7 +363,7 @@ class MultigridWorkspace(IterateMemory):
         """Take the projected cycle's correction as it is."""
         finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x)
-        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, False], device=self.problem.device)
+        launch_recorded(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, False], device=self.problem.device)
 
     def truncated_step(self) -> Step:
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
