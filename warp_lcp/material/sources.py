@@ -16,6 +16,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import sources_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import LaunchGraph
 
 NOW = 1e-9  # s: a time that a step has been cut to may be off by its rounding
@@ -306,7 +307,7 @@ def _mixed(word: np.ndarray) -> np.ndarray:
     return word ^ (word >> np.uint64(31))
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.outlets")
+@forward_kernel(module="warp_lcp.material.outlets")
 @typing.no_type_check
 def mark_inside_kernel(distance: wp.array(dtype=wp.float32), marks: wp.array(dtype=wp.int32)):
     """Mark particles at a negative distance."""

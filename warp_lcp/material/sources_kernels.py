@@ -8,12 +8,13 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, cell_below, cell_kernel
 from warp_lcp.grid.staggered import cell_index
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows.compiler import forward_kernel
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 _BYTES = wp.array(dtype=wp.uint8)
 
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "warp_lcp.material.sources"}
+options: dict[str, typing.Any] = {"module": "warp_lcp.material.sources"}
 
 
 @wp.func
@@ -61,7 +62,7 @@ def occupy_kernel(k, j, i, slots: I32, sources: wp.array(dtype=wp.int32), runnin
         kind[k, j, i] = wp.where(fluid != 0, _FLUID, _SOLID)
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def occupants_kernel(
     inverse_dx: float, n: wp.vec3i, origin: wp.vec3i, slots: I32, position: wp.array(dtype=wp.vec3), counts: wp.array(dtype=wp.int32)
 ):
