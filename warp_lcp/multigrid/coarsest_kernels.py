@@ -88,7 +88,8 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         at = element(L, r)
         if S.d[at] != d_type(0):
             matrix[r, r] = S.unit * wp.float64(S.d[at])
-            for axis in range(3):
+            axes = int(3)  # no constant, for which Warp would write the loop out
+            for axis in range(axes):
                 below = beside(L, periodic, r, axis, -1)
                 if below >= 0:
                     if S.d[element(L, below)] != d_type(0):

@@ -16,6 +16,10 @@ HEADER_FLAGS = "-DWP_NO_BFLOAT16= -fpch-instantiate-templates"
 # version may not have, where no kernel would compile: so for versions of Warp that it was tried with.
 INLINE_FIRST = "-mllvm=-enable-module-inliner"
 INLINE_FIRST_VERSIONS = ("1.19",)
+# Warp writes functions to add structs for gradients. Local to the module, they are not compiled.
+LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE
+#define CUDA_CALLABLE __attribute__((internal_linkage))
+"""
 
 
 def forward_kernel(*, module: str, inline_first: bool = True, **options: Any) -> Any:
@@ -54,4 +58,5 @@ def project_module(name: str, inline_first: bool = True) -> Any:
     added = [HEADER_FLAGS, INLINE_FIRST] if inline_first and checked else [HEADER_FLAGS]
     module = wp.get_module(name)
     module.options["cpu_compiler_flags"] = " ".join([flags, *added]).strip()
+    module.options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS)
     return module
