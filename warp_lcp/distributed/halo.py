@@ -15,6 +15,7 @@ from warp_lcp.distributed.decomposition import CellBox, Decomposition, Triple
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import exchange, exchanging
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, Task
 
 
@@ -161,7 +162,7 @@ class Gathering:
         launch(take_kernel, self._shape[:2], given, device=mine.device)
 
 
-@wp.kernel(enable_backward=False)
+@forward_kernel(module="warp_lcp.distributed.halo")
 @no_type_check
 def take_kernel(whole: wp.array3d(dtype=Any), mine: wp.array3d(dtype=Any), k0: int, j0: int, i0: int):
     """Copy a row of a box."""

@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.waiting import waiting
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.team import Operation, launched_alone
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def add_of_all(
     """Call MPI_Allgather, and add up in the order of the ranks."""
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.messages")
+@forward_kernel(module="warp_lcp.messages")
 def exchange_kernel(
     begin: wp.uint64, end: wp.uint64, forest: wp.uint64, pairs: wp.uint64, replace: wp.uint64, count: int, told: wp.uint64
 ):  # fmt: skip
@@ -66,7 +67,7 @@ def exchange_kernel(
     copy_to_leaves(begin, end, forest, pairs, replace, count, told)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.messages")
+@forward_kernel(module="warp_lcp.messages")
 def add_kernel(
     gather: wp.uint64, unit: wp.uint64, comm: wp.uint64, sums: wp.uint64, of_all: wp.uint64, count: int, ranks: int, told: wp.uint64
 ):

@@ -32,6 +32,7 @@ from warp_lcp.grid.particle_loops import MARGIN, launch
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import KernelFile, RowPass
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.memory import Scalar, scaled
 
 MAX_CLEARANCE = 6  # cells; a particle that moves further in a step takes the careful way, which is always right
@@ -79,7 +80,7 @@ def carry_pass(axis: int) -> RowPass:
     return KERNELS.kernel("warp_lcp.grid.semi_lagrangian.carry", module=module, constants={"AXIS": axis})
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.clearance")
+@forward_kernel(module="warp_lcp.grid.clearance")
 @typing.no_type_check
 def clearance_kernel(cells: wp.array3d(dtype=wp.int8), planes: int, distance: int, room: wp.array3d(dtype=wp.int8)):
     """Pass `distance` = 0 marks SOLID cells 0 and others MAX_CLEARANCE; pass d marks those around cells of d - 1 with d.

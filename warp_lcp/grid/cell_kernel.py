@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
+from warp_lcp.rows.compiler import project_module
 from warp_lcp.rows.program import Launch, call, is_recording, launch, launch_ranges
 
 F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))  # fields
@@ -156,4 +157,4 @@ def _made(function: Callable, module: str, first: tuple[str, Any], loop: str, be
     function.__signature__ = inspect.Signature([inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD), *typed])
     function.__annotations__ = {name: kind} | {p.name: p.annotation for p in typed}
     key = function.__qualname__.replace("<locals>.", "").replace(".", "__")
-    return wp.Kernel(function, key, wp.get_module(module), {"enable_backward": False}, source=ast.unparse(tree))
+    return wp.Kernel(function, key, project_module(module), {"enable_backward": False}, source=ast.unparse(tree))

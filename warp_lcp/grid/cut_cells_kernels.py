@@ -11,6 +11,7 @@ from warp_lcp.grid.node_distance_kernels import HOLLOW, Nearest
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.native import text
 from warp_lcp.rows.program import launch
 
@@ -163,7 +164,7 @@ def velocity_kernel(
         w[k, j, i] = face_velocity(S, 2, planes, spacing, origin, k, j, i, az, wz, turn, shift)
 
 
-options = {"enable_backward": False, "module": "warp_lcp.grid.capacity"}
+options = {"module": "warp_lcp.grid.capacity"}
 COLORS = 3  # along an axis: as many cells as a kernel reaches over
 
 OPEN_CELLS = KERNELS["warp_lcp.grid.capacity.open_cells"]
@@ -173,7 +174,7 @@ OPEN_CELLS = KERNELS["warp_lcp.grid.capacity.open_cells"]
 def cut_cell(near_: F32, out_: F32, planes: int, k: int, j: int, i: int): ...
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
     """Integrate over every third cut cell along each axis, from cell (color[2], color[1], color[0]) of the box on.
 
@@ -188,7 +189,7 @@ def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state:
             cut_cell(near, capacity, planes, k, j, i)
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def cut_in_order_kernel(low: wp.vec3i, high: wp.vec3i, origin: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
     """Integrate over the cut cells of a box, color after color; one thread."""
     colors = COLORS * COLORS

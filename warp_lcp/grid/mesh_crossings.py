@@ -13,6 +13,8 @@ import warp as wp
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from warp_lcp.rows.compiler import forward_kernel
+
 MODULE = "warp_lcp.grid.mesh_crossings"
 NEAR = wp.constant(1.0e-9)  # half diagonals of the mesh: closer than rounding of float64 coordinates tells
 SHORT = wp.constant(1.0e-5)  # a common segment that is shorter counts as a point: vertices are equal within 1e-6
@@ -95,7 +97,7 @@ def height(x: wp.vec3d, origin: wp.vec3d, normal: wp.vec3d, shared: bool) -> wp.
     return wp.where(shared or wp.abs(h) < wp.float64(NEAR), wp.float64(0.0), h)
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
+@forward_kernel(module=MODULE, inline_first=False)
 @typing.no_type_check
 def find_crossings(mesh: wp.uint64, points: Points, corners: Corners, crosses: wp.array(dtype=wp.uint8)):
     """Mark the triangles that cross another one."""
@@ -151,7 +153,7 @@ def find_crossings(mesh: wp.uint64, points: Points, corners: Corners, crosses: w
             crosses[t] = wp.uint8(1)
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
+@forward_kernel(module=MODULE, inline_first=False)
 @typing.no_type_check
 def look_beside(
     mesh: wp.uint64, points: Points, corners: Corners, which: wp.array(dtype=wp.int32), at: Points, kind: wp.array(dtype=wp.uint8)

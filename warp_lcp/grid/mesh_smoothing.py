@@ -13,19 +13,20 @@ from warp_lcp.grid.marching_cubes import DeviceMesh
 from warp_lcp.grid.particle_loops import chunks
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 
 TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
 ON_SIDE, ON_SOLID = 1, 2  # bits of a mark
 NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can tell
 
 _SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
-_options = {"enable_backward": False, "module": "warp_lcp.grid.mesh_smoothing"}
+_options = {"module": "warp_lcp.grid.mesh_smoothing"}
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/surface_mesh.h")
 SEE_NEIGHBORS = KERNELS["warp_lcp.grid.mesh_smoothing.see_neighbors"]
 
 
-@wp.kernel(**_options)
+@forward_kernel(**_options)
 @typing.no_type_check
 def hold_kernel(planes: int, dx: float, origin: wp.vec3, points: POINTS, room: F32, counts: wp.vec3, held: _BYTES):
     """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids, with ON_SIDE + ON_SOLID."""
@@ -41,7 +42,7 @@ def hold_kernel(planes: int, dx: float, origin: wp.vec3, points: POINTS, room: F
     held[p] = wp.uint8(mark)
 
 
-@wp.kernel(**_options)
+@forward_kernel(**_options)
 @typing.no_type_check
 def move_kernel(share: float, most: float, sums: _SUMS, held: _BYTES, size: wp.vec3, start: POINTS, points: POINTS):
     """Move a point a share of the way to the mean of its neighbors, within the domain and not too far from where it started."""

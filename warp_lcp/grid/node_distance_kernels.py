@@ -16,6 +16,7 @@ from warp_lcp.grid.solids_kernels import (
     to_plane,
     to_sphere,
 )
+from warp_lcp.rows.compiler import forward_kernel
 
 FAR = 4.0  # cells: distances below it are exact, others at least this large
 COARSE = 3  # nodes along an axis of a block in which one distance may stand for all
@@ -25,7 +26,7 @@ HOLLOW = 1  # a mark of cells with distance 0 at all corners whose center is ope
 BOX, SPHERE, CAPSULE, PLANE = range(4)  # kinds of a PlacedShape
 
 Listed = wp.array(dtype=wp.vec4i)
-options = {"enable_backward": False, "module": "warp_lcp.grid.node_distance"}
+options = {"module": "warp_lcp.grid.node_distance"}
 
 
 @wp.struct
@@ -99,7 +100,7 @@ def snapped(meters: float, spacing: float, snap: float):
     return d
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def claim_nodes(block: Block, distance: Distances, snap: float, solid: int, nodes: Nearest):
     """Enter the distances [m] of a solid at a block of nodes."""
     c = wp.tid()
@@ -123,7 +124,7 @@ def enter_solids(
                 enter(node, snapped(d, block.spacing, snap), solid.number, nodes)
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def claim_groups(
     block: Block, distance: Distances, solid: int, nodes: Nearest, unsure: Listed, sure: Listed, listed: wp.array(dtype=wp.int32)
 ):
@@ -153,14 +154,14 @@ def claim_groups(
                     unsure[wp.atomic_add(listed, 0, 1)] = wp.vec4i(i, j, k, 0)
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def listed_points(block: Block, list: Listed, out: Points):
     """Fill the places [m] of listed nodes, or with the block's offset of the centers of listed cells."""
     c = wp.tid()
     out[c] = node_position(block, wp.vec3i(list[c][0], list[c][1], list[c][2]), block.offset)
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def claim_listed(block: Block, list: Listed, distance: Distances, snap: float, solid: int, nodes: Nearest):
     """Enter the distances [m] of a solid at listed nodes; where the list has a sign, it is that of the distance."""
     c = wp.tid()
@@ -185,7 +186,7 @@ def find_flat_cells(k, j, i, planes: int, near: F32, list: Listed, count: wp.arr
                 list[slot] = wp.vec4i(i, j, k, 0)
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def mark_listed(list: Listed, distance: Distances, begin: bool, marks: I8):
     """Mark the listed cells HOLLOW that no solid so far covers at their center."""
     c = wp.tid()

@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import list_kernel
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/particles.h")
 NUMBER = KERNELS["warp_lcp.grid.particles.number"]
@@ -21,7 +22,7 @@ SORT_BEGIN = KERNELS.kernel("warp_lcp.grid.particles.sort_begin", constants=_SOR
 SORT_PLACE = KERNELS.kernel("warp_lcp.grid.particles.sort_place", constants=_SORT)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+@forward_kernel(module="warp_lcp.grid.particles")
 def count_up_kernel(order: wp.array(dtype=wp.int32), key: wp.array(dtype=wp.int32), count: int, last: int):
     """Write 0, 1, 2, ..., and a key beyond all others behind those of the particles."""
     p = wp.tid()
@@ -30,7 +31,7 @@ def count_up_kernel(order: wp.array(dtype=wp.int32), key: wp.array(dtype=wp.int3
         key[p] = last
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+@forward_kernel(module="warp_lcp.grid.particles")
 def offset_kernel(key: wp.array(dtype=wp.int32), count: int, offsets: wp.array(dtype=wp.int32)):
     """Find the first particle of each cell, or of the next one that has any, among sorted keys."""
     cell = wp.tid()
@@ -52,7 +53,7 @@ def put_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec
     target[order[i]] = source[i]
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+@forward_kernel(module="warp_lcp.grid.particles")
 def stays_kernel(marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32), removed: wp.array(dtype=wp.int32)):
     """Write 1 for a particle without a mark, 0 for others; count those with the mark 1, and those with another."""
     p = wp.tid()
@@ -62,7 +63,7 @@ def stays_kernel(marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32
         wp.atomic_add(removed, wp.where(mark == 1, 0, 1), 1)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+@forward_kernel(module="warp_lcp.grid.particles")
 def close_ranks_kernel(
     marks: wp.array(dtype=wp.int32), stay: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)
 ):

@@ -15,6 +15,7 @@ from warp_lcp.grid.cell_kernel import F32, cell_kernel, launch_list, list_kernel
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, launch
 
 SIDES = ("left", "right", "bottom", "top", "back", "front")  # at low x, high x, low y, high y, low z, high z; bit n is side n
@@ -211,7 +212,7 @@ class PeriodicSides:
 def wrap_kernel(dtype: typing.Any) -> wp.Kernel:
     """Return the kernel that fills the ring of fields of a type."""
 
-    @wp.kernel(enable_backward=False, module=f"warp_lcp.grid.periodic_{dtype.__name__}")
+    @forward_kernel(module=f"warp_lcp.grid.periodic_{dtype.__name__}")
     @typing.no_type_check
     def wrap(count: int, lines: wp.array4d(dtype=dtype)):
         layer, a, b = wp.tid()
@@ -221,7 +222,7 @@ def wrap_kernel(dtype: typing.Any) -> wp.Kernel:
     return wrap
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
+@forward_kernel(module="warp_lcp.grid.periodic")
 @typing.no_type_check
 def add_kernel(count: int, lines: F32):
     """Add the two ends of a line to the cells that they repeat."""
@@ -231,7 +232,7 @@ def add_kernel(count: int, lines: F32):
     lines[a, b, count] = lines[a, b, count] + low
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
+@forward_kernel(module="warp_lcp.grid.periodic")
 @typing.no_type_check
 def average_kernel(count: int, weight: F32, field: F32, saved: F32):
     """Bring the two ends of a line into the faces that they repeat, as means with their weights."""
@@ -250,7 +251,7 @@ def average_kernel(count: int, weight: F32, field: F32, saved: F32):
         weight[a, b, ring] = 0.0
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
+@forward_kernel(module="warp_lcp.grid.periodic")
 @typing.no_type_check
 def carry_kernel(endless: wp.vec3i, axes: int, size: wp.vec3, spacing: float, position: wp.array(dtype=wp.vec3)):
     """Positions modulo the domain's size, off the very end of it; who has crossed keeps off the walls, which stopped nobody beyond."""

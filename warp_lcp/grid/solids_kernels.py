@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import list_kernel
+from warp_lcp.rows.compiler import forward_kernel
 
 MODULE = "warp_lcp.solids"
 Points, Distances = wp.array(dtype=wp.vec3), wp.array(dtype=wp.float32)
@@ -112,7 +113,7 @@ def mesh_surface_distance(i, points: Points, frame: ShapeFrame, mesh: wp.uint64,
     out[i] = frame.scale * distance
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
+@forward_kernel(module=MODULE)
 def mesh_thickness(mesh: wp.uint64, reach: float, out: wp.array(dtype=wp.float32)):
     """Measure from each triangle's center straight inward to the other side; `reach` when it is farther or another part begins."""
     face = wp.tid()
@@ -161,14 +162,14 @@ def node_position(block: Block, node: wp.vec3i, offset: float):
     return wp.vec3(x, (float(block.origin[1] + node[1] - 1) + offset) * block.spacing, z)
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
+@forward_kernel(module=MODULE)
 def item_points(block: Block, out: Points):
     """Fill the places [m] of the items of a block: nodes, the middles of groups of nodes, or the centers of cells."""
     c = wp.tid()
     out[c] = node_position(block, first_node(block, c), block.offset)
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
+@forward_kernel(module=MODULE)
 def claim_cells(block: Block, distance: Distances, solid: int, index: wp.array3d(dtype=wp.int32), covered: wp.array(dtype=wp.int32)):
     """Give the open cells of a block whose center lies inside to `solid`, and count those that lie inside, claimed or not."""
     c = wp.tid()

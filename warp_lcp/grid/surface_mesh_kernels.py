@@ -8,6 +8,7 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 
 FAR = 2.0  # lattice cells: a distance to solids that takes nothing from the liquid
 LEAST_OPEN = 0.25  # of a kernel: where less of it is open the distance is continued from outside the solid
@@ -16,7 +17,7 @@ LEAST_OPEN = 0.25  # of a kernel: where less of it is open the distance is conti
 THIN, POWER = 0.6, 0.4
 
 
-_options = {"enable_backward": False, "module": "warp_lcp.grid.surface_mesh"}
+_options = {"module": "warp_lcp.grid.surface_mesh"}
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/surface_mesh.h", {"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "POWER": POWER})
@@ -26,7 +27,7 @@ CARVE = KERNELS["warp_lcp.grid.surface_mesh.carve"]
 BOOST = KERNELS["warp_lcp.grid.surface_mesh.boost"]
 
 
-@wp.kernel(**_options)
+@forward_kernel(**_options)
 def mirror_kernel(fold: bool, lines: F32):
     """Give the ring at both ends of a line the values beside it, after adding to those what the ring holds; a thread a line."""
     a, b = wp.tid()
@@ -80,7 +81,7 @@ def open_share_kernel(k, j, i, room: F32, out: F32):
     out[k, j, i] = wp.clamp(room[k, j, i] + 0.5, 0.0, 1.0)
 
 
-@wp.kernel(**_options)
+@forward_kernel(**_options)
 def clamp_kernel(points: wp.array(dtype=wp.vec3), size: wp.vec3, out: wp.array(dtype=wp.vec3)):
     """Bring points that are beyond the far sides back to them."""
     p = wp.tid()

@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import Across, Reduction, rows_of
@@ -48,7 +49,7 @@ def next_iteration(scalars: wp.array(dtype=wp.float64), rr: int):
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")
+@forward_kernel(module="warp_lcp.conjugate_gradient")
 def begin_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int), tolerance: wp.float64, limit: int, by_error: int):
     """Before the first iteration: no old direction."""
     scalars[BY_ERROR] = wp.float64(by_error)
@@ -57,7 +58,7 @@ def begin_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")
+@forward_kernel(module="warp_lcp.conjugate_gradient")
 def end_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)):
     """After an iteration: remember r.z for beta, and decide whether to go on; by r.z of the iteration's start if that was asked for."""
     if scalars[BY_ERROR] > wp.float64(0.0):

@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, I32, U8, cell_below, cell_kernel
 from warp_lcp.operators.grid_poisson import AIR, SOLID
+from warp_lcp.rows.compiler import forward_kernel
 
 TOUCHES_NOTHING = 0  # no solid face
 HELD = 1  # a wall cell whose material stays on its walls
@@ -20,7 +21,7 @@ _AIR = wp.constant(wp.int8(AIR))
 _SOLID = wp.constant(wp.int8(SOLID))
 
 
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "warp_lcp.material.boundary"}
+options: dict[str, typing.Any] = {"module": "warp_lcp.material.boundary"}
 
 
 @cell_kernel("warp_lcp.material.boundary")
@@ -86,7 +87,7 @@ def wall_velocity_kernel(
     field[k, j, i] = u
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def larger_kernel(a: wp.array(dtype=wp.float32), b: wp.array(dtype=wp.float32)):
     """Set b to the larger of a and b."""
     i = wp.tid()

@@ -13,6 +13,7 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
@@ -22,7 +23,7 @@ _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 _SOLID = wp.constant(wp.int8(SOLID))
 
 
-options = {"enable_backward": False, "module": "warp_lcp.material.flight"}
+options = {"module": "warp_lcp.material.flight"}
 Integers, Bytes = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
 Kinds = I8
 Motions = wp.array2d(dtype=wp.vec3)
@@ -92,7 +93,7 @@ def add_up(flight: Flight, n: int, x: wp.vec3):
     put(flight.sums, b, 16, q, wp.dot(v, v))
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def board_kernel(key: Integers, parent: Integers, number: Integers, who: Integers, body: Integers, count: Integers):
     """List the particles of bodies; count[1] becomes their number. All others take no more than this look."""
     p = wp.tid()
@@ -103,7 +104,7 @@ def board_kernel(key: Integers, parent: Integers, number: Integers, who: Integer
         body[n] = b
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def lift_kernel(flight: Flight, position: Vectors, start: Vectors):
     """Note where particles are, and add them up."""
     n = wp.tid()
@@ -183,7 +184,7 @@ def fly_kernel(
     near[i] = met
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def arrive_kernel(flight: Flight, x: Vectors, near: Bytes):
     """Add up the particles where they have come to [cells], and those that came near a wall or an open side."""
     n = wp.tid()

@@ -9,6 +9,7 @@ from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, INTS, POINTS, U8, cell_
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces
@@ -123,7 +124,7 @@ def quota_kernel(
     quota[k, j, i] = count
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
+@forward_kernel(module="warp_lcp.material.narrow_band")
 def leave_kernel(width: float, key: INTS, depth: wp.array(dtype=wp.float32), before: wp.array(dtype=wp.float32), marks: INTS):
     """Mark the particles of cells deeper than the band, and of those that get fresh ones."""
     p = wp.tid()

@@ -6,6 +6,7 @@ import warp as wp
 from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kernel
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
+from warp_lcp.rows.compiler import forward_kernel
 
 JITTER = 0.25  # of half a cell: how far from the center of its part of a cell a particle is put at random, as at the start
 FULL = 0.75  # of what the cells around one can hold: less, and it is near a surface (a level one: 2/3), or in a bubble of more than a cell
@@ -78,7 +79,7 @@ def emptiest(planes: int, cell: wp.vec3i, start: int, here: int, inverse_dx: flo
     return part
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
+@forward_kernel(module="warp_lcp.material.reseeding")
 def exchange_kernel(way: wp.vec3i, s: ReseedingSetting, takers: INTS, offsets: INTS, count: I32, position: POINTS, numbers: INTS):
     """Let each cell that wants particles take some from the neighbor in one direction.
 

@@ -12,6 +12,7 @@ from scipy import ndimage
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.rows.compiler import forward_kernel
 
 EVERY = 8  # steps between looks for particles that have left the others
 TILE = 8  # cells: clusters of particles are told apart by empty tiles between them
@@ -21,7 +22,7 @@ MOST_TILES = 1 << 22  # else they are larger
 CLEAR = 3  # cells from a solid or a wall, and its way in a step: nearer than that it is on the grid
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.spray")
+@forward_kernel(module="warp_lcp.material.spray")
 @no_type_check
 def fly_kernel(change: wp.vec3, dt: float, position: wp.array(dtype=wp.vec3), velocity: wp.array(dtype=wp.vec3)):
     """Change velocities, then move for a time step."""

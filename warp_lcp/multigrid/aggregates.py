@@ -14,13 +14,14 @@ from pyamg.classical.split import RS
 from pyamg.strength import classical_strength_of_connection, symmetric_strength_of_connection
 
 from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, Program
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.aggregates")
+@forward_kernel(module="warp_lcp.aggregates")
 def restrict_kernel(
     first: i32, members: i32, y: f64, x: f64, lower: f64, upper: f64, factor: wp.float64, b: f64, low: f64, high: f64, e: f64
 ):
@@ -39,7 +40,7 @@ def restrict_kernel(
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.aggregates")
+@forward_kernel(module="warp_lcp.aggregates")
 def correct_kernel(owner: i32, e: f64, factor: wp.float64, lower: f64, upper: f64, x: f64):
     """Add `factor` times its aggregate's correction to each unknown, projected; unknowns of none stay."""
     i = wp.tid()
@@ -49,7 +50,7 @@ def correct_kernel(owner: i32, e: f64, factor: wp.float64, lower: f64, upper: f6
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.aggregates")
+@forward_kernel(module="warp_lcp.aggregates")
 def settle_kernel(
     indptr: i32, indices: i32, values: f64, diagonal: f64, b: f64, lower: f64, upper: f64, sweeps: int, enough: wp.float64, x: f64
 ):

@@ -5,10 +5,12 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.rows.compiler import forward_kernel
+
 INDICES, MATRIX = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.float64)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.algebraic")
+@forward_kernel(module="warp_lcp.algebraic")
 def places_kernel(
     ptr: INDICES, col: INDICES, right_ptr: INDICES, right_col: INDICES, out_ptr: INDICES, out_col: INDICES, at: INDICES,
     place: wp.array(dtype=wp.uint16), n: int,
@@ -24,7 +26,7 @@ def places_kernel(
                 c += wp.int64(1)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.algebraic")
+@forward_kernel(module="warp_lcp.algebraic")
 def densify_kernel(ptr: INDICES, col: INDICES, a: wp.array(dtype=Any), out: MATRIX):
     """A row a thread as a dense one."""
     i = wp.tid()
@@ -34,7 +36,7 @@ def densify_kernel(ptr: INDICES, col: INDICES, a: wp.array(dtype=Any), out: MATR
         out[i, col[k]] = wp.float64(a[k])
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.algebraic")
+@forward_kernel(module="warp_lcp.algebraic")
 def factor_kernel(matrix: MATRIX, rounding: wp.float64):
     """L U in place without pivoting, by one thread.
 
@@ -64,7 +66,7 @@ def factor_kernel(matrix: MATRIX, rounding: wp.float64):
                 matrix[c, r] = wp.float64(0.0)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.algebraic")
+@forward_kernel(module="warp_lcp.algebraic")
 def invert_kernel(factors: MATRIX, inverse: MATRIX):
     """Column c of the inverse from the factors, a column a thread; rows and columns of unknowns that were taken out are 0."""
     c = wp.tid()
@@ -87,7 +89,7 @@ def invert_kernel(factors: MATRIX, inverse: MATRIX):
             inverse[r, c] = v / factors[r, r]
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.algebraic")
+@forward_kernel(module="warp_lcp.algebraic")
 def solve_kernel(inverse: MATRIX, b: wp.array(dtype=Any), x: wp.array(dtype=Any)):
     """x = the inverse times b."""
     i = wp.tid()

@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import RowLayout, stencil_struct
 from warp_lcp.rows.sequence import CUDA_THREADS, meet
 
@@ -87,7 +88,8 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         at = element(L, r)
         if S.d[at] != d_type(0):
             matrix[r, r] = S.unit * wp.float64(S.d[at])
-            for axis in range(3):
+            axes = int(3)  # no constant, for which Warp would write the loop out
+            for axis in range(axes):
                 below = beside(L, periodic, r, axis, -1)
                 if below >= 0:
                     if S.d[element(L, below)] != d_type(0):
@@ -98,7 +100,7 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
                     if S.d[o] != d_type(0):
                         matrix[r, above] -= weight(S, axis, o)
 
-    @wp.kernel(enable_backward=False, module=f"warp_lcp.coarsest.factor_{name}")
+    @forward_kernel(module=f"warp_lcp.coarsest.factor_{name}")
     def factor(
         S: Stencil, L: RowLayout, periodic: wp.vec3i, rounding: wp.float64, changed: wp.array2d(dtype=wp.uint8), matrix: square
     ):  # fmt: skip
@@ -149,7 +151,7 @@ def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
             new[i, j] = v
         meet()
 
-    @wp.kernel(enable_backward=False, module=f"warp_lcp.coarsest.invert_{name}", launch_bounds=CUDA_THREADS)
+    @forward_kernel(module=f"warp_lcp.coarsest.invert_{name}", launch_bounds=CUDA_THREADS)
     def invert(S: Stencil, L: RowLayout, periodic: wp.vec3i, rounding: wp.float64, threads: int, other: square, inverse: square):
         """Assemble and invert; every thread of the block passes every barrier."""
         t = wp.tid()

@@ -176,9 +176,10 @@ class Level:
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.
         """
         lower, upper = self._sides(projected)
+        start = {"from_zero": from_zero} if "from_zero" in kind.numbers else {}
         make = lambda: kind.bind(  # noqa: E731
             rows or self.stencil.rows, stencil=self.stencil, x=x, y=y, b=self.b, lower=lower, upper=upper, omega=omega,
-            projected=projected, from_zero=from_zero,
+            projected=projected, **start,
         )  # fmt: skip
         return self._once((kind, id(rows), y is self.x, omega, projected, from_zero), make)
 

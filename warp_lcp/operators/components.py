@@ -14,15 +14,16 @@ import warp as wp
 
 from warp_lcp.problem.protocol import FLUID
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, clear, together
 from warp_lcp.rows.readings import Reading
 
-options: dict[str, Any] = {"enable_backward": False, "module": "warp_lcp.components"}
+options: dict[str, Any] = {"module": "warp_lcp.components"}
 F64, I32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
 
 @no_type_check
-@wp.kernel(**options)
+@forward_kernel(**options)
 def component_sums_kernel(label: I32, free: wp.array(dtype=wp.uint8), r: wp.array(dtype=Any), sums: F64, held: I32):
     """Sum r over each component, and note which have an unknown that is not free."""
     i = wp.tid()
@@ -35,7 +36,7 @@ def component_sums_kernel(label: I32, free: wp.array(dtype=wp.uint8), r: wp.arra
 
 
 @no_type_check
-@wp.kernel(**options)
+@forward_kernel(**options)
 def remove_means_kernel(label: I32, sums: F64, held: I32, sizes: F64, r: wp.array(dtype=Any)):
     """Take the mean off every component that is free as a whole."""
     i = wp.tid()
@@ -46,7 +47,7 @@ def remove_means_kernel(label: I32, sums: F64, held: I32, sizes: F64, r: wp.arra
 
 
 @no_type_check
-@wp.kernel(**options)
+@forward_kernel(**options)
 def smallest_gap_kernel(label: I32, x: F64, lower: F64, upper: F64, below: F64, above: F64):
     """Smallest distance to the lower and to the upper bounds over each component."""
     i = wp.tid()
@@ -57,7 +58,7 @@ def smallest_gap_kernel(label: I32, x: F64, lower: F64, upper: F64, below: F64, 
 
 
 @no_type_check
-@wp.kernel(**options)
+@forward_kernel(**options)
 def shift_components_kernel(label: I32, held: I32, constant: F64, lower: F64, upper: F64, x: F64):
     """Add each component's constant, where the component is free as a whole; the sum's rounding stays within the bounds."""
     i = wp.tid()

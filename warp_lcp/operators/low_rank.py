@@ -13,6 +13,7 @@ from warp_lcp.operators.dense import is_rounding
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.protocol import layout_of
 from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
 from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import Launch
@@ -20,7 +21,7 @@ from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Across, Reduction, add_across
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.low_rank")
+@forward_kernel(module="warp_lcp.low_rank")
 def weigh_kernel(weights: wp.array2d(dtype=wp.float64), c: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
     """out = W c, c's first entries."""
     i = wp.tid()

@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows import Bound, KernelFile, Rows
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.layout import Pattern, check_memory, put, stencil_struct
 from warp_lcp.rows.program import Launch, Task
@@ -41,7 +42,7 @@ def whole_span(first: int, last: int, n: int):
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.stencil")
+@forward_kernel(module="warp_lcp.stencil")
 def coarsen_spans_kernel(fine: wp.array2d(dtype=wp.vec2i), factors: wp.vec3i, n: int, spans: wp.array2d(dtype=wp.vec2i)):
     """A coarse row's span covers those of its rows; factors = cells an aggregate along z, y, x."""
     k, j = wp.tid()

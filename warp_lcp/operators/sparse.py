@@ -18,6 +18,7 @@ from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, kept, real_array, relative_rounding, zeros, zeros_like
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import Sums
@@ -26,7 +27,7 @@ INDICES = wp.array(dtype=wp.int32)
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.sparse.color")
+@forward_kernel(module="warp_lcp.sparse.color")
 def color_kernel(ptr: INDICES, col: INDICES, taken: INDICES, color: INDICES, n: int):
     """Greedy coloring in row order by one thread: the least color that no neighbor has. `taken[c]` is the last row that saw c, plus one."""
     for i in range(n):

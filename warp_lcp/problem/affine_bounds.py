@@ -9,6 +9,7 @@ from typing import Any, no_type_check
 import numpy as np
 import warp as wp
 
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import Layout, real_array
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
@@ -35,7 +36,7 @@ def bound_at(S: AffineSide, x: f64, i: int):
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.affine_bounds")
+@forward_kernel(module="warp_lcp.affine_bounds")
 def evaluate_kernel(S: AffineSide, x: f64, out: f64):
     """Write the bounds at x, an unknown a thread."""
     i = wp.tid()

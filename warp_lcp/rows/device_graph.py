@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import RowLayout, make_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
 from warp_lcp.rows.program import Conditional, DeviceCopy, Program, Task
@@ -40,7 +41,7 @@ class NotRecordable(Exception):
     """What a graph of CUDA cannot hold: a task of the host, a copy of a replaced array."""
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.device_graph")
+@forward_kernel(module="warp_lcp.device_graph")
 def patch_kernel(cells: wp.array(dtype=wp.uint8), source: wp.array(dtype=int), place: wp.array(dtype=int), image: wp.array(dtype=wp.uint8)):
     """Write a byte that changes from run to run to its place in the arguments."""
     t = wp.tid()
@@ -65,7 +66,7 @@ def pass_from_memory(form: Any) -> Any:
     name = form.declared.name.rpartition(".")[2]
     from_memory.__name__ = from_memory.__qualname__ = name
     words = "_".join([form.declared.name, *form.words])
-    return Piece, wp.kernel(enable_backward=False, module=f"{run.module.name}.memory.{words}")(from_memory)
+    return Piece, forward_kernel(module=f"{run.module.name}.memory.{words}")(from_memory)
 
 
 _KERNELS: dict[Any, Any] = {}

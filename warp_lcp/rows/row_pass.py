@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, make_struct, packed, put, stencil_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
 from warp_lcp.rows.native import HEADERS, sections, shared, text
@@ -467,7 +468,9 @@ class Form:
                 run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
 
         alone.__name__ = alone.__qualname__ = self.name
-        return wp.kernel(enable_backward=False, module=run.module.name)(alone)
+        if touch is not None:  # the caller's function may need what the project's flags leave out
+            return wp.kernel(enable_backward=False, module=run.module.name)(alone)
+        return forward_kernel(module=run.module.name)(alone)
 
     def entry(self, bound: "Bound") -> Entry:
         """Return the kernel as the team calls it."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import RowLayout, make_struct
 from warp_lcp.rows.program import Launch, perform
 from warp_lcp.rows.row_pass import Bound, Form
@@ -146,5 +147,5 @@ def _sequence_kernel(name: str, forms: tuple[Form, ...]) -> Any:
             meet()
 
     sequence.__name__ = sequence.__qualname__ = name.rpartition(".")[2]
-    kernel = wp.kernel(enable_backward=False, module=f"warp_lcp.{name}.{variant}", launch_bounds=CUDA_THREADS)(sequence)
+    kernel = forward_kernel(module=f"warp_lcp.{name}.{variant}", launch_bounds=CUDA_THREADS)(sequence)
     return kernel, Tables, structs

@@ -23,6 +23,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.deadline import check_time, seconds_left
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.native import shared
 
 VARIABLE = "WARP_LCP_THREADS"
@@ -52,7 +53,7 @@ def work_through(team_: wp.uint64, table_: wp.uint64, mode: int, me: int, share:
     """Do what `mode` asks of thread `me`."""
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.team")
+@forward_kernel(module="warp_lcp.team")
 def team_kernel(team: wp.uint64, table: wp.uint64, mode: int, me: int, share: int, limit: wp.int64):
     """Do what `mode` asks of thread `me`; one thread."""
     work_through(team, table, mode, me, share, limit)
@@ -432,7 +433,7 @@ def _system() -> list[int]:
         return []
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.team")
+@forward_kernel(module="warp_lcp.team")
 def trial_kernel(a: wp.array(dtype=wp.float32), first: int, value: float):
     """a[first + i] = value + i."""
     i = wp.tid()

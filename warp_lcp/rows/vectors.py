@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.native import HEADERS, text
@@ -41,7 +42,7 @@ def add_up_span(partials: wp.array(dtype=wp.float64), offset: int, start: int, n
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.vectors")
+@forward_kernel(module="warp_lcp.vectors")
 def add_up_kernel(
     partials: wp.array(dtype=wp.float64), before: int, n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int
 ):  # fmt: skip
@@ -62,7 +63,7 @@ def add_up_kernel(
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.vectors")
+@forward_kernel(module="warp_lcp.vectors")
 def largest_kernel(
     partials: wp.array(dtype=wp.float64), before: int, n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int
 ):  # fmt: skip

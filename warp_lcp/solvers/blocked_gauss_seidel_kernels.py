@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.problem.affine_bounds import AffineSide, bound_at
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.solvers.sweep_kernels import INFINITE, ZERO, scalar_solution
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
@@ -215,7 +216,7 @@ def block_sweep_kernel(a_type: Any, m: int) -> Any:
                 out[p] = scalar_solution(out[p], y, a[p, p], side_at(low, out, p), side_at(high, out, p), wp.float64(1.0))
         return out
 
-    @wp.kernel(enable_backward=False, module=name)
+    @forward_kernel(module=name)
     def sweep(
         A: Rows, b: f64, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, B: BlockLists, begin: int, each: int, forward: bool,
         x: f64,

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+from warp_lcp.rows.compiler import forward_kernel
+
 EXACT = 64.0  # units of rounding: a candidate whose measure is below needs no better one
 RANK = 1e3  # units of rounding: pivots below, relative to A's largest entry, are zero
 EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration at most; the first changes nothing where rows are alike
@@ -148,7 +150,7 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
                         best, least, found = x, m, code
         return wp.cw_mul(S, best), least, found
 
-    @wp.kernel(enable_backward=False, module=module)
+    @forward_kernel(module=module)
     def batch(
         A: wp.array3d(dtype=dtype), b: wp.array2d(dtype=dtype), lower: wp.array2d(dtype=dtype), upper: wp.array2d(dtype=dtype),
         accepted: dtype, x: wp.array2d(dtype=dtype), chosen: wp.array(dtype=wp.int32),
@@ -170,7 +172,7 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
             found = -1
         chosen[t] = found
 
-    @wp.kernel(enable_backward=False, module=module)
+    @forward_kernel(module=module)
     def each(
         A: wp.array2d(dtype=dtype), b: wp.array(dtype=dtype), lower: wp.array(dtype=dtype), upper: wp.array(dtype=dtype),
         x: wp.array2d(dtype=dtype), measures: wp.array(dtype=dtype),

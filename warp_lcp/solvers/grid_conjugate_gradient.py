@@ -12,6 +12,7 @@ from warp_lcp.krylov.conjugate_gradient import first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import KernelFile, Wave
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Program
 from warp_lcp.rows.vectors import Reduction
@@ -32,7 +33,7 @@ f64 = wp.array(dtype=wp.float64)
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.grid_conjugate_gradient")
+@forward_kernel(module="warp_lcp.grid_conjugate_gradient")
 def begin_grid_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.float64, limit: int):
     """Before the first iteration: no old direction, no norm yet."""
     scalars[CARRY] = wp.float64(0.0)
@@ -42,7 +43,7 @@ def begin_grid_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.fl
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.grid_conjugate_gradient")
+@forward_kernel(module="warp_lcp.grid_conjugate_gradient")
 def end_grid_kernel(scalars: f64, going: wp.array(dtype=int)):
     """After an iteration: decide whether to go on."""
     more = next_iteration(scalars, SQUARE)

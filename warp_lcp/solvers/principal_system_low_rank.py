@@ -11,6 +11,7 @@ import warp as wp
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
@@ -21,7 +22,7 @@ I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
+@forward_kernel(module="warp_lcp.low_rank_correction")
 def split_kernel(S: F64, E: F64, columns: I32, sums: F64, m: int, force: F64, kept: F64):
     """From Z'r: kept = E^-1 Z'r, and S'^-1 Z'r as factors of all columns; S and E are the inverses."""
     i = wp.tid()
@@ -35,7 +36,7 @@ def split_kernel(S: F64, E: F64, columns: I32, sums: F64, m: int, force: F64, ke
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
+@forward_kernel(module="warp_lcp.low_rank_correction")
 def join_kernel(S: F64, columns: I32, u: F64, m: int, kept: F64, t: F64):
     """From U'z: t = S^-1 U'z less what `split_kernel` kept; S is the inverse."""
     i = wp.tid()
@@ -46,7 +47,7 @@ def join_kernel(S: F64, columns: I32, u: F64, m: int, kept: F64, t: F64):
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
+@forward_kernel(module="warp_lcp.low_rank_correction")
 def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
     """Make z'Kz and z'Kp of K = A + U W U' from those of A."""
     zz = wp.float64(0.0)
@@ -61,7 +62,7 @@ def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
 
 
 @no_type_check
-@wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
+@forward_kernel(module="warp_lcp.low_rank_correction")
 def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64):
     """From u = U'x and W u: x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x."""
     beyond = wp.float64(0.0)

@@ -9,6 +9,7 @@ import warp as wp
 from warp_lcp.multigrid.cycle_passes import ASCEND
 from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.rows import Bound, KernelFile, Wave
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.solvers.descent import CREEP, STALL
 
 # Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, and so are ZAZ ... GP.
@@ -62,7 +63,7 @@ def conjugate(zaz: wp.float64, zap: wp.float64, gz: wp.float64, gp: wp.float64, 
     return least - least, zaz, gz
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid")
 def plan_step_kernel(scalars: f64):
     """Beta and the step length from the measured products: the new direction is conjugate to the last one, the step minimizes along it."""
     zero = wp.float64(0.0)
@@ -89,7 +90,7 @@ def rescale(scalars: f64):
         scalars[PER_SIZE] = wp.float64(1.0) / scalars[SIZE]
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid")
 def plan_whole_step_kernel(scalars: f64, searched: bool):
     """Take a projected cycle's correction z as it is, or as much of it as lowers the energy most; both keep to the bounds.
 
@@ -134,7 +135,7 @@ def keep_row(scalars: f64, rows: f64, n: int):
     rows[n * ROW + ROW_SIZE] = scalars[SIZE]
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid")
 def take_unit_kernel(scalars: f64, square: f64):
     """Take ||b|| as the unit of right-hand sides, 1 if it is 0; no step has been taken."""
     size = wp.sqrt(square[0])
@@ -145,13 +146,13 @@ def take_unit_kernel(scalars: f64, square: f64):
     scalars[STEP] = wp.float64(0.0)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid")
 def keep_row_kernel(scalars: f64, rows: f64, n: int):
     """Keep what an evaluation has found as row n."""
     keep_row(scalars, rows, n)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid")
 def begin_kernel(
     scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int,
     rtol: wp.float64, atol: wp.float64, counted: f64, noise: wp.float64,
@@ -182,7 +183,7 @@ def begin_kernel(
     scalars[CARRY] = wp.float64(0.0)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid")
 def resume_kernel(
     judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int, tolerance: wp.float64,
     norm: wp.float64, best: wp.float64, energy: wp.float64, lowest: wp.float64, fell: wp.float64, noise: wp.float64,
@@ -201,7 +202,7 @@ def resume_kernel(
     stale[0] = was_stale
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid")
 def judge_kernel(
     scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), rebuilds: bool,
 ):  # fmt: skip

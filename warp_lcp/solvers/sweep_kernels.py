@@ -11,6 +11,7 @@ import warp as wp
 from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.problem.affine_bounds import AffineSide, bound_at
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 
 f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)
 ZERO = wp.constant(wp.float64(0.0))
@@ -65,7 +66,7 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
     name = f"warp_lcp.sweep.{a_type.__name__}"
     entries, Rows = wp.array(dtype=a_type), matrix_rows(a_type)
 
-    @wp.kernel(enable_backward=False, module=name)
+    @forward_kernel(module=name)
     def sweep(A: Rows, b: f64, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, order: i32, forward: bool, n: int, x: f64):
         """Relax the rows of `order` (empty: all, by number) one after the other, by one thread."""
         for place in range(n):
@@ -90,7 +91,7 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
             upper = bound_at(uppers, x, i)
             x[i] = scalar_solution(x[i], y, d, lower, upper, omega)
 
-    @wp.kernel(enable_backward=False, module=name)
+    @forward_kernel(module=name)
     def greedy(A: Rows, diagonal: entries, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, n: int, y: f64, x: f64):
         """Relax n times the row whose x would change most, measured by |d| |change|; A is symmetric, so that its column is its row."""
         for _ in range(n):
@@ -128,7 +129,7 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
 def jacobi_kernel(d_type: Any) -> Any:
     """Return the kernel of Jacobi's pass for a diagonal of type d_type."""
 
-    @wp.kernel(enable_backward=False, module=f"warp_lcp.jacobi.{d_type.__name__}")
+    @forward_kernel(module=f"warp_lcp.jacobi.{d_type.__name__}")
     def jacobi(d: wp.array(dtype=d_type), unit: wp.float64, y: f64, lower: f64, upper: f64, unknown: i8, omega: wp.float64, x: f64):
         """Solve each scalar problem from the same x."""
         i = wp.tid()

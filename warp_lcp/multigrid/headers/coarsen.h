@@ -40,47 +40,54 @@ if (make) {
     const bool whole_x = fx == 2 && below_x == 1, whole_y = wide == 2 && below_y == yp, whole_z = deep == 2 && below_z == zp;
     const T scale = COUNTS ? unit : (T)1, se = scale*(all ? held : stiffen), sx = whole_x ? (T)0 : fx == 2 ? scale : scale*stiffen;
     const T sy = whole_y ? (T)0 : L.fy == 2 ? scale : scale*stiffen, sz = whole_z ? (T)0 : L.fz == 2 ? scale : scale*stiffen;
-    B excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M];
+    B excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M], none[2*M];
     const auto one = [](B v) { return (unsigned char)(v < (B)1 ? v : (B)1); };
-    const auto face = [&](const auto* w, T c, long long k, long long shift, long long other) -> B {  // stored `shift` after cell k, to `other`
-        if constexpr (COUNTS) return (B)(one(d[k]) & one(d[k + other]) & (unsigned char)(c > 0));
-        else if constexpr (STENCIL == 'v') return ((d[k] != 0) & (d[k + other] != 0)) ? (B)w[k + shift] : (B)0;
-        else return ((d[k] != 0) & (d[k + other] != 0)) ? (B)c : (B)0; };
+    const auto face = [&](auto here, auto there, T c, const auto* w, int i) -> B {  // between two cells of these diagonals
+        if constexpr (COUNTS) return (B)(one(here) & one(there) & (unsigned char)(c > 0));
+        else if constexpr (STENCIL == 'v') return ((here != 0) & (there != 0)) ? (B)w[i] : (B)0;
+        else return ((here != 0) & (there != 0)) ? (B)c : (B)0; };
+    const auto from = [&](const auto* field, long long first) { const auto* q = field + first; OPAQUE(q); return q; };
     for (int begin = 0; begin < n; begin += M) {
         const int m = n - begin < M ? n - begin : (int)M, last = cells - 1 - fx*(P.first + begin); const long long p = fx*begin;
         // Cell i of row y in one plane or both: what it adds to the aggregate's excess and to the outer faces below and above it. Rows go one
-        // after another, for memory is fetched ahead best along them; planes together, which halves the passes.
-        const auto row = [&](auto both, auto second, int from, int to, long long left, long long right) {
-            enum { BOTH = decltype(both)::value, SECOND = decltype(second)::value };
-            const long long at = p + (SECOND ? yp : 0), low_y = SECOND ? -yp : below_y, high_y = SECOND || wide == 1 ? above_y : yp;
+        // after another, for memory is fetched ahead best along them; planes together, which halves the passes. One loop serves both rows:
+        // this kernel takes longest to compile.
+        const auto row = [&](auto both, int y, int begin, int end, long long left, long long right) {
+            enum { BOTH = decltype(both)::value };
+            const long long at = p + y*yp, low_y = y ? -yp : below_y, high_y = y || wide == 1 ? above_y : yp;
+            B* first_by = y ? none : by;
+            struct Plane { const decltype(d + 0) e, e_left, e_right, e_below, e_above, e_down, e_up; decltype(wx + 0) left, right, below, above, down, up; };
+            const auto plane = [&](long long k, long long down, long long up) -> Plane {
+                return {from(d, k), from(d, k + left), from(d, k + right), from(d, k + low_y), from(d, k + high_y), from(d, k + down), from(d, k + up),
+                        from(wx, k), from(wx, k + 1), from(wy, k), from(wy, k + yp), from(wz, k), from(wz, k + zp)}; };
+            const Plane lower = plane(at, below_z, BOTH ? zp : above_z), upper = BOTH ? plane(at + zp, -zp, above_z) : lower;
             const auto cell = [&](int i) {
-                B sum = 0, bx_ = 0, ax_ = 0, by_ = 0, ay_ = 0, bz_ = 0, az_ = 0;
-                if (SECOND) { sum = excess[i]; bx_ = bx[i]; ax_ = ax[i]; bz_ = bz[i]; az_ = az[i]; }
-                const auto add = [&](auto upper) {
-                    enum { UPPER = decltype(upper)::value };
-                    const long long k = at + i + (UPPER ? zp : 0);
-                    const B f = face(wx, cx, k, 0, left), g = face(wx, cx, k, 1, right);
-                    const B h = face(wy, cy, k, 0, low_y), l = face(wy, cy, k, yp, high_y);
-                    const B o = face(wz, cz, k, 0, UPPER ? -zp : below_z), q = face(wz, cz, k, zp, BOTH && !UPPER ? zp : above_z);
-                    if constexpr (COUNTS) sum += (B)(d[k] - f - g - h - l - o - q);
-                    else { const B e = unit*(T)d[k], v = e - f - g - h - l - o - q; sum += v > least*e ? v : (B)0; }
+                B sum = excess[i], bx_ = bx[i], ax_ = ax[i], by_ = 0, ay_ = 0, bz_ = bz[i], az_ = az[i];
+                const auto add = [&](const Plane& P, auto is_upper) {
+                    enum { UPPER = decltype(is_upper)::value };
+                    const auto e = P.e[i];
+                    const B f = face(e, P.e_left[i], cx, P.left, i), g = face(e, P.e_right[i], cx, P.right, i);
+                    const B h = face(e, P.e_below[i], cy, P.below, i), l = face(e, P.e_above[i], cy, P.above, i);
+                    const B o = face(e, P.e_down[i], cz, P.down, i), q = face(e, P.e_up[i], cz, P.up, i);
+                    if constexpr (COUNTS) sum += (B)(e - f - g - h - l - o - q);
+                    else { const B s = unit*(T)e, v = s - f - g - h - l - o - q; sum += v > least*s ? v : (B)0; }
                     bx_ += f; ax_ += g; by_ += h; ay_ += l;  // the last row's l counts
                     if (!UPPER) bz_ += o;
                     if (UPPER || !BOTH) az_ += q; };
-                add(No());
-                if (BOTH) add(Yes());
+                add(lower, No());
+                if (BOTH) add(upper, Yes());
                 excess[i] = sum; bx[i] = bx_; ax[i] = ax_; ay[i] = ay_; bz[i] = bz_; az[i] = az_;
-                if (!SECOND) by[i] = by_; };
-            const int bytes = COUNTS ? from + (to - from)/64*64 : from;
-            SIMD64 for (int i = from; i < bytes; ++i) cell(i);
-            SIMD for (int i = bytes; i < to; ++i) cell(i); };
+                first_by[i] = by_; };
+            const int bytes = COUNTS ? begin + (end - begin)/64*64 : begin;
+            SIMD64 for (int i = begin; i < bytes; ++i) cell(i);
+            SIMD for (int i = bytes; i < end; ++i) cell(i); };
         for (int part = 0; part < 3; ++part) {  // all; again those whose neighbor is at the other end of the row
             const int from = part == 2 ? last : 0, to = part == 0 ? fx*m : from + 1;
             if (part == 1 && (P.first + begin > 0 || below_x == -1)) continue;
             if (part == 2 && (last >= fx*m || above_x == 1)) continue;
             const long long left = part == 1 ? below_x : -1, right = part == 2 ? above_x : 1;
-            if (deep == 1) { row(No(), No(), from, to, left, right); if (wide == 2) row(No(), Yes(), from, to, left, right); }
-            else { row(Yes(), No(), from, to, left, right); if (wide == 2) row(Yes(), Yes(), from, to, left, right); } }
+            SIMD for (int i = from; i < to; ++i) { excess[i] = 0; bx[i] = 0; ax[i] = 0; bz[i] = 0; az[i] = 0; }
+            for (int y = 0; y < wide; ++y) { if (deep == 1) row(No(), y, from, to, left, right); else row(Yes(), y, from, to, left, right); } }
         T *dc = coarse_d + begin, *wxc = coarse_wx + begin, *wyc = coarse_wy + begin, *wzc = coarse_wz + begin;
         if (fx == 2) {
             SIMD for (int k = 0; k < m; ++k) {
@@ -263,8 +270,16 @@ for (int begin = 0; begin < n; begin += R) {
 //   by_row     vec2i spans, known; uint8 changed
 const auto old = known[P.row], now = spans[P.row];
 if (old[0] != now[0] || old[1] != now[1]) {
+    const int below = old[1] < now[0] ? old[1] : now[0], above = old[0] > now[1] ? old[0] : now[1];
     const auto clear = [&](auto* field) {
-        if (field) for (int k = old[0]; k < old[1]; ++k) if (k < now[0] || k >= now[1]) field[k] = 0; };
+        const auto zero = [&](int from, int to) {
+#ifdef __CUDA_ARCH__
+            for (int k = from; k < to; ++k) field[k] = 0;
+#else
+            if (from < to) __builtin_memset(field + from, 0, (to - from)*sizeof(*field));  // no loop to vectorize, seven times over
+#endif
+        };
+        if (field) { zero(old[0], below); zero(above, old[1]); } };
     clear(x); clear(b); clear(t); clear(diagonals); clear(lower_x); clear(lower_y); clear(lower_z);
     known[P.row] = now; changed[P.row] = 1; }
 

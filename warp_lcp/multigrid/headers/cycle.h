@@ -4,14 +4,7 @@
 // around.
 const auto relaxed = [&](T x, T sum_around, T weight, int k, T e) -> T { return x + weight*((b[k] + sum_around) / e - x); };
 
-// kernel cycle.sweep: y = x + omega (b - A x) / diagonal, clipped to the bounds if projected;
-// from_zero: as if x were 0
-//   compute    S
-//   stencil    F, S
-//   reads      S x, b, lower?, upper?
-//   writes     S y
-//   numbers    S omega; bool from_zero, projected
-//   module     multigrid
+// snippet sweep: y = a value clipped to the bounds if projected, 0 where there is no unknown
 #include "relax"
 const auto from_b = [&](int k, T e) -> T { return omega*b[k] / e; };
 const auto from_x = [&](int k, T e) -> T { return relaxed(x[k], around(x, k, down, up), omega, k, e); };
@@ -21,17 +14,27 @@ const auto clips = [&](auto value) {
     if (!projected) sweep(value, [](int, T v) { return v; });
     else if (upper) sweep(value, [&](int k, T v) { return clipped(v, lower[k], upper[k]); });
     else sweep(value, [&](int k, T v) { return v < lower[k] ? lower[k] : v; }); };
+
+// kernel cycle.sweep: y = x + omega (b - A x) / diagonal, clipped to the bounds if projected;
+// from_zero: as if x were 0
+//   compute    S
+//   stencil    F, S
+//   reads      S x, b, lower?, upper?
+//   writes     S y
+//   numbers    S omega; bool from_zero, projected
+#include "sweep"
 if (from_zero) clips(from_b); else clips(from_x);
 
-// kernel cycle.out_of_ring: As cycle.sweep, out of a ring of planes
+// kernel cycle.out_of_ring: As cycle.sweep, out of a ring of planes, never from zero
 //   compute    S
 //   stencil    F, S
 //   reads      S x, b, lower?, upper?
 //   writes     S y
 //   ring       x
-//   numbers    S omega; bool from_zero, projected
+//   numbers    S omega; bool projected
 //   module     multigrid
-#include "cycle.sweep"
+#include "sweep"
+clips(from_x);
 
 // kernel cycle.into_ring: As cycle.sweep, into a ring of planes: what the plane that was here before had
 // may be wider, where rows beside this one look

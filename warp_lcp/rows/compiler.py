@@ -1,0 +1,62 @@
+"""How Warp's compiler is called for the project's kernels on CPUs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+# WP_NO_BFLOAT16: no kernel here computes with bfloat16, and Warp's header of all built-in functions,
+# which the first module of a process compiles to a precompiled header, is a third shorter without it.
+# -fpch-instantiate-templates: templates that this header uses itself are instantiated when it is
+# compiled, not again in each module. Neither changes a module's object code.
+HEADER_FLAGS = "-DWP_NO_BFLOAT16= -fpch-instantiate-templates"
+# LLVM inlines the functions of a module before it optimizes any, instead of optimizing a kernel again
+# at each level of calls: a fifth less time for code of the same size. An option of LLVM that a later
+# version may not have, where no kernel would compile: so for versions of Warp that it was tried with.
+INLINE_FIRST = "-mllvm=-enable-module-inliner"
+INLINE_FIRST_VERSIONS = ("1.19",)
+# Warp writes functions to add structs for gradients. Local to the module, they are not compiled.
+LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE
+#define CUDA_CALLABLE __attribute__((internal_linkage))
+"""
+
+
+def forward_kernel(*, module: str, inline_first: bool = True, **options: Any) -> Any:
+    """Declare a Warp kernel without a backward pass, in a module of the project.
+
+    Args:
+        module: Warp module of the kernel, see `project_module`.
+        inline_first: likewise.
+        **options: of `wp.kernel`.
+
+    Returns:
+        The decorator.
+    """
+    project_module(module, inline_first)
+    return wp.kernel(enable_backward=False, module=module, **options)
+
+
+def project_module(name: str, inline_first: bool = True) -> Any:
+    """Return a Warp module, made if need be, with the project's compiler flags.
+
+    All modules of the project should have the same: there is one precompiled header for each set of
+    flags, and each takes a second.
+
+    Args:
+        name: of the module.
+        inline_first: False where a large function is called from many places, and would be compiled
+            in each.
+
+    Returns:
+        The module. Flags are added to `wp.config.cpu_compiler_flags` as it is when a kernel of the
+        module is declared.
+    """
+    flags = wp.config.cpu_compiler_flags
+    flags = "-march=native" if flags is None else flags  # what Warp takes for None
+    checked = ".".join(wp.__version__.split(".")[:2]) in INLINE_FIRST_VERSIONS
+    added = [HEADER_FLAGS, INLINE_FIRST] if inline_first and checked else [HEADER_FLAGS]
+    module = wp.get_module(name)
+    module.options["cpu_compiler_flags"] = " ".join([flags, *added]).strip()
+    module.options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS)
+    return module
