@@ -6,6 +6,7 @@ import warp as wp
 from warp_lcp.fluids.wall_kernels import Walls, face_center, moving_on
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.rows.compiler import forward_kernel
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _I32 = wp.array(dtype=wp.int32)
@@ -118,7 +119,7 @@ def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _
     counts[row] = e - begin
 
 
-@wp.kernel(enable_backward=False, module="fluids.coupling")
+@forward_kernel(module="fluids.coupling")
 def offsets_kernel(first: int, counts: _I32, offsets: _I32, total: _I32):
     """Add up counts exclusively from row `first` on, whose offset is known, and their total; one thread."""
     before = offsets[first]

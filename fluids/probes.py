@@ -12,6 +12,7 @@ from warp_lcp.grid.cell_kernel import F32, F64, I8, interpolated
 from warp_lcp.grid.staggered import StaggeredGrid, three_components
 from warp_lcp.material.particle_log import Row
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, launch
 
@@ -23,7 +24,7 @@ STEP = wp.constant(0.25)  # cells between two looks for the surface
 VALUES = 6  # of a probe: pressure over density, velocity, level, and whether that is where the search ended, in liquid
 FAR = 1e9  # cells: farther than any grid
 
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.probes"}
+options: dict[str, typing.Any] = {"module": "fluids.probes"}
 
 
 @wp.func
@@ -59,7 +60,7 @@ def depth_of(x: wp.vec3, planes: int, shape: wp.vec3i, kind: I8, phi: F32):
     return deep, total
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 @typing.no_type_check
 def probe_kernel(
     points: wp.array(dtype=wp.vec3), counts: wp.vec3i, planes: int, kind: I8, x: F64, phi: F32, u: F32, v: F32, w: F32,

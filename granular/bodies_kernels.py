@@ -10,12 +10,13 @@ import warp as wp
 
 from warp_lcp.granular.stress_kernels import KERNELS
 from warp_lcp.granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import make_struct, put
 
 _INTS, _BYTES, _REALS = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8), wp.array(dtype=wp.float64)
 _ROW, _SINGLE, _PAIRS = wp.array2d(dtype=wp.float64), wp.array(dtype=wp.float32), wp.array(dtype=wp.vec2d)
 _MATS, _SPANS = wp.array3d(dtype=wp.float64), wp.array2d(dtype=wp.int32)
-options = {"enable_backward": False, "module": "granular.bodies"}
+options = {"module": "granular.bodies"}
 
 
 @functools.cache
@@ -95,7 +96,7 @@ def copy_of(stress: _SINGLE, n: int, copies: int, q: int):
     return wp.where((copies >> q) & 1 == 1, wp.float64(stress[n]), wp.float64(0.0))
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def forget_kernel(slot: _INTS, now: _SINGLE, before: _SINGLE, point: _SINGLE):
     """No stress at the slots."""
     n = slot[wp.tid()]
@@ -104,7 +105,7 @@ def forget_kernel(slot: _INTS, now: _SINGLE, before: _SINGLE, point: _SINGLE):
     point[n] = 0.0
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def force_kernel(grid: FieldShape, spans: _SPANS, stress: _SINGLE, cells: Places, edges: Places, share: Vector, out: _ROW):
     """What a part of the cells and edges beside a body does to it: minus their rows times their stresses."""
     part = wp.tid()
@@ -133,7 +134,7 @@ def force_kernel(grid: FieldShape, spans: _SPANS, stress: _SINGLE, cells: Places
                 out[part, q] = out[part, q] - edges.row[n, 0, q] * shear
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def respond_kernel(
     implicit: int, parts: _SPANS, partial: _ROW, start: _ROW, response: _MATS, correction: _MATS, force: _ROW, error: _ROW, velocity: _ROW
 ):
@@ -159,7 +160,7 @@ def respond_kernel(
         velocity[body, q] = velocity[body, q] + change
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def layer_kernel(faces: Places, mass: Vector, u: Vector, weight: Vector, out: _PAIRS):
     """Mass of the sand that moves with a body's face, half a cell, and the velocity that it had."""
     n = wp.tid()
@@ -170,7 +171,7 @@ def layer_kernel(faces: Places, mass: Vector, u: Vector, weight: Vector, out: _P
         out[n] = wp.vec2d(wp.float64(0.5) * wp.float64(entry(mass, a, at)), wp.float64(entry(u, a, at)))
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def stiffness_kernel(
     grid: FieldShape,
     cells: Places,
@@ -201,7 +202,7 @@ def stiffness_kernel(
     out[n] = found
 
 
-@wp.kernel(**options)
+@forward_kernel(**options)
 def lightness_kernel(grid: FieldShape, edges: Places, share: Vector, inverse: Vector, out: _REALS):
     """1 / sum of the inverse masses around an edge; 0 where it has no shear."""
     n = wp.tid()
@@ -222,7 +223,7 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
     name = f"bodies_{dimension}d_{real.__name__}{'_box' * box}{'_rate' * rate}"
     module, Velocity = f"granular.{name}", vector_struct(real)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @forward_kernel(module=module)
     def move(faces: Places, velocity: _ROW, moved: Velocity):
         """Give the bodies' faces the velocity that they have."""
         n = wp.tid()
@@ -232,7 +233,7 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
             u += faces.row[n, 0, q] * velocity[b, q]
         set_entry(moved, int(faces.axis[n]), faces.at[n], real(u))
 
-    @wp.kernel(enable_backward=False, module=module)
+    @forward_kernel(module=module)
     def strain(grid: FieldShape, edges: Places, u: Velocity, rates: Velocity):
         """Twice the shear rate of the edges beside bodies, times dx."""
         n = wp.tid()

@@ -14,6 +14,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import LaunchGraph, clear, launch
 
 INTS, BYTES = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
@@ -79,7 +80,7 @@ class Walls:
             launch(kernel, CUDA_LISTS, [*fields, self._counts], device=device)
 
 
-@wp.kernel(enable_backward=False, module="granular.walls")
+@forward_kernel(module="granular.walls")
 @no_type_check
 def activate_kernel(cells: INTS, flags: BYTES, active: INTS):
     """List the entries whose cells hold sand, in order, behind their number."""
@@ -91,7 +92,7 @@ def activate_kernel(cells: INTS, flags: BYTES, active: INTS):
     active[0] = count
 
 
-@wp.kernel(enable_backward=False, module="granular.walls_cuda")
+@forward_kernel(module="granular.walls_cuda")
 @no_type_check
 def count_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
     """Count the entries of one of equal parts of the list whose cells hold sand; a thread a part."""
@@ -102,7 +103,7 @@ def count_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
     counts[t] = count
 
 
-@wp.kernel(enable_backward=False, module="granular.walls_cuda")
+@forward_kernel(module="granular.walls_cuda")
 @no_type_check
 def list_active_kernel(cells: INTS, flags: BYTES, active: INTS, counts: INTS):
     """List them in order, behind their number: each part's after those of the parts before it."""

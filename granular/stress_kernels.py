@@ -17,6 +17,7 @@ import warp as wp
 
 from warp_lcp.granular.yield_set import COLUMNS, CONSTANTS, F64
 from warp_lcp.rows import KernelFile
+from warp_lcp.rows.compiler import forward_kernel
 
 # The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
 # residuals over the last PERIOD steps; sums over these; 1 less the most that the momentum may grow to.
@@ -42,7 +43,7 @@ def stress_passes(dimension: int, real: Any, *, box: bool = False, rate: bool = 
     return SimpleNamespace(**made, wall=wall)
 
 
-@wp.kernel(enable_backward=False, module="granular.momentum")
+@forward_kernel(module="granular.momentum")
 def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.float64)):
     """Momentum of the next step but one; every few steps more or less of it, by the angle between the projection's error and the step.
 

@@ -16,6 +16,7 @@ from warp_lcp.distributed.messages import exchange_all, exchanging_all
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import is_recording, launch, perform
 from warp_lcp.rows.vectors import Across, convert
 
@@ -38,7 +39,7 @@ def ghost_layers(cfl: float, smoothing: int) -> int:
     return max(LAYERS, math.ceil(cfl) + 3, smoothing + 3)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.distributed.cells")
+@forward_kernel(module="warp_lcp.distributed.cells")
 @no_type_check
 def copy_kernel(to: wp.array3d(dtype=Any), source: wp.array3d(dtype=Any)):
     """Copy a row of cells."""

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
-from warp_lcp.rows.compiler import project_module
+from warp_lcp.rows.compiler import forward_kernel, project_module
 from warp_lcp.rows.program import Launch, call, is_recording, launch, launch_ranges
 
 F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))  # fields
@@ -116,7 +116,7 @@ def launch_list(
     launch_ranges(kernel, (count,), cost, inputs, device=wp.get_device(device), launch=launch, ordered=ordered, sized=sized, extent=extent)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.scan")
+@forward_kernel(module="warp_lcp.grid.scan")
 def scan_kernel(values: INTS, sums: INTS, inclusive: int):
     """Write the sum of the values before each, or up to and with it."""
     total = int(0)
