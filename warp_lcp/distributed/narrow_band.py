@@ -59,10 +59,10 @@ class SharedNarrowBand(NarrowBand):
             self._now.assign(after)
             falls = self.part.ranks.any(bool((after < before).any()))
 
-    def _seed(self, particles: Particles, window: Window, shift: np.ndarray, saved: Sequence[wp.array]) -> None:
+    def _seed(self, particles: Particles, saved: Sequence[wp.array]) -> None:
         """Put fresh particles behind the others of all ranks, in the order of the whole domain's cells."""
         assert isinstance(particles, SharedParticles), "particles of ranks"
-        super()._seed(particles, window, shift, saved)
+        super()._seed(particles, saved)
         counts = np.diff(self._total.numpy(), prepend=0)
         stored = np.flatnonzero(counts)
         counts = counts[stored]

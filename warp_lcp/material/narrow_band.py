@@ -35,6 +35,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.advection import CENTERS, carry_field
+from warp_lcp.grid.cell_kernel import launch_list, scan
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.grid.transfer import faces_to_particles
@@ -92,6 +93,7 @@ class NarrowBand:
         self.depth, self._now, self.velocity = grid.field(), grid.field(), grid.faces()
         self._keep = wp.array(keep.astype(np.int8), dtype=wp.int8, device=grid.device) if keep is not None else None
         self._total = wp.zeros(grid.size, dtype=wp.int32, device=grid.device)
+        self._sum = self._total[-1:]
         self._changed = wp.zeros(1, dtype=wp.int32, device=grid.device)
         self._seeds = random_seed % 2**31 - 1
         self._steps = np.append(PLASTIC[grid.dimension] ** -np.arange(1.0, grid.dimension + 1), 0.0)[:3]
@@ -102,9 +104,11 @@ class NarrowBand:
         self._own, self._before = grid.domain, (0, 0, 0)
         self._window, self._owned, self._inner = (ActiveWindow(w) for w in (grid.everywhere, grid.domain, grid.domain))
         self._last = Scalar(), Scalar()  # plane and row of the window
-        self._each, self._shift, self._at_rest, self._way = (Scalar() for _ in range(4))
-        launches = (self._launch_depth, self._fall, self._launch_quota, self._launch_carry)
-        self._depths, self._falling, self._quota, self._carrying = (LaunchGraph(grid.device, launch) for launch in launches)
+        self._each, self._at_rest, self._way, self._behind = (Scalar() for _ in range(4))
+        self._shift = Scalar(), Scalar(), Scalar()  # of fresh particles' lattice
+        launches = (self._launch_depth, self._fall, self._launch_quota, self._launch_carry, self._launch_seeds)
+        self._depths, self._falling, self._quota, self._carrying, self._seeding = (LaunchGraph(grid.device, launch) for launch in launches)
+        self._leaving = LaunchGraph(grid.device, self._launch_leaving, at_once=grid.device.is_cuda)  # a scan of Warp's
         self._move_to(grid.everywhere)
         self.interior = self._summed(grid.everywhere)
 
@@ -201,24 +205,22 @@ class NarrowBand:
             saved: velocity as it came from the particles [m/s], for FLIP.
         """
         self._move_to(window)
-        grid = self.grid
         self._each.value = self.particles_a_cell * self.density
         self._depths.run(kind, phi, contact, variant=phi is None)
         self._relax(fallen=FALLS)
-        depths, removed = [self._now, self.depth], 0
+        removed = 0
         if particles.count:
             marks = particles.marks
-            flat = [depth.flatten() for depth in depths]
-            wp.launch(kernels.leave_kernel, particles.count, [self.width, particles.key, *flat, marks], device=grid.device)
-            removed = particles.remove(marks)
+            self._leaving.run(particles, marks)
+            removed = sum(particles.finish_removal(marks))
         self.held += self._of_all(removed)
         shift = (self._steps * step) % 1.0
-        self._shift.value = float(shift[0])
+        for number, part in zip(self._shift, shift, strict=True):
+            number.value = float(part)
         self._quota.run(variant=self._here)
-        wp.utils.array_scan(self._total, self._total, inclusive=True)
-        self.fresh = int(self._total[-1:].numpy()[0])
+        self.fresh = int(self._sum.numpy()[0])
         if self._here and self.fresh:
-            self._seed(particles, self._owned, shift, saved)
+            self._seed(particles, saved)
         self.held -= self._of_all(self.fresh)
 
     def carry(self, velocity: list[wp.array], dt: float) -> None:
@@ -251,7 +253,14 @@ class NarrowBand:
         clear(self._total)
         where = [self.boundary.base, self._now, self.depth, self._total.reshape(self.grid.shape)]
         if self._here:
-            self._owned.launch(kernels.quota_kernel, [self._numbered, self.width, self._each, self._seeds, self._shift, *where])
+            self._owned.launch(kernels.quota_kernel, [self._numbered, self.width, self._each, self._seeds, self._shift[0], *where])
+        scan(self._total, self._total, inclusive=True)
+
+    def _launch_leaving(self, particles: Particles, marks: wp.array) -> None:
+        """Launch the removal of the particles of deep cells, and of those that get fresh ones."""
+        inputs = [self.width, particles.key, self._now.flatten(), self.depth.flatten(), marks]
+        launch_list(kernels.leave_kernel, particles.count, inputs, device=self.grid.device)
+        particles.launch_removal(marks)
 
     def with_interior(self, totals: ParticleTotals) -> ParticleTotals:
         """Return sums over the particles and the interior.
@@ -361,16 +370,22 @@ class NarrowBand:
     def _join(self, *fields: wp.array) -> None:
         """Give fields what others who have parts of the grid know of them."""
 
-    def _seed(self, particles: Particles, window: Window, shift: np.ndarray, saved: Sequence[wp.array]) -> None:
+    def _seed(self, particles: Particles, saved: Sequence[wp.array]) -> None:
         """Put fresh particles behind the others."""
-        grid, first = self.grid, particles.make_room(self.fresh)
-        sites = kernels.Sites()
-        sites.planes, sites.per_axis, sites.jitter, sites.seed = grid.planes, self.per_axis, self.jitter, self._seeds
-        sites.shift, sites.dx = wp.vec3(*shift), grid.spacing
-        window.launch(kernels.seed_kernel, [sites, self._numbered, first, *grid.shape[1:], self._total, particles.position])
+        first = particles.make_room(self.fresh)
+        self._behind.value = first
+        self._seeding.run(particles)
         if saved:
             tail = particles.position[first:], particles.velocity[first:]
-            faces_to_particles(grid, list(saved), *tail, [])
+            faces_to_particles(self.grid, list(saved), *tail, [])
+
+    def _launch_seeds(self, particles: Particles) -> None:
+        """Launch what puts fresh particles on their sites."""
+        grid, sites = self.grid, kernels.Sites()
+        sites.planes, sites.per_axis, sites.jitter, sites.seed = grid.planes, self.per_axis, self.jitter, self._seeds
+        sites.dx = grid.spacing
+        numbers = [*self._shift, self._behind, *grid.shape[1:]]
+        self._owned.launch(kernels.seed_kernel, [sites, self._numbered, *numbers, self._total, particles.position])
 
     def _launch_sums(self, box: Window) -> None:
         """Launch the sums over a box's cells without particles."""

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, INTS, POINTS, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, INTS, POINTS, U8, cell_kernel, list_kernel
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces
@@ -124,31 +123,32 @@ def quota_kernel(
     quota[k, j, i] = count
 
 
-@forward_kernel(module="warp_lcp.material.narrow_band")
-def leave_kernel(width: float, key: INTS, depth: wp.array(dtype=wp.float32), before: wp.array(dtype=wp.float32), marks: INTS):
+@list_kernel("warp_lcp.material.narrow_band")
+def leave_kernel(i, width: float, key: INTS, depth: wp.array(dtype=wp.float32), before: wp.array(dtype=wp.float32), marks: INTS):
     """Mark the particles of cells deeper than the band, and of those that get fresh ones."""
-    p = wp.tid()
-    cell = key[p]
+    cell = key[i]
     now = depth[cell]
-    marks[p] = wp.where(now > width or renewed(now, before[cell], width), 1, 0)
+    marks[i] = wp.where(now > width or renewed(now, before[cell], width), 1, 0)
 
 
 @wp.struct
 class Sites:
-    """A jittered lattice of so many places along each axis of a cell, that `shift` moves through the cell."""
+    """A jittered lattice of so many places along each axis of a cell."""
 
     planes: int
     per_axis: int
     jitter: float
     seed: int
-    shift: wp.vec3
     dx: float
 
 
 @cell_kernel("warp_lcp.material.narrow_band")
-def seed_kernel(k, j, i, S: Sites, where: Numbered, behind: int, ny: int, nx: int, total: INTS, position: POINTS):
-    """Put a cell's particles on their sites; `total` counts up to and with each cell."""
-    planes, per_axis, seed, shift = S.planes, S.per_axis, S.seed, S.shift
+def seed_kernel(
+    k, j, i, S: Sites, where: Numbered, shift_x: float, shift_y: float, shift_z: float, behind: int, ny: int, nx: int, total: INTS,
+    position: POINTS,
+):  # fmt: skip
+    """Put a cell's particles on their sites, that a shift moves through the cell; `total` counts up to and with each cell."""
+    planes, per_axis, seed, shift = S.planes, S.per_axis, S.seed, wp.vec3(shift_x, shift_y, shift_z)
     sites = per_axis * per_axis * wp.where(planes == 2, per_axis, 1)
     here = (k * ny + j) * nx + i
     start = total[here - 1]
