@@ -38,6 +38,7 @@ from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.rigid.body import PLANAR
+from warp_lcp.rows.joined import joined
 from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, missed_by_far
@@ -156,6 +157,11 @@ class SandSimulation(ParticleSimulation):
             SimulationFailed: something is not finite, or a particle has left the domain.
             ValueError: dt is not positive.
         """
+        with joined(self.grid.device):
+            return self._step(dt)
+
+    def _step(self, dt: float) -> Row:
+        """Advance by dt [s]."""
         before = self.begin_step(dt)
         window = self.window(before)
         self.particles_to_grid(window)
