@@ -97,6 +97,7 @@ class SandSimulation(ParticleSimulation):
         self.carried = None if self.bodies is None else self._carried(self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress, self.outcome = self._stresses(box=box, rate=rate, bodies=self.carried)
+        self._work = self.method.init(self.stress)
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
 
@@ -305,7 +306,7 @@ class SandSimulation(ParticleSimulation):
         """
         solver = self.scene.solver
         stopping = wl.StoppingCriteria(rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations)
-        return wl.solve(self.stress, self.method, stopping=stopping)
+        return wl.solve(self.stress, self.method, stopping=stopping, workspace=self._work)
 
     def _solve(self, window: Window, dt: float) -> Row:
         """Solve for the stresses and take over the velocity that they leave; return what the log wants to know of the solve."""

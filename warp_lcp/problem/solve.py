@@ -304,10 +304,26 @@ class _Loop:
         if x0 is not None:
             self.work.x.assign(x0)
         self.warm = True
-        self._refer()
+        self._refer(self._begun_in_place())
         self._record(0, Step("start", 0))
         self._keep(0)
         return None if math.isfinite(self.reference) else SolveStatus.NON_FINITE
+
+    def _begun_in_place(self) -> float | None:
+        """Begin on the device where the iterate is; return the residual there, None where it has not begun."""
+        work: Any = self.work
+        return work.begin_ahead(None, self.criteria) if self._lets_device_lead(work) else None
+
+    def _lets_device_lead(self, work: Any) -> bool:
+        """Tell a workspace how many steps its device may take without the host; return whether it may take any.
+
+        With a callback, merits or a deadline the host takes each step.
+        """
+        if not hasattr(work, "begin_ahead"):
+            return False
+        watched = self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
+        work.allow(0 if watched else self.stopping.max_iterations)
+        return not watched
 
     def _refer(self, reference: float | None = None) -> None:
         """Take the residual at the start that tolerances refer to; None: that of the iterate."""
@@ -410,7 +426,7 @@ class _LoopInBox(_Loop):
     def _begin(self, x0: Array | None) -> SolveStatus | None:
         """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
         work: Any = self.work
-        if hasattr(work, "begin_ahead") and self._begin_ahead(work, x0):
+        if self._lets_device_lead(work) and self._begin_ahead(work, x0):
             return None
         x, residual = self.work.x, self.residual
         guess = None if x0 is None else self._guess(x0)
@@ -442,10 +458,8 @@ class _LoopInBox(_Loop):
         return SolveStatus.INFEASIBLE if lost > self.tolerance else None
 
     def _begin_ahead(self, work: BeginsAhead, x0: Array | None) -> bool:
-        """Begin on the device; return whether it has begun. With a callback, merits or a deadline the host takes each step."""
-        watched = self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
-        work.allow(0 if watched else self.stopping.max_iterations)
-        if x0 is None or watched:
+        """Begin on the device; return whether it has begun."""
+        if x0 is None:
             return False
         reference = work.begin_ahead(self.problem.layout.load(x0, wp.float64, "x0"), self.criteria)
         if reference is None:
