@@ -13,6 +13,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.coupled import METHODS
+from warp_lcp.granular.front import Front
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import SandReport
 from warp_lcp.granular.scene import SandScene
@@ -81,7 +82,9 @@ class SandSimulation(ParticleSimulation):
         """Allocate the fields and find the sand's cells."""
         self.method = METHODS[scene.solver.method]()
         self._at_rest = scene.particles.per_axis**grid.dimension
+        self._percentiles = Front(grid.device) if grid.device.is_cuda and not self.shared else None
         super().__init__(scene, grid, parts, particles, **more)
+        self.measure_particles()
         self._start = self._front()[0]
         self.mark()
 
@@ -167,26 +170,34 @@ class SandSimulation(ParticleSimulation):
         window = self.window(before)
         self.particles_to_grid(window)
         solved = self._solve(window, dt)
-        measured = self._measured()
+        self._measure_stresses()
         self.extrapolate_velocity(window, self.outcome.known, self.packing.kind, self.outcome.contact)
         if self.sources is not None:
             self.sources.hold(self.velocity, [], self.packing.kind)
         self.grid_to_particles(window, self.packing.kind, dt)
         below, most = self._mass_below(), self._most()
-        row = self.move(dt, window)
+        row = self.move(dt, window) | self._measured()
         self._place_solids()
         runout, height = self._front()
         rate = self._flow_rate(below, row, dt)
-        return self.logged(
-            row | solved | measured | {"max_fraction": most, "runout": runout - self._start, "height": height, "flow_rate": rate}
-        )
+        return self.logged(row | solved | {"max_fraction": most, "runout": runout - self._start, "height": height, "flow_rate": rate})
+
+    def _measure_stresses(self) -> None:
+        """Launch what the log alone wants to know of the stresses."""
+        if self.scene.output.diagnostics:
+            with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
+                self.outcome.measure()
 
     def _measured(self) -> Row:
         """Return what the log alone wants to know of the stresses."""
         if not self.scene.output.diagnostics:
             return {}
-        with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
-            return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
+        return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
+
+    def measure_particles(self) -> None:
+        """Launch the percentiles of runout and height, on CUDA."""
+        if self._percentiles is not None:
+            self._percentiles.find(self.particles, percentile_place(self.particles.count))
 
     def known_density(self) -> wp.array | None:
         """Return the density from which the packing was computed."""
@@ -319,6 +330,9 @@ class SandSimulation(ParticleSimulation):
                 self.sources.hold(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()
+        if self.grid.device.is_cuda and self.flights is not None and self.sources is None and not self.shared:
+            with self.watch.stage("bodies in flight", packing.kind):  # whose number comes with what the solve has to tell
+                self.flights.find(window, self.weights, packing.kind)
         impulse = self.kick_dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
         growth = scene.growth(self.grid.spacing, self.kick_dt)
         bound = YieldSet(scene.slope, scene.intercept * impulse, scene.material.tensile_strength * impulse, **growth)
@@ -405,6 +419,8 @@ class SandSimulation(ParticleSimulation):
 
     def _front(self) -> tuple[float, float]:
         """Return the 99th percentile of x and of y [m]."""
+        if self._percentiles is not None:
+            return self._percentiles.read()
         position = self.particles.position.numpy()
         if not len(position):
             return 0.0, 0.0
