@@ -31,7 +31,7 @@ from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_ST
 from warp_lcp.grid.staggered import three_components
 from warp_lcp.rows import Rows
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch
+from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch, launch_now
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import renamed_method
 
@@ -85,7 +85,7 @@ class Velocity:
         """Return the fields as kernels take them."""
         return VelocityFields(*[*three_components(self.u), *three_components(self.edge), self.openings])
 
-    def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
+    def find(self, stress: wp.array, *, launch: Launch = launch_now, bodies: SandBodies | None = None, respond: bool = False) -> None:
         """Compute velocity and rates of strain under a field of stresses.
 
         Args:

@@ -22,7 +22,7 @@ from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.rows.fields import Array
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import convert
 
 SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squares that float64 holds
@@ -186,7 +186,7 @@ class IterateMemory:
         if self._best is not None:
             self.problem.layout.copy(self.x, self._best)
 
-    def round_iterate(self, *, launch: Launch = wp.launch) -> None:
+    def round_iterate(self, *, launch: Launch = launch_now) -> None:
         """Round x to its precision."""
         self._round(self.x, launch=launch)
 
@@ -196,7 +196,7 @@ class IterateMemory:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
 
-    def _round(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def _round(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
         if self._rounded is not None:
             convert(x, self._rounded, launch=launch)
             convert(self._rounded, x, launch=launch)
