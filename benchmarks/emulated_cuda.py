@@ -229,9 +229,19 @@ if COMPARE:
 
 def replayed():
     """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
-    from warp_lcp.rows import device_graph
-    from warp_lcp.rows.program import Loop, Program
+    from warp_lcp.rigid import contact_problem
+    from warp_lcp.rows import device_graph, joined
+    from warp_lcp.rows.program import LaunchGraph, Loop, Program
 
+    class HostGraph(LaunchGraph):
+        """Launches of contacts, which are in the host's memory on every machine: nothing of them waits."""
+
+        def run(self, *arguments, **options):
+            """Launch everything, so that the host can read it."""
+            super().run(*arguments, **options)
+            joined.settle()
+
+    contact_problem.LaunchGraph = HostGraph
     device_graph.noted = lambda device, event: None
     wp.is_conditional_graph_supported = lambda: True
     Program._captured = lambda self, commands: list(commands)

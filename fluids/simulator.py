@@ -40,6 +40,7 @@ from warp_lcp.material.particle_assembly import (
 from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rows.joined import joined
 from warp_lcp.rows.program import LaunchGraph
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
@@ -156,6 +157,11 @@ class LiquidSimulation(ParticleSimulation):
             SimulationFailed: something is not finite, a particle has left the domain, or enclosed liquid would have to change its volume.
             ValueError: dt is not positive.
         """
+        with joined(self.grid.device):
+            return self._step(dt)
+
+    def _step(self, dt: float) -> Row:
+        """Advance by dt [s]."""
         before = self.begin_step(dt)
         if self.forces is not None:
             self.forces.begin(self.time)

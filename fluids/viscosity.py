@@ -46,7 +46,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy, launch_now
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a force, relative to the diagonal times the speed
 STIFF = 1.0  # of nu dt / dx^2: where it is less, faces without mass, which nobody reads, would decide by their error when a solve ends
@@ -283,7 +283,7 @@ class Viscosity:
         if self._bodies is not None:
             self._bodies.push(self._change)
 
-    def _product(self, p: wp.array, q: wp.array, *, launch: Launch = wp.launch) -> None:
+    def _product(self, p: wp.array, q: wp.array, *, launch: Launch = launch_now) -> None:
         """Write q = A p, the bodies' answer included."""
         self.multigrid.product(p, q, launch=launch)
         if self._bodies is not None:

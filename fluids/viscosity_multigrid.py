@@ -16,7 +16,7 @@ import warp as wp
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.staggered import CLEAR, ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.program import Launch, Program, launch_now
 
 LEAST = 8  # cells of the longest side at which there is no coarser level
 SWEEPS = 4  # of the coarsest level, each forth and back
@@ -289,7 +289,7 @@ class VectorMultigrid:
         """Write z = M r."""
         self.program.run()
 
-    def product(self, p: wp.array, q: wp.array, *, launch: Launch = wp.launch) -> None:
+    def product(self, p: wp.array, q: wp.array, *, launch: Launch = launch_now) -> None:
         """Write q = A p."""
         self.levels[0].product(self.components(p), self.components(q), launch)
 

@@ -13,18 +13,16 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.granular import stress_kernels as kernels
 from warp_lcp.granular.stress import Stress
-from warp_lcp.granular.stress_kernels import PERIOD
+from warp_lcp.granular.stress_ahead import StressAhead
+from warp_lcp.granular.stress_kernels import BETTER, NEAR_BEST, NOTHING, PERIOD, STILL_SHARE, TIGHTER
 from warp_lcp.granular.yield_set import CONSTANTS
 from warp_lcp.rows import KernelFile, RowPass, Rows
 from warp_lcp.settings import Count, CountOrZero, NonNegative, Positive, Relaxation, Settings, ShareOrZero, renamed_names
 
-BETTER = 0.95  # of the best estimate: progress
-NEAR_BEST = 1.2
-NOTHING = 1e-3  # of the tolerance: nothing to solve, as in free fall
 SWING = 1.9  # 1 - momentum, times the cells of a side, of cold solves: with less than 2 sqrt(pressure_step / 4) pi / 2 = 1.4 the longest
 # wave, a quarter of which fits into a column's depth, swings back, and walls hold down what they have let rise; friction asks for more
-STILL = 1e-2  # of the tolerance, which leaves sand at rest
 APART = 3  # cells along an axis, so that two threads change no velocity in common: what a cell changes reaches two cells far
 KERNELS = KernelFile(Path(__file__).parent / "headers/sweeps.h", CONSTANTS)
 
@@ -109,11 +107,19 @@ class HeavyBallProjectedGradient(Settings):
         return MomentumWorkspace(problem, self)
 
     def step(self, problem: Stress, work: MomentumWorkspace, x: wp.array) -> wl.Step:
-        """Take `check_every` periods of steps; evaluate the residual if it is due."""
-        estimate, taken = problem.advance(self.check_every), self.check_every * PERIOD
-        due, stagnates = work.judge(estimate, taken)
+        """Take `check_every` periods of steps, or more where the device decides; evaluate the residual if it is due."""
+        taken, due, stagnates = work.take_steps()
         failure = wl.SolveStatus.STAGNATED if stagnates else None
         return wl.Step("projection", taken, failure=failure, interim=True, iterations=taken, due=due, final=True)
+
+    def steps(self, stress: Stress) -> tuple[float, float, float]:
+        """Return the lengths of steps of pressure and friction, relative to the diagonal, and the lookahead."""
+        flat = stress.packing.grid.dimension == 2
+        return self.pressure_step, self.shear_step * (1.0 if flat else 0.5), self.lookahead
+
+    def swing(self, stress: Stress) -> float:
+        """Return the limit of the momentum of cold solves, see `SWING`."""
+        return 1.0 - SWING / max(stress.packing.grid.domain_counts)
 
 
 class MomentumWorkspace(StressWorkspace):
@@ -127,24 +133,70 @@ class MomentumWorkspace(StressWorkspace):
     def __init__(self, stress: Stress, method: HeavyBallProjectedGradient) -> None:
         super().__init__(stress)
         self.method = method
+        self._ahead = StressAhead(stress, method) if StressAhead.suits(stress) else None
+        self._leads = False  # whether the device has begun the solve, and takes its steps
+        self._news: int | None = None  # where the decisions have the residual of the stresses as they are; None: it is not known
+        self._taken = 0  # of the steps done, those that the outer loop knows of
+        self._allowed = 0
+
+    def allow(self, steps: int) -> None:
+        """Say how many steps of the next solve may be taken without the host; 0: it takes each step."""
+        self._allowed, self._leads, self._news = steps, False, None
+
+    def begin_ahead(self, guess: None, criteria: wl.StoppingCriteria) -> float | None:
+        """Begin a solve on the device; return the residual at its start, None where the host leads.
+
+        Args:
+            guess: None: the solve begins with the stresses as they are.
+            criteria: when steps are done; the device leads where the tolerance is absolute.
+        """
+        self._leads = self._ahead is not None and self._allowed > 0 and criteria.rtol == 0.0
+        if self._ahead is None or not self._leads:
+            return None
+        self._ahead.begin(criteria.atol, self._allowed)
+        self._taken = 0
+        reference = self._take(kernels.FIRST)
+        self._news = kernels.LAST if self.problem.packing.grid.device.is_cuda else None
+        return reference
+
+    def _take(self, place: int) -> float:
+        """Take a residual over that the device has found; return its norm."""
+        assert self._ahead is not None
+        sums = self._ahead.decisions()[place : place + 2]
+        self.norm, self.current = math.hypot(*self.problem.take_residual(*map(float, sums))), True
+        return self.norm
+
+    def evaluate(self, x: wp.array) -> float:
+        """Return the norm of the natural residual, see the base class; the device may have found it."""
+        return super().evaluate(x) if self._news is None else self._take(self._news)
+
+    def take_steps(self) -> tuple[int, bool, bool]:
+        """Take steps; return how many, whether to evaluate the residual, and whether progress has ended."""
+        if self._ahead is None or not self._leads:
+            taken = self.method.check_every * PERIOD
+            return taken, *self.judge(self.problem.advance(self.method.check_every), taken)
+        if self._ahead.decisions()[kernels.DONE] == self._taken:
+            self._ahead.resume()
+        found = self._ahead.decisions()
+        taken, self._taken = int(found[kernels.DONE]) - self._taken, int(found[kernels.DONE])
+        return taken, bool(found[kernels.DUE]), bool(found[kernels.STAGNATES])
 
     def start(self, *, warm: bool, tolerance: float) -> bool:
         """Begin a sequence of steps; return whether a minimum number is required.
 
         The minimum holds for any residual.
         """
+        if self._ahead is not None and self._leads:
+            return bool(self._ahead.decisions()[kernels.LEAST] > 0.0)
         stress, method = self.problem, self.method
-        flat = stress.packing.grid.dimension == 2
-        stress.restart(
-            pressure_step=method.pressure_step, shear_step=method.shear_step * (1.0 if flat else 0.5), lookahead=method.lookahead,
-            momentum=method.momentum,
-        )  # fmt: skip
+        pressure_step, shear_step, lookahead = method.steps(stress)
+        stress.restart(pressure_step=pressure_step, shear_step=shear_step, lookahead=lookahead, momentum=method.momentum)
         self._aim, self._best, self._limits = tolerance, math.inf, list(method.calm)
         self._done, self._best_at, self._moved = 0, 0, 0  # steps: taken, when the estimate was best, when it or the momentum last changed
         self._least, self._still = method.least, 0.0
         if stress.cold:
-            self._least, self._still = method.cold, STILL * tolerance
-            stress.limit_momentum(1.0 - SWING / max(stress.packing.grid.domain_counts))
+            self._least, self._still = method.cold, STILL_SHARE * tolerance
+            stress.limit_momentum(method.swing(stress))
         if self.norm <= NOTHING * tolerance:
             self._least = 0
         return self._least > 0
@@ -166,7 +218,7 @@ class MomentumWorkspace(StressWorkspace):
             self._best, self._best_at, self._moved = estimate, self._done, self._done
         due = stagnates or not (estimate > self._aim or (self._done < self._least and estimate > self._still))
         if due:
-            self._aim *= 0.8  # should the estimate have been too good
+            self._aim *= TIGHTER
         return due, stagnates
 
 

@@ -107,6 +107,11 @@ class Packing:
         return int(self._found.numpy()[0])
 
     @property
+    def counts(self) -> wp.array:
+        """Return `sand_cells` and `densest` where kernels find them, float64, shape (2,)."""
+        return self._found.array
+
+    @property
     def densest(self) -> float:
         """Largest fraction of a cell, in units of the densest packing.
 

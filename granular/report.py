@@ -50,8 +50,13 @@ class SandReport:
         inputs = [wp.uint8(HELD), wp.uint8(RELEASED), packing.flags, stress.now, self.contact]
         packing.grid.domain.launch(contact_kernel, inputs)
 
+    def measure(self) -> None:
+        """Launch what finds the figures of the last solve, which `report` returns."""
+        self._reporting.run()
+        self._report.changed()
+
     def report(self, mass: float) -> Row:
-        """Return figures of the last solve; collective.
+        """Return figures of the last solve, after `measure`; collective.
 
         yielded: share of the cells that carry shear whose friction is at its bound; dissipation: what friction takes, never negative but
         for the solve's residual [J; J/m in 2-D]; predicted_excess: by how much a cell's fraction would exceed 1 after the step, at most.
@@ -59,8 +64,6 @@ class SandReport:
         Args:
             mass: of a full cell [kg; kg/m in 2-D].
         """
-        self._reporting.run()
-        self._report.changed()
         cells, yielded, taken, most = self._found()
         return {"yielded": yielded / max(cells, 1.0), "dissipation": taken * mass, "predicted_excess": most}
 

@@ -13,6 +13,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.coupled import METHODS
+from warp_lcp.granular.front import Front
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import SandReport
 from warp_lcp.granular.scene import SandScene
@@ -38,6 +39,7 @@ from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.rigid.body import PLANAR
+from warp_lcp.rows.joined import joined
 from warp_lcp.rows.program import LaunchGraph, copy
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, missed_by_far
@@ -80,7 +82,9 @@ class SandSimulation(ParticleSimulation):
         """Allocate the fields and find the sand's cells."""
         self.method = METHODS[scene.solver.method]()
         self._at_rest = scene.particles.per_axis**grid.dimension
+        self._percentiles = Front(grid.device) if grid.device.is_cuda and not self.shared else None
         super().__init__(scene, grid, parts, particles, **more)
+        self.measure_particles()
         self._start = self._front()[0]
         self.mark()
 
@@ -96,6 +100,7 @@ class SandSimulation(ParticleSimulation):
         self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress, self.outcome = self._stresses(box=box, rate=rate, bodies=self.carried)
+        self._work = self.method.init(self.stress)
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
 
@@ -150,30 +155,43 @@ class SandSimulation(ParticleSimulation):
             SimulationFailed: something is not finite, or a particle has left the domain.
             ValueError: dt is not positive.
         """
+        with joined(self.grid.device):
+            return self._step(dt)
+
+    def _step(self, dt: float) -> Row:
+        """Advance by dt [s]."""
         before = self.begin_step(dt)
         window = self.window(before)
         self.particles_to_grid(window)
         solved = self._solve(window, dt)
-        measured = self._measured()
+        self._measure_stresses()
         self.extrapolate_velocity(window, self.outcome.known, self.packing.kind, self.outcome.contact)
         if self.sources is not None:
             self.sources.hold(self.velocity, [], self.packing.kind)
         self.grid_to_particles(window, self.packing.kind, dt)
         below, most = self._mass_below(), self._most()
-        row = self.move(dt, window)
+        row = self.move(dt, window) | self._measured()
         self._place_solids()
         runout, height = self._front()
         rate = self._flow_rate(below, row, dt)
-        return self.logged(
-            row | solved | measured | {"max_fraction": most, "runout": runout - self._start, "height": height, "flow_rate": rate}
-        )
+        return self.logged(row | solved | {"max_fraction": most, "runout": runout - self._start, "height": height, "flow_rate": rate})
+
+    def _measure_stresses(self) -> None:
+        """Launch what the log alone wants to know of the stresses."""
+        if self.scene.output.diagnostics:
+            with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
+                self.outcome.measure()
 
     def _measured(self) -> Row:
         """Return what the log alone wants to know of the stresses."""
         if not self.scene.output.diagnostics:
             return {}
-        with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
-            return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
+        return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
+
+    def measure_particles(self) -> None:
+        """Launch the percentiles of runout and height, on CUDA."""
+        if self._percentiles is not None:
+            self._percentiles.find(self.particles, percentile_place(self.particles.count))
 
     def known_density(self) -> wp.array | None:
         """Return the density from which the packing was computed."""
@@ -293,7 +311,7 @@ class SandSimulation(ParticleSimulation):
         """
         solver = self.scene.solver
         stopping = wl.StoppingCriteria(rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations)
-        return wl.solve(self.stress, self.method, stopping=stopping)
+        return wl.solve(self.stress, self.method, stopping=stopping, workspace=self._work)
 
     def _solve(self, window: Window, dt: float) -> Row:
         """Solve for the stresses and take over the velocity that they leave; return what the log wants to know of the solve."""
@@ -306,6 +324,9 @@ class SandSimulation(ParticleSimulation):
                 self.sources.hold(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()
+        if self.grid.device.is_cuda and self.flights is not None and self.sources is None and not self.shared:
+            with self.watch.stage("bodies in flight", packing.kind):  # whose number comes with what the solve has to tell
+                self.flights.find(window, self.weights, packing.kind)
         impulse = self.kick_dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
         growth = scene.growth(self.grid.spacing, self.kick_dt)
         bound = YieldSet(scene.slope, scene.intercept * impulse, scene.material.tensile_strength * impulse, **growth)
@@ -392,6 +413,8 @@ class SandSimulation(ParticleSimulation):
 
     def _front(self) -> tuple[float, float]:
         """Return the 99th percentile of x and of y [m]."""
+        if self._percentiles is not None:
+            return self._percentiles.read()
         position = self.particles.position.numpy()
         if not len(position):
             return 0.0, 0.0

@@ -15,19 +15,29 @@ from warp_lcp.granular.cut_walls import WALL_FACE
 from warp_lcp.granular.fields import StressFields, VelocityFields
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.solids import Walls
-from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, momentum_kernel, stress_passes
+from warp_lcp.granular.stress_kernels import (
+    BETA_X,
+    NEXT_X,
+    PERIOD,
+    RESIDUAL_X,
+    REST,
+    SHARE,
+    STATE,
+    momentum_kernel,
+    numbers_kernel,
+    stress_passes,
+)
 from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
 from warp_lcp.grid.staggered import three_components
 from warp_lcp.rows import Rows
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy
+from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch, launch_now
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import renamed_method
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
 MOST_MOMENTUM = 0.985  # unless a method wants less
 GROWN = 1.5  # of the time for which forces act in a step: its stresses are no guess to trust
-SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds the natural residual: measured
 
 
 @dataclass(frozen=True)
@@ -75,7 +85,7 @@ class Velocity:
         """Return the fields as kernels take them."""
         return VelocityFields(*[*three_components(self.u), *three_components(self.edge), self.openings])
 
-    def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
+    def find(self, stress: wp.array, *, launch: Launch = launch_now, bodies: SandBodies | None = None, respond: bool = False) -> None:
         """Compute velocity and rates of strain under a field of stresses.
 
         Args:
@@ -141,22 +151,23 @@ class Stress(wl.VariationalInequality):
         self.now, self._before, self._point = (wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(3))
         self.velocity, self.checked = (Velocity(packing, real, box=box, rate=rate) for real in (wp.float32, wp.float64))
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
-        self._momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
+        self.momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
-        self._total = self._sums  # of all who have a part of the stresses
+        self.total = self._sums  # of all who have a part of the stresses
         threads = int(np.prod(packing.grid.shape[:2])) * packing.counted.cells.chunks
         self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
         self._wall_sums: Reduction | None = None
-        self._host, self._host_momentum = self.numbers.numpy(), self._momentum.numpy()  # on the CPU the memory of both
+        self._host, self._host_momentum = self.numbers.numpy(), self.momentum.numpy()  # on the CPU the memory of both
         self._program: Program | None = None  # of an accelerated step
         self._check: Program | None = None  # of the residual
-        self._cells = 1
+        self._cells: int | None = 1  # None: nobody has asked since `begin`
+        self._yields = [Scalar() for _ in range(NUMBERS - 3)]  # of `numbers_kernel`
         self.last_residual = 0.0, 0.0
         self.kick_dt, self.cold = 0.0, True
         self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # as before `begin`
         self._ratio = Scalar()  # of the time for which forces act to that in the last step
         self._admitting, self._restarting = (
-            LaunchGraph(grid.device, record, at_once=self.shared) for record in (self._launch_admission, self._launch_restart)
+            LaunchGraph(grid.device, record, at_once=self.shared) for record in (self._launch_admission, self.start_from_now)
         )
         self.set_walls(walls)
 
@@ -181,12 +192,12 @@ class Stress(wl.VariationalInequality):
             kick_dt: time for which forces act in it [s]; stresses are impulses and are rescaled from the last step's pressure.
         """
         self._last_kick = self.kick_dt
-        self._host[:] = (
-            bound.k, bound.cohesion, bound.tension, *(gravity * kick_dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing, bound.gain,
-            bound.halfway,
-        )  # fmt: skip
-        self._upload(self.numbers, self._host)
-        self._cells = max(self._count(), 1)
+        before = bound.k, bound.cohesion, bound.tension, *map(float, gravity * kick_dt)
+        after = dt / self.packing.grid.spacing, bound.gain, bound.halfway
+        self._host[:] = *before, 1.0, 1.0, 0.0, *after
+        for number, value in zip(self._yields, (*before, *after), strict=True):
+            number.value = value
+        self._cells = max(self._count(), 1) if self.shared else None
         self.cold = kick_dt > GROWN * self.kick_dt
         self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
         self._admitting.run()
@@ -195,6 +206,8 @@ class Stress(wl.VariationalInequality):
     def _launch_admission(self) -> None:
         """Launch what makes the last stresses those of the new packing: rescaled, 0 where it admits none, without the checkerboard."""
         p, sand, stresses = self.packing, self.packing.fields, self._fields
+        if p.grid.device.is_cuda:  # on the CPU they are the host's memory
+            launch(numbers_kernel, 1, [self.numbers, *self._yields], device=p.grid.device)
         copy(self._last, self.now)
         self.walls.activate(p.flags)
         p.counted.run(self.velocity.passes.admit, sand, stresses, ratio=self._ratio)
@@ -206,6 +219,13 @@ class Stress(wl.VariationalInequality):
     def _count(self) -> int:
         """Return how many cells hold sand."""
         return self.packing.sand_cells
+
+    @property
+    def cells(self) -> int:
+        """Number of cells that hold sand, at least 1; may wait for the device."""
+        if self._cells is None:
+            self._cells = max(self._count(), 1)
+        return self._cells
 
     def _upload(self, array: wp.array, host: np.ndarray) -> None:
         """Copy the host's numbers to an array; on the CPU they are its memory."""
@@ -226,28 +246,33 @@ class Stress(wl.VariationalInequality):
             lookahead: where the gradient is taken, in units of the momentum's displacement.
             momentum: the most of the last step that is repeated, at first.
         """
-        self._host[[PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD]] = pressure_step, shear_step, lookahead
+        self.set_steps(pressure_step, shear_step, lookahead)
         self._upload(self.numbers, self._host)
         state = self._host_momentum
         state[:] = 0.0
         state[[BETA_X, BETA_X + 1]] = momentum
         state[[NEXT_X, NEXT_X + 1]] = 0.25
         state[REST] = 1.0 - MOST_MOMENTUM
-        self._upload(self._momentum, state)
+        self._upload(self.momentum, state)
         self._restarting.run()
+
+    def set_steps(self, pressure_step: float, shear_step: float, lookahead: float) -> None:
+        """Set the host's copy of the lengths of steps, see `restart`, and the bodies' response to steps so long."""
+        self._host[[PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD]] = pressure_step, shear_step, lookahead
         if self.bodies is not None:
             self.bodies.prepare(self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step)
 
-    def _launch_restart(self) -> None:
+    def start_from_now(self) -> None:
+        """Launch or record what makes the stresses those before, and those at which the gradient is taken."""
         for stress in (self._point, self._before):
             copy(stress, self.now)
 
     def limit_momentum(self, momentum: float) -> None:
         """Limit all later momenta to `momentum`."""
-        state = self._momentum.numpy().copy()
+        state = self.momentum.numpy().copy()
         state[BETA_X : NEXT_X + 2] = np.minimum(state[BETA_X : NEXT_X + 2], momentum)
         state[REST] = 1.0 - momentum
-        self._momentum.assign(state)
+        self.momentum.assign(state)
 
     face = renamed_method("face", set_walls)
     take_back = renamed_method("take_back", roll_back)
@@ -258,15 +283,20 @@ class Stress(wl.VariationalInequality):
 
         See `PERIOD`; the steps have momentum.
         """
+        program = self.period()
+        for _ in range(periods):
+            program.run()
+        pressure, friction = self.momentum.numpy()[[RESIDUAL_X, RESIDUAL_X + 1]]
+        pressure, friction = pressure / self._host[PRESSURE_STEP], SHARE * friction / self._host[SHEAR_STEP]
+        return float(1.0 / math.sqrt(self.cells) * math.sqrt(pressure * pressure + friction * friction))
+
+    def period(self) -> Program:
+        """Return the program of `PERIOD` steps with momentum, of the walls as they are."""
         if self._program is None:
             self._program = Program(self.packing.grid.device)
             for step in range(PERIOD):
                 self._record(step, self._program.launch)
-        for _ in range(periods):
-            self._program.run()
-        pressure, friction = self._momentum.numpy()[[RESIDUAL_X, RESIDUAL_X + 1]]
-        scale = 1.0 / math.sqrt(self._cells)
-        return scale * math.hypot(pressure / self._host[PRESSURE_STEP], SHARE * friction / self._host[SHEAR_STEP])
+        return self._program
 
     def _record(self, step: int, launch: Launch) -> None:
         self.velocity.find(self._point, launch=launch, bodies=self.bodies)
@@ -278,24 +308,32 @@ class Stress(wl.VariationalInequality):
     def _end_step(self, step: int, launch: Launch) -> None:
         """Add up what a step of a period has found, and choose the momentum of the next but one."""
         self._add_up(launch)
-        self._choose_momentum(self._total, launch)
+        self._choose_momentum(self.total, launch)
 
     def _choose_momentum(self, sums: wp.array, launch: Launch) -> None:
-        launch(momentum_kernel, 1, [sums, self._momentum], device=self.packing.grid.device)
+        launch(momentum_kernel, 1, [sums, self.momentum], device=self.packing.grid.device)
 
     def residual(self) -> tuple[float, float]:
         """Return the natural residual of pressure and friction [m/s], in float64.
 
         Root mean squares over the cells that hold sand.
         """
+        self.check().run()
+        sums = self.total.numpy()
+        return self.take_residual(sums[0], sums[1] + sums[COLUMNS])
+
+    def check(self) -> Program:
+        """Return the program that leaves the sums of the residual in `total`."""
         if self._check is None:
             self._check = Program(self.packing.grid.device)
             self.checked.find(self.now, launch=self._check.launch, bodies=self.bodies, respond=True)
             self._project(self.checked, self._check.launch)
             self._add_up(self._check.launch)
-        self._check.run()
-        sums = self._total.numpy()
-        self.last_residual = math.sqrt(sums[0] / self._cells), math.sqrt((sums[1] + sums[COLUMNS]) / self._cells)
+        return self._check
+
+    def take_residual(self, pressure: float, friction: float) -> tuple[float, float]:
+        """Return the residual whose sums of squares a device has found [m/s]."""
+        self.last_residual = math.sqrt(pressure / self.cells), math.sqrt(friction / self.cells)
         return self.last_residual
 
     def _project(self, velocity: Velocity, launch: Launch) -> None:
@@ -312,7 +350,7 @@ class Stress(wl.VariationalInequality):
 
     @property
     def _fields(self) -> StressFields:
-        return StressFields(self.now, self._before, self._point, self._momentum, self.numbers)
+        return StressFields(self.now, self._before, self._point, self.momentum, self.numbers)
 
     def _add_up(self, launch: Launch) -> None:
         self._cell_sums.add_up(0, COLUMNS, launch=launch)

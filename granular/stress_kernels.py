@@ -1,6 +1,8 @@
 # mypy: ignore-errors
 """Passes of the coupled pressure and friction of sand: projected steps on the stresses of `granular.yield_set`, 2-D and 3-D.
 
+And the momentum of these steps, and the decisions by which a device takes them without its host, see `granular.stress_ahead`.
+
 And what damps the pattern that exerts no force: a checkerboard in the pressure and one in the shear balance each other on every face. Noise
 in the fraction feeds it and no equation takes it away. Where p = (-1)^(i + j), the shear stress with -p at a cell's low-low corner, +p at
 the two mixed ones and -p at high-high cancels grad p; in 3-D half of that on the edges of each shear does. So a part of what alternates of
@@ -15,7 +17,21 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.granular.yield_set import COLUMNS, CONSTANTS, F64
+from warp_lcp.granular.yield_set import (
+    COHESION,
+    COLUMNS,
+    CONSTANTS,
+    F64,
+    FRICTION,
+    GAIN,
+    HALFWAY,
+    LOOKAHEAD,
+    PRESSURE_STEP,
+    SHEAR_STEP,
+    STEP_OF_CELL,
+    TENSION,
+    WEIGHT,
+)
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.compiler import forward_kernel
 
@@ -75,3 +91,133 @@ def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.f
     for block in range(2):
         state[NOW_X + block] = state[NEXT_X + block]
         state[NEXT_X + block] = wp.min(state[BETA_X + block], (count + wp.float64(1.0)) / (count + wp.float64(4.0)))
+
+
+# Decisions of a solve. Steps: taken, when the estimate was best, when it or the momentum last changed, to be taken at least, at most.
+DONE, BEST_AT, CHANGED, LEAST, MOST = 0, 1, 2, 3, 4
+BEST, AIM, STILL = 5, 6, 7  # [m/s]: least estimate, what it is to fall below, below which `LEAST` does not count
+LIMITS, DUE, STAGNATES = 8, 9, 10  # limits of the momentum used; whether the residual is due; whether progress has ended
+FIRST, LAST, DECISIONS = 11, 13, 15  # sums of squares of pressure's and friction's residual: at the start, after the last steps
+BETTER, NEAR_BEST = 0.95, 1.2  # of the best estimate: progress, and where a solve that stagnates may end
+NOTHING = 1e-3  # of the tolerance: nothing to solve, as in free fall
+STILL_SHARE = 1e-2  # of the tolerance, which leaves sand at rest
+TIGHTER = 0.8  # the aim after a residual was due, should the estimate have been too good
+SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds the natural residual: measured
+SAFELY = 1.0 + 1e-9  # the host computes the norm again
+f32s, f64s, i32s = wp.array(dtype=wp.float32), wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
+
+
+@wp.kernel(enable_backward=False, module="granular.momentum")
+def numbers_kernel(
+    numbers: f32s, k: float, cohesion: float, tension: float, x: float, y: float, z: float, step: float, gain: float, halfway: float
+):
+    """Write what the kernels of a time step read, before a method sets its steps; see `granular.yield_set`."""
+    numbers[FRICTION] = k
+    numbers[COHESION] = cohesion
+    numbers[TENSION] = tension
+    numbers[WEIGHT] = x
+    numbers[WEIGHT + 1] = y
+    numbers[WEIGHT + 2] = z
+    numbers[PRESSURE_STEP] = 1.0
+    numbers[SHEAR_STEP] = 1.0
+    numbers[LOOKAHEAD] = 0.0
+    numbers[STEP_OF_CELL] = step
+    numbers[GAIN] = gain
+    numbers[HALFWAY] = halfway
+
+
+@wp.func
+def limit(state: f64s, momentum: wp.float64):
+    """Limit all later momenta."""
+    for i in range(BETA_X, NEXT_X + 2):
+        state[i] = wp.min(state[i], momentum)
+    state[REST] = wp.float64(1.0) - momentum
+
+
+@wp.kernel(enable_backward=False, module="granular.momentum")
+def keep_sums_kernel(sums: f64s, decisions: f64s, place: int):
+    """Keep the sums of a residual: of pressure, of friction in cells and on walls."""
+    decisions[place] = sums[0]
+    decisions[place + 1] = sums[1] + sums[COLUMNS]
+
+
+@wp.kernel(enable_backward=False, module="granular.momentum")
+def begin_steps_kernel(
+    sums: f64s, counted: f64s, numbers: f32s, state: f64s, decisions: f64s, going: i32s, pressure_step: float, shear_step: float,
+    lookahead: float, momentum: wp.float64, most_momentum: wp.float64, limit_: wp.float64, tolerance: wp.float64, least: wp.float64,
+    still: wp.float64, most: wp.float64,
+):  # fmt: skip
+    """Begin the steps of a solve whose residual at the start is known, as `coupled.MomentumWorkspace.start` does."""
+    numbers[PRESSURE_STEP] = pressure_step
+    numbers[SHEAR_STEP] = shear_step
+    numbers[LOOKAHEAD] = lookahead
+    for i in range(STATE):
+        state[i] = wp.float64(0.0)
+    for block in range(2):
+        state[BETA_X + block] = momentum
+        state[NEXT_X + block] = wp.float64(0.25)
+    state[REST] = wp.float64(1.0) - most_momentum
+    if wp.isfinite(limit_):
+        limit(state, limit_)
+    decisions[FIRST] = sums[0]
+    decisions[FIRST + 1] = sums[1] + sums[COLUMNS]
+    norm = wp.sqrt((decisions[FIRST] + decisions[FIRST + 1]) / wp.max(counted[0], wp.float64(1.0)))
+    wanted = least
+    if norm <= wp.float64(NOTHING) * tolerance:
+        wanted = wp.float64(0.0)
+    decisions[DONE] = wp.float64(0.0)
+    decisions[BEST_AT] = wp.float64(0.0)
+    decisions[CHANGED] = wp.float64(0.0)
+    decisions[LEAST] = wanted
+    decisions[MOST] = most
+    decisions[BEST] = wp.float64(wp.inf)
+    decisions[AIM] = tolerance
+    decisions[STILL] = still
+    decisions[LIMITS] = wp.float64(0.0)
+    decisions[DUE] = wp.float64(0.0)
+    decisions[STAGNATES] = wp.float64(0.0)
+    steps = wanted > wp.float64(0.0) or norm > tolerance * wp.float64(SAFELY)
+    going[0] = wp.where(steps and most > wp.float64(0.0) and wp.isfinite(norm), 1, 0)
+
+
+@wp.kernel(enable_backward=False, module="granular.momentum")
+def resume_steps_kernel(decisions: f64s, going: i32s):
+    """Go on after a residual that has missed the tolerance."""
+    decisions[DUE] = wp.float64(0.0)
+    decisions[STAGNATES] = wp.float64(0.0)
+    going[0] = 1
+
+
+@wp.kernel(enable_backward=False, module="granular.momentum")
+def decide_kernel(
+    counted: f64s, numbers: f32s, state: f64s, decisions: f64s, limits: f64s, going: i32s, check: int, patience: int, wait: int
+):
+    """Decide after a period of steps whether the host is to look at the residual, as `coupled.MomentumWorkspace.judge` does."""
+    done = decisions[DONE] + wp.float64(PERIOD)
+    decisions[DONE] = done
+    if done % wp.float64(check) != wp.float64(0.0):
+        return
+    pressure = state[RESIDUAL_X] / wp.float64(numbers[PRESSURE_STEP])
+    friction = wp.float64(SHARE) * state[RESIDUAL_X + 1] / wp.float64(numbers[SHEAR_STEP])
+    scale = wp.float64(1.0) / wp.sqrt(wp.max(counted[0], wp.float64(1.0)))
+    estimate = scale * wp.sqrt(pressure * pressure + friction * friction)
+    stagnates = bool(False)
+    if estimate < wp.float64(BETTER) * decisions[BEST]:
+        decisions[BEST] = estimate
+        decisions[BEST_AT] = done
+        decisions[CHANGED] = done
+    else:
+        late = done - decisions[BEST_AT] >= wp.float64(patience) and estimate < wp.float64(NEAR_BEST) * decisions[BEST]
+        stagnates = late or not wp.isfinite(estimate)
+        used = int(decisions[LIMITS])
+        if used < limits.shape[0] and done - decisions[CHANGED] >= wp.float64(wait) and estimate > decisions[AIM]:
+            limit(state, limits[used])
+            decisions[LIMITS] = wp.float64(used + 1)
+            decisions[CHANGED] = done
+    early = done < decisions[LEAST] and estimate > decisions[STILL]
+    due = stagnates or not (estimate > decisions[AIM] or early)
+    if due:
+        decisions[AIM] = wp.float64(TIGHTER) * decisions[AIM]
+    decisions[DUE] = wp.where(due, wp.float64(1.0), wp.float64(0.0))
+    decisions[STAGNATES] = wp.where(stagnates, wp.float64(1.0), wp.float64(0.0))
+    going[0] = wp.where(due or done >= decisions[MOST], 0, 1)

@@ -38,7 +38,7 @@ class SharedStress(Stress):
     def __init__(self, part: Subdomain, packing: Packing, walls: Walls, **more: Any) -> None:
         self._part = part
         super().__init__(packing, walls, **more)
-        self._total, self._nothing = wp.zeros_like(self._sums), wp.zeros_like(self._sums)
+        self.total, self._nothing = wp.zeros_like(self._sums), wp.zeros_like(self._sums)
         self._found = np.zeros((PERIOD, 2 * COLUMNS))  # by the steps of a period on this rank
 
     def begin(self, *arguments: Any) -> None:
@@ -58,7 +58,7 @@ class SharedStress(Stress):
         last = step == PERIOD - 1
         if last:
             perform(self._share_period, launch)
-        self._choose_momentum(self._total if last else self._nothing, launch)
+        self._choose_momentum(self.total if last else self._nothing, launch)
 
     def _keep(self, step: int) -> None:
         self._found[step] = self._sums.numpy()
@@ -70,11 +70,11 @@ class SharedStress(Stress):
         found[:, 6:] = np.sqrt(found[:, 6:])
         total = found.sum(axis=0)
         total[6:] **= 2  # of which the momentum takes the roots
-        self._total.assign(np.concatenate([total, np.zeros(COLUMNS)]))
+        self.total.assign(np.concatenate([total, np.zeros(COLUMNS)]))
 
     def _add_up(self, launch: Launch) -> None:
         super()._add_up(launch)
         perform(self._share_sums, launch)
 
     def _share_sums(self) -> None:
-        self._total.assign(self._part.ranks.sum(self._sums.numpy()))
+        self.total.assign(self._part.ranks.sum(self._sums.numpy()))

@@ -16,7 +16,7 @@ from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import exchange, exchanging
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Launch, Task
+from warp_lcp.rows.program import Launch, Task, launch_now
 
 
 class Halo:
@@ -156,7 +156,7 @@ class Gathering:
             return Task(partial(self.collect, mine, whole))
         return Task(partial(self.collect, mine, whole), partial(exchanging, self._forest, mine.numpy(), whole.numpy()))
 
-    def take(self, whole: wp.array[Any], mine: wp.array[Any], launch: Launch = wp.launch) -> None:
+    def take(self, whole: wp.array[Any], mine: wp.array[Any], launch: Launch = launch_now) -> None:
         """Write this rank's part of the whole grid's field to its own, ghost cells too."""
         given = [whole.reshape(self._whole), mine.reshape(self._shape), *self._low]
         launch(take_kernel, self._shape[:2], given, device=mine.device)

@@ -367,6 +367,7 @@ class ParticleSimulation(ParticleCheckpoints):
             with self.watch.stage("narrow band", self.band.depth, *self.velocity):
                 self.band.carry(self.velocity, dt)
         exchanged = self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
+        self.measure_particles()
         after = self.checked_totals("after")
         stopped, pushed, stuck = self.met()
         rearranged: Row = {"max_density": self.rearrangement.max_density}
@@ -376,12 +377,16 @@ class ParticleSimulation(ParticleCheckpoints):
             rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, dt, self.watch, fill, contact)
             if self.outlets is not None:  # the density correction may push particles out through open sides
                 exchanged["departed"] += self._remove_departed(self.outlets)
+            self.measure_particles()
             after = self.checked_totals("after the density correction of")
         self.particles.totals_stay(True)
         self.time += dt
         self.step_count += 1
         self.last_dt = dt
         return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
+
+    def measure_particles(self) -> None:
+        """Launch what the log wants to know of the particles besides their totals, with which it is read."""
 
     def carry(self, dt: float) -> None:
         """Move particles and solids by dt [s]; bodies in flight keep their momenta."""

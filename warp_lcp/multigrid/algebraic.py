@@ -25,7 +25,7 @@ from warp_lcp.operators.compressed_rows import RowEntries
 from warp_lcp.operators.sparse import GATHER, PRODUCT, SparseOperator
 from warp_lcp.rows import Bound, KernelFile, Rows
 from warp_lcp.rows.fields import kept, zeros
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.program import Launch, Program, launch_now
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/algebraic.h")
 FILL = KERNELS["algebraic.fill"]
@@ -143,7 +143,7 @@ class AlgebraicHierarchy:
         ).launch()  # fmt: skip
         self._coarsening.run()
 
-    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """q = M p, on the finest level."""
         self.levels[0].A.product(p, q, launch)
 

@@ -16,7 +16,7 @@ from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import Layout, check_storable, checked_device, real_array
 from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Across, Reduction, add_across
 
@@ -131,7 +131,7 @@ class BlockColumns:
         return self.rows.numpy()[:n], self.blocks.numpy()[:n], self.values.numpy()[: n * self.width].reshape(n, self.width)
 
     def gather(
-        self, x: wp.array[Any], *, mask: wp.array[Any] | None = None, fused: bool = True, launch: Launch = wp.launch,
+        self, x: wp.array[Any], *, mask: wp.array[Any] | None = None, fused: bool = True, launch: Launch = launch_now,
     ) -> wp.array[Any]:  # fmt: skip
         """Write U'x to `sums`, and return that; x is a flat stored field, taken for 0 where `mask` is; `fused` as of `scatter`."""
         out = self.sums if self._reduction is None else self._reduction.partials
@@ -144,7 +144,7 @@ class BlockColumns:
 
     def scatter(
         self, factors: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None,
-        sign: float = 1.0, fused: bool = True, launch: Launch = wp.launch,
+        sign: float = 1.0, fused: bool = True, launch: Launch = launch_now,
     ) -> None:  # fmt: skip
         """out = base + sign U f on U's rows; other rows of `out` stay as they are, and so do those where `mask` is 0.
 
@@ -285,7 +285,7 @@ class LowRankOperator(Pickled):
 
     def add(
         self, x: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None, transposed: bool = False,
-        launch: Launch = wp.launch,
+        launch: Launch = launch_now,
     ) -> None:  # fmt: skip
         """Evaluate out = base + U W U' x on U's rows where `mask` is not 0.
 

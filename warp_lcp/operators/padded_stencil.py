@@ -20,7 +20,7 @@ from warp_lcp.rows import Bound, KernelFile, Rows
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.layout import Pattern, check_memory, put, stencil_struct
-from warp_lcp.rows.program import Launch, Task
+from warp_lcp.rows.program import Launch, Task, launch_now
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 PRODUCT = KERNELS["stencil.product"]
@@ -161,7 +161,7 @@ class PaddedStencil:
         """Whether ghost cells must be filled before each product."""
         return any(self.periodic) or self.ghosts is not None
 
-    def wrap(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def wrap(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Fill x's ghost cells along periodic axes, and those that stand for cells of others."""
         for filling in self.fillings(x):
             filling.launch(launch)
@@ -178,7 +178,7 @@ class PaddedStencil:
         """The ghost cells before the first of each axis."""
         return [Rows.edge(self.padding, self.device, axis) for axis in range(3)]
 
-    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
+    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = launch_now) -> None:
         """out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
         self.wrap(x, launch=launch)
         PRODUCT.bind(self.rows, stencil=self, x=x, b=plus, y=out).launch(launch)

@@ -20,7 +20,7 @@ from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import Layout, check_kept, check_storable, checked_device, kept, real_array, relative_rounding, zeros, zeros_like
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import Sums
 
 INDICES = wp.array(dtype=wp.int32)
@@ -204,7 +204,7 @@ class SparseOperator(Pickled):
         """Evaluate out = A x + b in one pass; fields of one type."""
         self.product(x, out, plus=b)
 
-    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
+    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = launch_now) -> None:
         """Evaluate out = A x, or A x + plus; launches kernels only."""
         PRODUCT.bind(Rows.flat(x.size, self.device), self._rows, x=x, plus=plus, y=out).launch(launch)
 
@@ -278,7 +278,7 @@ class SparseOperator(Pickled):
 
     def relax(
         self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True, colored: bool | None = None,
-        launch: Launch = wp.launch,
+        launch: Launch = launch_now,
     ) -> None:  # fmt: skip
         """Sweep x once, each unknown projected onto its bounds.
 

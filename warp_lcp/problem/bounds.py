@@ -15,7 +15,7 @@ from warp_lcp.problem.affine_bounds import affine_fields
 from warp_lcp.problem.pickling import OnHost
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import LARGE, Array, Layout, nothing, overwrite, real_array
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import Sums
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
@@ -126,7 +126,7 @@ class Bounds:
             self.encode()
             self.code = self._no_code if self._other_values() else self._memory
 
-    def encode(self, launch: Launch = wp.launch) -> None:
+    def encode(self, launch: Launch = launch_now) -> None:
         """Launch the coding of fields that are in place; `stays` then tells, and waits for the device."""
         if not self.in_place:
             return

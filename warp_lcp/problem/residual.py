@@ -19,7 +19,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.problem.scale import estimated_scale
 from warp_lcp.rows import KernelFile, Known, Rows
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Sums
 
@@ -86,7 +86,7 @@ class NaturalResidual:
             self.rescale()
         self.project(x, keep=keep)
 
-    def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = wp.launch) -> None:
+    def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = launch_now) -> None:
         """Launch the projection of x onto the bounds, or of 0, as `start` does."""
         p = self.problem
         for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
@@ -143,7 +143,7 @@ class NaturalResidual:
         """||b||^2 over the unknowns as last launched, in the first entry."""
         return self._sums.reading
 
-    def launch_square_of_b(self, launch: Launch = wp.launch) -> None:
+    def launch_square_of_b(self, launch: Launch = launch_now) -> None:
         """Launch the evaluation of `square_of_b`."""
         self._sums.launch(UNKNOWN_SQUARE, launch=launch, b=self.problem.b, unknown=self.problem.unknown)
 

@@ -22,7 +22,7 @@ from warp_lcp.problem.residual import EPS, NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria, limit_of_steps
 from warp_lcp.rows.fields import Array
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import convert
 
 SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squares that float64 holds
@@ -187,7 +187,7 @@ class IterateMemory:
         if self._best is not None:
             self.problem.layout.copy(self.x, self._best)
 
-    def round_iterate(self, *, launch: Launch = wp.launch) -> None:
+    def round_iterate(self, *, launch: Launch = launch_now) -> None:
         """Round x to its precision."""
         self._round(self.x, launch=launch)
 
@@ -209,7 +209,7 @@ class IterateMemory:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
 
-    def _round(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def _round(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
         if self._rounded is not None:
             convert(x, self._rounded, launch=launch)
             convert(self._rounded, x, launch=launch)
@@ -342,10 +342,26 @@ class _Loop:
         if x0 is not None:
             self.work.x.assign(x0)
         self.warm = True
-        self._refer()
+        self._refer(self._begun_in_place())
         self._record(0, Step("start", 0))
         self._keep(0)
         return None if math.isfinite(self.reference) else SolveStatus.NON_FINITE
+
+    def _begun_in_place(self) -> float | None:
+        """Begin on the device where the iterate is; return the residual there, None where it has not begun."""
+        work: Any = self.work
+        return work.begin_ahead(None, self.criteria) if self._lets_device_lead(work) else None
+
+    def _lets_device_lead(self, work: Any) -> bool:
+        """Tell a workspace how many steps its device may take without the host; return whether it may take any.
+
+        With a callback, merits or a deadline the host takes each step.
+        """
+        if not hasattr(work, "begin_ahead"):
+            return False
+        watched = self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
+        work.allow(0 if watched else self.stopping.max_iterations)
+        return not watched
 
     def _refer(self, reference: float | None = None) -> None:
         """Take the residual at the start that tolerances refer to; None: that of the iterate."""
@@ -448,7 +464,7 @@ class _LoopInBox(_Loop):
     def _begin(self, x0: Array | None) -> SolveStatus | None:
         """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
         work: Any = self.work
-        if hasattr(work, "begin_ahead") and self._begin_ahead(work, x0):
+        if self._lets_device_lead(work) and self._begin_ahead(work, x0):
             return None
         x, residual = self.work.x, self.residual
         guess = None if x0 is None else self._guess(x0)
@@ -480,10 +496,8 @@ class _LoopInBox(_Loop):
         return SolveStatus.INFEASIBLE if lost > self.tolerance else None
 
     def _begin_ahead(self, work: BeginsAhead, x0: Array | None) -> bool:
-        """Begin on the device; return whether it has begun. With a callback, merits or a deadline the host takes each step."""
-        watched = self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
-        work.allow(0 if watched else self.stopping.max_iterations)
-        if x0 is None or watched:
+        """Begin on the device; return whether it has begun."""
+        if x0 is None:
             return False
         reference = work.begin_ahead(self.problem.layout.load(x0, wp.float64, "x0"), self.criteria)
         if reference is None:

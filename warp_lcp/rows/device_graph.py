@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.rows.joined import settle, waits
 from warp_lcp.rows.layout import RowLayout, make_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
 from warp_lcp.rows.program import Conditional, DeviceCopy, Program, Task
@@ -244,11 +245,34 @@ class DeviceProgram(Program):
         """Return whether all rows have no more threads now than were captured."""
         return all(e <= r for memory, room in self._extents for e, r in zip(memory.extent, room, strict=True))
 
+    @property
+    def commands(self) -> list[Any]:
+        """What a graph of the program holds, in order."""
+        return self._commands
+
+    def captured(self, commands: list[Any]) -> Any:
+        """Return the graph of some launches."""
+        return self._captured(commands)
+
     def run(self) -> None:
-        """Launch the graph; the first time launch by launch, which loads the kernels."""
+        """Launch the graph, or have it wait for others, see `joined.py`; the first time launch by launch, which loads the kernels."""
+        settle(self)  # whose buffer is still to be read
         if self._buffer is not None:
             self._refresh()
+        if not waits(self):
+            self.launch_now()
+
+    def launch_now(self) -> None:
+        """Launch the graph with what its buffer holds."""
         super().run()
+        self._note_copy()
+
+    def note_launch(self) -> None:
+        """Take note that a joined graph has launched it."""
+        self._runs += 1
+        self._note_copy()
+
+    def _note_copy(self) -> None:
         if self._buffer is not None:
             self._copied = noted(self.device, self._copied)
 

@@ -63,6 +63,16 @@ class Launch(Protocol):
         """Launch the kernel now, or record its launch."""
 
 
+def launch_now(kernel: Any, dim: Any, inputs: Any, *, device: Any, **options: Any) -> Any:
+    """Launch a kernel by Warp; a default argument that holds `wp.launch` itself would pass by what waits, see `joined.py`."""
+    return wp.launch(kernel, dim, inputs, device=device, **options)
+
+
+def launch_graph(graph: Any) -> None:
+    """Launch a captured graph by Warp; likewise."""
+    wp.capture_launch(graph)
+
+
 @dataclass(frozen=True)
 class Task:
     """What the host does between launches: exchange with other processes, say.
@@ -75,7 +85,7 @@ class Task:
     function: Callable[[], object]
     operation: Callable[[], Operation] | None = None
 
-    def launch(self, launch: Launch = wp.launch) -> None:
+    def launch(self, launch: Launch = launch_now) -> None:
         """Do it now, or record it between the launches."""
         recorded = (is_recording() or isinstance(getattr(launch, "__self__", None), Program)) and team() is not None
         perform(self.operation() if recorded and self.operation else self.function, launch)
@@ -276,7 +286,7 @@ def _bytes_of(array: wp.array[Any]) -> int:
 class Program:
     """A sequence of kernel launches with fixed arguments.
 
-    Functions that launch take `launch: Launch = wp.launch`; handed `program.launch`, they record instead. On the CPU the team works through
+    Functions that launch take `launch: Launch = launch_now`; given `program.launch`, they record instead. On the CPU the team works through
     a table of them, on CUDA a graph is captured once the first run has loaded every kernel. Where the host has tasks between launches, see
     `perform`, there is a table or a graph for each stretch without one.
 
@@ -388,7 +398,7 @@ class Program:
             return partial(_run_while, condition.numpy(), Table(self._commands, condition))
         with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             wp.capture_while(condition, self._launch)
-        return partial(wp.capture_launch, capture.graph)
+        return partial(launch_graph, capture.graph)
 
     def _run_in_time(self) -> None:
         check_time()
@@ -406,7 +416,7 @@ class Program:
             if is_task:
                 made += [task.function for task in stretch]
             elif self.device.is_cuda:
-                made.append(partial(wp.capture_launch, self._captured(stretch)))
+                made.append(partial(launch_graph, self._captured(stretch)))
             elif all(isinstance(command, Operation) for command in stretch):
                 made.append(partial(run_table, Table(stretch)))
             else:

@@ -19,7 +19,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, make_struct, packed, put, stencil_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
 from warp_lcp.rows.native import HEADERS, sections, shared, text
-from warp_lcp.rows.program import Launch, device_program, is_recording, perform
+from warp_lcp.rows.program import Launch, device_program, is_recording, launch_now, perform
 from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, ranges, team
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
@@ -594,7 +594,7 @@ class Wave:
             raise ValueError(f"{name}: expected 1 to {LARGEST} passes, 0 and more planes behind the first")
         self.name, self.stages = name, stages
 
-    def launch(self, *passes: Bound | None, launch: Any = wp.launch) -> None:
+    def launch(self, *passes: Bound | None, launch: Any = launch_now) -> None:
         """Launch the passes, or record them; None leaves one out.
 
         Raises:

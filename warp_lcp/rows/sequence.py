@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import RowLayout, make_struct
-from warp_lcp.rows.program import Launch, perform
+from warp_lcp.rows.program import Launch, launch_now, perform
 from warp_lcp.rows.row_pass import Bound, Form
 
 CUDA_THREADS = 512  # of the block: with 1024 a thread has 64 registers, and passes spill up to 2 kB of what it holds
@@ -69,7 +69,7 @@ class Sequence:
             setattr(made, table, typed)
         return made
 
-    def launch(self, launch: Launch = wp.launch) -> None:
+    def launch(self, launch: Launch = launch_now) -> None:
         """Launch all passes, or record their launch."""
         if self.device.is_cuda:
             inputs = [self.tables, 0, len(self._stages), CUDA_THREADS]

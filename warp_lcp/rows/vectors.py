@@ -19,7 +19,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.native import HEADERS, text
-from warp_lcp.rows.program import Launch, Task, as_one_table, copy, is_recording
+from warp_lcp.rows.program import Launch, Task, as_one_table, copy, is_recording, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.team import Operation
@@ -106,7 +106,7 @@ def segments_of(n: int) -> int:
 
 def fold(
     kernel: wp.Kernel, partials: wp.array[wp.float64], n: Any, columns: int, out: wp.array[wp.float64], slot: int,
-    between: wp.array[wp.float64], launch: Launch = wp.launch, most: int | None = None, before: int = 0,
+    between: wp.array[wp.float64], launch: Launch = launch_now, most: int | None = None, before: int = 0,
 ) -> None:  # fmt: skip
     """Write to out[slot], out[slot + 1], ... what `add_up_kernel` or `largest_kernel` makes of columns of n partial results, on CUDA.
 
@@ -152,7 +152,7 @@ class Reduction:
         self.partials = zeros(columns * self.threads, wp.float64, device)
         self._folded = zeros(columns * segments_of(self.threads) if device.is_cuda else 0, wp.float64, device)
 
-    def add_up(self, slot: int, columns: int = 1, *, launch: Launch = wp.launch) -> None:
+    def add_up(self, slot: int, columns: int = 1, *, launch: Launch = launch_now) -> None:
         """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
         device = self.partials.device
         if device.is_cpu:  # Warp's tiles are not for several threads at a time
@@ -163,7 +163,7 @@ class Reduction:
         if self._across is not None:
             add_across(self._across, self.scalars, slice(slot, slot + columns), launch)
 
-    def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, rows: Rows | None = None, launch: Launch = wp.launch) -> None:
+    def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, rows: Rows | None = None, launch: Launch = launch_now) -> None:
         """Write the inner product a.b, over some rows if told, to scalars[slot]."""
         DOT.bind(rows or rows_of(a), a=a, b=b, out=self.partials).launch(launch)
         self.add_up(slot, launch=launch)
@@ -189,7 +189,7 @@ class Sums(Reduction):
             self._launch(declared, structs, given, slot, wp.launch)
         return self.reading.numpy()[slot : slot + len(declared.sums)]
 
-    def launch(self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, launch: Launch = wp.launch, **given: Any) -> None:
+    def launch(self, declared: RowPass, *structs: DataclassInstance, slot: int = 0, launch: Launch = launch_now, **given: Any) -> None:
         """Launch a pass, whose sums `reading` will have from a slot on, or record it."""
         self._launch(declared, structs, given, slot, launch)
 
@@ -282,7 +282,7 @@ class Tally:
         return np.array([part.sum() if c < sums else part.max(initial=-np.inf) for c, part in enumerate(parts)])
 
 
-def add_across(across: Across, scalars: wp.array[wp.float64], slots: slice, launch: Launch = wp.launch) -> None:
+def add_across(across: Across, scalars: wp.array[wp.float64], slots: slice, launch: Launch = launch_now) -> None:
     """Add what the others have summed, now or among the launches of a program."""
     operation = (lambda: across.adding(scalars.numpy()[slots])) if scalars.device.is_cpu else None
     Task(partial(_add_across, across, scalars, slots), operation).launch(launch)
@@ -301,7 +301,7 @@ def rows_of(field: wp.array[Any]) -> Rows:
     return Rows.flat(field.size, field.device)
 
 
-def convert(a: wp.array[Any], b: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+def convert(a: wp.array[Any], b: wp.array[Any], *, launch: Launch = launch_now) -> None:
     """b = a, between float types; types that differ may be recorded by `launch`."""
     if a.dtype is b.dtype:
         copy(b, a)

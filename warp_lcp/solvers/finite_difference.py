@@ -13,7 +13,7 @@ from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.rows import KernelFile
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
@@ -60,7 +60,7 @@ class FiniteDifferenceSystem(KrylovSystem):
         """Precondition: z = r / d."""
         SCALE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
-    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
         norm = self.norm(p)
         if norm == 0:
             q.zero_()

@@ -33,7 +33,7 @@ from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.program import Launch, Program, launch_now
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.dense_problem import equilibration, factored
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
@@ -229,7 +229,7 @@ class CoupledGridSystem(KrylovSystem):
         self._grid.apply()
         self._correction.end()
 
-    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
         self._grid.hierarchy.finest.stencil.product(p, q)
         self._low.add(p, q, q, mask=self._free)
 
@@ -349,7 +349,7 @@ class DiagonalSystem(KrylovSystem):
         """Precondition: z = r / d."""
         DIVIDE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
-    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
         shape = self._layout.stored_shape
         self._A.apply(p.reshape(shape), q.reshape(shape))
         MASK.bind(rows_of(q), free=self._free, shift=self._shift, direction=p, q=q).launch()

@@ -12,7 +12,7 @@ from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
@@ -166,7 +166,7 @@ class LowRankCorrection:
             lost = True
         return lost
 
-    def begin(self, *, launch: Launch = wp.launch) -> None:
+    def begin(self, *, launch: Launch = launch_now) -> None:
         """Before a cycle: take U S'^-1 Z'r off the hierarchy's finest right-hand side r."""
         if self._dots is None:
             return
@@ -177,7 +177,7 @@ class LowRankCorrection:
         launch(split_kernel, m, inputs, device=low.device)
         self._spread(-1.0, launch)
 
-    def end(self, *, launch: Launch = wp.launch) -> None:
+    def end(self, *, launch: Launch = launch_now) -> None:
         """After the cycle: correct the finest x, and put back what `begin` took."""
         if self._dots is None:
             return

@@ -22,7 +22,7 @@ from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.protocol import FLUID, HasStencil
 from warp_lcp.rows.fields import zeros
-from warp_lcp.rows.program import Launch
+from warp_lcp.rows.program import Launch, launch_now
 from warp_lcp.solvers.principal_system_guarded import GuardedSystem
 
 # symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
@@ -43,7 +43,7 @@ class SparsePreconditioner(Preconditioner, Protocol):
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take a free set and a shift."""
 
-    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """q = M p, on the device."""
 
 
@@ -135,7 +135,7 @@ class IncompleteFactors:
             self.weight.assign(np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0))
         self._solve = self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
 
-    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """q = M p, on the host."""
         q.assign(self._M @ p.numpy())
 

@@ -11,7 +11,7 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Step
-from warp_lcp.rows.program import Launch, LaunchGraph, Program
+from warp_lcp.rows.program import Launch, LaunchGraph, Program, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import CONVERT, rows_of
 from warp_lcp.solvers import principal_system_low_rank as coupling
@@ -46,12 +46,12 @@ class CoupledResidual(AssessedResidual):
         if self._low_version != self._low.version:
             self._low_version, self.stale = self._low.version, True
 
-    def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = wp.launch) -> None:
+    def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = launch_now) -> None:
         """Launch the projection of x, or of 0, onto the bounds; take b, off U's rows."""
         CONVERT.bind(rows_of(self._b), a=self.problem.b, b=self._b).launch(launch)
         super().project(x, keep=keep, launch=launch)
 
-    def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def assess(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Launch the evaluation, of b + U W U' x first, and correct the energy for that."""
         low = self._low
         low.add(x, self.problem.b, self._b, launch=launch)
@@ -59,7 +59,7 @@ class CoupledResidual(AssessedResidual):
         inputs = [low.columns.sums, low.weighed, low.rank, self.scalars]
         launch(coupling.subtract_energy_kernel, 1, inputs, device=low.device)
 
-    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Launch the step and the evaluation where it ends; U'x is needed between them."""
         self.update(x, direction, launch=launch)
         self.assess(x, launch=launch)
@@ -164,13 +164,13 @@ class CoupledWorkspace(MultigridWorkspace):
         program.extend(self.hierarchy.cycle)
         self._measure(launch=program.launch)
 
-    def _measure(self, *, launch: Launch = wp.launch) -> None:
+    def _measure(self, *, launch: Launch = launch_now) -> None:
         """Correct the cycle's z for the bodies, measure it and plan the step."""
         self.correction.end(launch=launch)
         self._sum_products(launch=launch)
         launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
 
-    def _sum_products(self, *, launch: Launch = wp.launch) -> None:
+    def _sum_products(self, *, launch: Launch = launch_now) -> None:
         """Sum the products that beta and the step need, with A + U W U'."""
         residual, finest, device, columns = self.residual, self.hierarchy.finest, self.A.device, self._low.columns
         finest.stencil.wrap(finest.x, launch=launch)

@@ -21,7 +21,7 @@ from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.fields import nothing
-from warp_lcp.rows.program import Launch, Program, as_one_table
+from warp_lcp.rows.program import Launch, Program, as_one_table, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
@@ -98,17 +98,17 @@ class AssessedResidual(NaturalResidual):
             self.assess(x)
         return self.read()
 
-    def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def assess(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Launch the evaluation at x; `read` has what it finds."""
         self._A.stencil.wrap(x, launch=launch)
         kernels.ADVANCE.launch(None, self._assessing(x), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
-    def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Launch the step from x along the direction that the cycle's correction gives."""
         self._updating(self._A.stencil.rows, x, direction).launch(launch)
 
-    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Launch the step and the evaluation where it ends: one launch on the CPU, unless periodic ghost cells must be filled between.
 
         Ghost cells that stand for cells of others take the step by themselves; x's and the correction's are filled.
@@ -461,7 +461,7 @@ class MultigridWorkspace(IterateMemory):
                 rows, stencil=s, z=finest.x, q=self._p, g=finest.b, sums=sums, place=place, lines=lines, places=places
             ).launch(launch)
 
-    def _measure(self, *, launch: Launch = wp.launch) -> None:
+    def _measure(self, *, launch: Launch = launch_now) -> None:
         """Measure the cycle's correction and plan the step."""
         finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x, launch=launch)
@@ -473,7 +473,7 @@ class MultigridWorkspace(IterateMemory):
         self.residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
 
-    def _advance(self, *, launch: Launch = wp.launch) -> None:
+    def _advance(self, *, launch: Launch = launch_now) -> None:
         """Take the planned step and evaluate the residual there."""
         if self.exact:
             self.residual.advance(self.x, self._p, launch=launch)

@@ -14,7 +14,7 @@ import warp as wp
 from warp_lcp.problem.frictional_contact import FrictionalContact
 from warp_lcp.problem.solve import Precision, Step
 from warp_lcp.rows import KernelFile, Rows
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.program import Launch, Program, launch_now
 from warp_lcp.rows.vectors import Reduction, rows_of
 from warp_lcp.settings import Count, Settings, Share
 
@@ -188,7 +188,7 @@ class ContactWorkspace:
         if self.method.accelerate:
             self._changes.dot(self._g, self._g, 1 - now, launch=launch)
 
-    def _look(self, launch: Launch = wp.launch) -> None:
+    def _look(self, launch: Launch = launch_now) -> None:
         """Find w from the impulses alone, and the squared residual."""
         self._gather.launch(launch)
         self._left.launch(launch)

@@ -1,0 +1,120 @@
+"""Heavy-ball steps of sand's stresses ahead of the host: the device takes them until the residual is due."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.granular import stress_kernels as kernels
+from warp_lcp.granular.stress import MOST_MOMENTUM, Stress
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, Program, launch, loops_on_device
+from warp_lcp.rows.readings import Reading
+
+if TYPE_CHECKING:
+    from warp_lcp.granular.coupled import HeavyBallProjectedGradient
+
+
+class StressAhead:
+    """Steps of a solve that the device takes and judges, as `coupled.MomentumWorkspace` would on the host.
+
+    On CUDA a solve is one graph: the residual at the start, a loop of periods of steps until the residual is due, that residual; the host
+    reads once. On the CPU a thread team works through the loop as one table.
+
+    Args:
+        stress: the problem, in one process.
+        method: settings of the steps.
+    """
+
+    def __init__(self, stress: Stress, method: HeavyBallProjectedGradient) -> None:
+        self._stress, self._method, device = stress, method, stress.packing.grid.device
+        self._decisions = Reading(device, kernels.DECISIONS)
+        self._going = wp.zeros(1, dtype=wp.int32, device=device)
+        self._limits = wp.array(method.calm, dtype=wp.float64, device=device)
+        self._given = [Scalar() for _ in range(5)]  # of `begin_steps_kernel`, from `limit_` on
+        self._beginning, self._resuming = (LaunchGraph(device, record) for record in (self._launch_beginning, self._launch_resumption))
+        self._period: Program | None = None  # that the loop is made of
+        self._loop = Program(device)
+
+    @staticmethod
+    def suits(stress: Stress) -> bool:
+        """Return whether the device can take steps without the host: where loops run on it, in one process."""
+        return not stress.shared and loops_on_device(stress.packing.grid.device)
+
+    def begin(self, tolerance: float, most: int) -> None:
+        """Evaluate the residual of the stresses as they are, and take steps until it is due again.
+
+        Args:
+            tolerance: of the residual [m/s].
+            most: steps of the solve.
+        """
+        stress, method = self._stress, self._method
+        stress.set_steps(*method.steps(stress))
+        limit, least, still = math.inf, method.least, 0.0
+        if stress.cold:
+            limit, least, still = method.swing(stress), method.cold, kernels.STILL_SHARE * tolerance
+        for number, value in zip(self._given, (limit, tolerance, least, still, most), strict=True):
+            number.value = float(value)
+        self._make_loop()
+        self._beginning.run()
+        self._repeat()
+
+    def resume(self) -> None:
+        """Take more steps, after a residual that misses the tolerance."""
+        self._make_loop()
+        self._resuming.run()
+        self._repeat()
+
+    def decisions(self) -> np.ndarray:
+        """Return what the device has decided, by the slots of `stress_kernels`; waits for it."""
+        return self._decisions.numpy()
+
+    def _repeat(self) -> None:
+        """Take the steps on the CPU; on CUDA they have been launched."""
+        if not self._stress.packing.grid.device.is_cuda:
+            self._loop.run_while(self._going)
+        self._decisions.changed()
+
+    def _make_loop(self) -> None:
+        """Make the loop of the walls as they are: a period of steps, and what decides whether another one follows."""
+        period, device = self._stress.period(), self._stress.packing.grid.device
+        if self._period is period:
+            return
+        self._stress.check()  # not made while others are recorded
+        self._period, self._loop = period, Program(device)
+        self._loop.extend(period)
+        s, method = self._stress, self._method
+        check, fields = method.check_every * kernels.PERIOD, [s.momentum, self._decisions.array, self._limits, self._going]
+        inputs = [s.packing.counts, s.numbers, *fields, check, method.patience, method.wait]
+        self._loop.launch(kernels.decide_kernel, 1, inputs, device=device)
+        self._beginning.forget()
+        self._resuming.forget()
+
+    def _launch_beginning(self) -> None:
+        """Launch what begins a solve, and on CUDA its steps."""
+        s, device = self._stress, self._stress.packing.grid.device
+        pressure_step, shear_step, lookahead = self._method.steps(s)
+        s.check().run()
+        fields = [s.total, s.packing.counts, s.numbers, s.momentum, self._decisions.array, self._going]
+        given = [pressure_step, shear_step, lookahead, self._method.momentum, MOST_MOMENTUM, *self._given]
+        launch(kernels.begin_steps_kernel, 1, [*fields, *given], device=device)
+        s.start_from_now()
+        if device.is_cuda:
+            self._launch_steps()
+
+    def _launch_resumption(self) -> None:
+        """Launch what goes on with a solve, and on CUDA its steps."""
+        device = self._stress.packing.grid.device
+        launch(kernels.resume_steps_kernel, 1, [self._decisions.array, self._going], device=device)
+        if device.is_cuda:
+            self._launch_steps()
+
+    def _launch_steps(self) -> None:
+        """Launch the loop, and the residual that it leaves, on CUDA."""
+        s = self._stress
+        self._loop.run_while(self._going)
+        s.check().run()
+        launch(kernels.keep_sums_kernel, 1, [s.total, self._decisions.array, kernels.LAST], device=s.packing.grid.device)
