@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, no_type_check
 
 import numpy as np
 import warp as wp
@@ -16,12 +16,14 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem.solve import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows import Rows
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Conditional, Launch, LaunchGraph, Program, copy, launch, loops_on_device
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import CONVERT
-from warp_lcp.solvers import projected_multigrid_kernels as kernels
+from warp_lcp.solvers.descent import CREEP, STALL
+from warp_lcp.solvers.projected_multigrid_kernels import CARRY, ENERGY, MOVED, NORM, PER_SIZE, SIZE, STEP, f64
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
@@ -30,6 +32,138 @@ EPS = float(np.finfo(np.float64).eps)
 ORDINARY = 1e-100  # the least residual that is taken for one: the squares of smaller ones vanish, which the loop looks into
 RATIOS = 1e-6, 1e6  # of a guess's residual to b within which corrections in float32 neither overflow nor vanish
 ROWS = 32  # at most
+
+
+# A row that is kept of each evaluation: NORM ... ENERGY, then these.
+ROW_STEP = wp.constant(4)
+ROW_SIZE = wp.constant(5)
+ROW = wp.constant(6)
+# Slots of what the device judges its steps by, as `descent.Descent` and the outer loop do.
+TAKEN = wp.constant(0)  # rows written
+MOST = wp.constant(1)  # rows that may be
+TOLERANCE = wp.constant(2)
+BEST = wp.constant(3)  # least norm
+LAST_NORM = wp.constant(4)
+LAST_ENERGY = wp.constant(5)
+LOWEST = wp.constant(6)  # energy
+FELL = wp.constant(7)  # by how much the last step lowered it
+NOISE = wp.constant(8)  # of the energy, relative
+JUDGED = 9
+CREEPS, STALLS = wp.constant(wp.float64(CREEP)), wp.constant(wp.float64(STALL))
+SAFELY = wp.constant(wp.float64(1.0 + 1e-9))  # what the host computes again must not come out the other way
+LEAST_RATIO, MOST_RATIO = wp.constant(wp.float64(1e-6)), wp.constant(wp.float64(1e6))
+
+
+@wp.func
+@no_type_check
+def keep_row(scalars: f64, rows: f64, n: int):
+    """Keep what an evaluation has found as row n."""
+    for c in range(4):
+        rows[n * ROW + c] = scalars[c]
+    rows[n * ROW + ROW_STEP] = scalars[STEP]
+    rows[n * ROW + ROW_SIZE] = scalars[SIZE]
+
+
+@forward_kernel(module="warp_lcp.projected_multigrid")
+@no_type_check
+def take_unit_kernel(scalars: f64, square: f64):
+    """Take ||b|| as the unit of right-hand sides, 1 if it is 0; no step has been taken."""
+    size = wp.sqrt(square[0])
+    scalars[SIZE] = size
+    if size == wp.float64(0.0):
+        scalars[SIZE] = wp.float64(1.0)
+    scalars[PER_SIZE] = wp.float64(1.0) / scalars[SIZE]
+    scalars[STEP] = wp.float64(0.0)
+
+
+@forward_kernel(module="warp_lcp.projected_multigrid")
+@no_type_check
+def keep_row_kernel(scalars: f64, rows: f64, n: int):
+    """Keep what an evaluation has found as row n."""
+    keep_row(scalars, rows, n)
+
+
+@forward_kernel(module="warp_lcp.projected_multigrid")
+@no_type_check
+def begin_kernel(
+    scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int,
+    rtol: wp.float64, atol: wp.float64, counted: f64, noise: wp.float64,
+):  # fmt: skip
+    """Begin with the guess that has been evaluated, if it misses the tolerance and is as large as b; row 0 has the reference.
+
+    The tolerance is absolute, or of the root mean square if unknowns are counted.
+    """
+    keep_row(scalars, rows, 1)
+    norm = wp.sqrt(scalars[NORM])
+    energy = wp.float64(0.5) * scalars[ENERGY]
+    absolute = atol
+    if counted:
+        absolute = atol * wp.sqrt(counted[0])
+    judged[TAKEN] = wp.float64(2.0)
+    judged[MOST] = wp.float64(most)
+    judged[TOLERANCE] = wp.max(absolute, rtol * wp.sqrt(rows[NORM]))
+    judged[BEST] = norm
+    judged[LAST_NORM] = norm
+    judged[LAST_ENERGY] = energy
+    judged[LOWEST] = energy
+    judged[FELL] = wp.float64(wp.inf)
+    judged[NOISE] = noise
+    ratio = norm / scalars[SIZE]
+    go = norm > judged[TOLERANCE] * SAFELY and ratio > LEAST_RATIO and ratio < MOST_RATIO and most > 2
+    going[0] = wp.where(go, 1, 0)
+    stale[0] = wp.where(scalars[MOVED] + rows[MOVED] > wp.float64(0.0), 1, was_stale)
+    scalars[CARRY] = wp.float64(0.0)
+
+
+@forward_kernel(module="warp_lcp.projected_multigrid")
+@no_type_check
+def resume_kernel(
+    judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int, tolerance: wp.float64,
+    norm: wp.float64, best: wp.float64, energy: wp.float64, lowest: wp.float64, fell: wp.float64, noise: wp.float64,
+):  # fmt: skip
+    """Begin with a step, from where the host has judged."""
+    judged[TAKEN] = wp.float64(0.0)
+    judged[MOST] = wp.float64(most)
+    judged[TOLERANCE] = tolerance
+    judged[BEST] = best
+    judged[LAST_NORM] = norm
+    judged[LAST_ENERGY] = energy
+    judged[LOWEST] = lowest
+    judged[FELL] = fell
+    judged[NOISE] = noise
+    going[0] = 1
+    stale[0] = was_stale
+
+
+@forward_kernel(module="warp_lcp.projected_multigrid")
+@no_type_check
+def judge_kernel(
+    scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), rebuilds: bool,
+):  # fmt: skip
+    """Keep what a truncated step has led to; go on if the host would take another one without a thought.
+
+    That is where the residual and the energy are the least yet, the tolerance is missed, and the free set does not creep; nor changes,
+    unless the device rebuilds what depends on it.
+    """
+    zero = wp.float64(0.0)
+    n = int(judged[TAKEN])
+    keep_row(scalars, rows, n)
+    norm = wp.sqrt(scalars[NORM])
+    energy = wp.float64(0.5) * scalars[ENERGY]
+    fell = judged[LAST_ENERGY] - energy
+    margin = judged[NOISE] * (wp.abs(judged[LAST_ENERGY]) + wp.abs(energy))
+    go = n + 1 < int(judged[MOST]) and wp.isfinite(scalars[STEP])
+    go = go and norm > judged[TOLERANCE] * SAFELY and norm < judged[BEST] and judged[LOWEST] - energy > margin * SAFELY
+    if scalars[MOVED] > zero:
+        go = go and rebuilds and fell * SAFELY < CREEPS * judged[FELL] and norm * SAFELY < STALLS * judged[LAST_NORM]
+    judged[TAKEN] = wp.float64(n + 1)
+    judged[BEST] = wp.min(judged[BEST], norm)
+    judged[LAST_NORM] = norm
+    judged[LAST_ENERGY] = energy
+    judged[LOWEST] = wp.min(judged[LOWEST], energy)
+    judged[FELL] = fell
+    going[0] = wp.where(go, 1, 0)
+    stale[0] = wp.where(scalars[MOVED] > zero, 1, 0)
 
 
 class RunAhead:
@@ -44,13 +178,13 @@ class RunAhead:
         rebuilds: whether the device follows the free set, too; else steps end where that changes, and the host rebuilds.
 
     Attributes:
-        rows: evaluations that the host has not looked at, see `projected_multigrid_kernels.keep_row`.
+        rows: evaluations that the host has not looked at, see `keep_row`.
     """
 
     def __init__(self, work: MultigridWorkspace, *, rebuilds: bool = True) -> None:
         self._work, self._rebuilds, device = work, rebuilds, work.A.device
         self.rows = deque[np.ndarray]()
-        self._found, self._judged = Reading(device, ROWS * int(kernels.ROW)), Reading(device, kernels.JUDGED)
+        self._found, self._judged = Reading(device, ROWS * int(ROW)), Reading(device, JUDGED)
         self._going, self._stale = (zeros(1, wp.int32, device) for _ in range(2))
         self._numbers = [Scalar() for _ in range(5)]  # of the kernel that begins: stale, most, both tolerances, noise
         self._loops: dict[int, Program] = {}  # by the step's program
@@ -72,7 +206,7 @@ class RunAhead:
         if loop is None:
             return False
         given = [int(r.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
-        self._launch(kernels.resume_kernel, [self._judged.array, self._going, self._stale], given)
+        self._launch(resume_kernel, [self._judged.array, self._going, self._stale], given)
         loop.run_while(self._going)
         self._take_rows()
         return True
@@ -107,7 +241,7 @@ class RunAhead:
             if loop is not None:
                 loop.run_while(self._going)
         self._take_rows()
-        reference, first = (math.sqrt(row[int(kernels.NORM)]) for row in (self.rows[0], self.rows[1]))
+        reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
         usual = p.bounds.stays and self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
         if not (usual and reference > ORDINARY and RATIOS[0] * size < first < RATIOS[1] * size):
@@ -127,7 +261,7 @@ class RunAhead:
         """Record the kernel that decides whether the guess is good enough."""
         *given, noise = self._numbers
         memory = [self._work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-        launch(kernels.begin_kernel, 1, [*memory, *given, counted, noise], device=self._work.A.device)
+        launch(begin_kernel, 1, [*memory, *given, counted, noise], device=self._work.A.device)
 
     def _launch(self, kernel: Any, memory: list[Any], given: list[Any]) -> None:
         """Launch a kernel of one thread whose last arguments differ from launch to launch."""
@@ -152,8 +286,8 @@ class RunAhead:
         """Take over the rows that a loop has left; waits for the device."""
         for reading in (self._found, self._judged):
             reading.changed()
-        count = int(self._judged.numpy()[int(kernels.TAKEN)])
-        self.rows.extend(self._found.numpy()[: count * int(kernels.ROW)].reshape(count, -1).copy())
+        count = int(self._judged.numpy()[int(TAKEN)])
+        self.rows.extend(self._found.numpy()[: count * int(ROW)].reshape(count, -1).copy())
 
     def _loop(self) -> Program | None:
         """Return the program of a step among others, None while parts of it have not run."""
@@ -169,7 +303,7 @@ class RunAhead:
                 CONVERT.bind(Rows.of_fields(work.problem.layout), a=work.x, b=work.best()).launch(loop.launch)
             loop.extend(step)
             memory = [work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-            loop.launch(kernels.judge_kernel, 1, [*memory, self._rebuilds], device=work.A.device)
+            loop.launch(judge_kernel, 1, [*memory, self._rebuilds], device=work.A.device)
         return self._loops[id(step)]
 
 
@@ -180,7 +314,7 @@ class Beginning:
         work: of the solve.
         guess: stored field, read each time.
         counted: of the criteria, see `MeanCriteria`.
-        found: receives the first evaluation, see `projected_multigrid_kernels.keep_row`.
+        found: receives the first evaluation, see `keep_row`.
         judge: launches or records what decides whether the guess is good enough.
     """
 
@@ -249,10 +383,10 @@ class Beginning:
         r.project(x, keep=False, launch=launch)
         work.round_iterate(launch=launch)
         r.launch_square_of_b(launch)
-        launch(kernels.take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
+        launch(take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
         r.classify = False
         r.assess(x, launch=launch)
-        launch(kernels.keep_row_kernel, 1, [r.scalars, self._found.array, 0], device=device)
+        launch(keep_row_kernel, 1, [r.scalars, self._found.array, 0], device=device)
         if isinstance(search, Conditional):
             assert self._program is not None
             self._program.record(search)

@@ -142,7 +142,7 @@ class AssessedResidual(NaturalResidual):
         return self.take([*scalars[:4], scalars[int(kernels.STEP)], scalars[int(kernels.SIZE)]])
 
     def take(self, row: Iterable[float], norm_of_b: float | None = None) -> float:
-        """Take what an evaluation has found, see `projected_multigrid_kernels.keep_row`; return the norm."""
+        """Take what an evaluation has found, see `projected_multigrid_ahead.keep_row`; return the norm."""
         square, moved, active, twice, step, size = map(float, row)
         self.energy, self.size = 0.5 * twice, size
         self.norm, self.current, self.active = float(np.sqrt(square)), True, int(active)
