@@ -62,6 +62,22 @@ def test_the_page_of_the_command_line_has_every_command():
     assert {name for cell in cells for name in re.findall(r"`(\w+)", cell)} == set(typer.main.get_command(app).commands)
 
 
+def test_a_value_passes_through_five_files_at_most_from_its_key_to_its_kernel():
+    """Each file of a walk is there, and has the names that the page says."""
+    page = (DOCS / "architecture.md").read_text().partition("## Four walks\n")[2].partition("\n## ")[0]
+    walks = re.split(r"^\*\*", page, flags=re.M)[1:]
+    assert len(walks) == 4
+    for walk in walks:
+        steps = re.split(r"^\d\. ", walk, flags=re.M)[1:]
+        assert 3 <= len(steps) <= 5
+        for step in steps:
+            file, *names = re.findall(r"`([^`]+)`", step)
+            assert "." in file.rpartition("/")[2]
+            assert [name for name in names if "/" in name] == []
+            text = (DOCS.parent / file).read_text()
+            assert [name for name in names if name not in text] == [], file
+
+
 def test_the_page_of_the_architecture_has_every_room_in_the_contract_s_order():
     page, picture = ((DOCS / name).read_text() for name in ("architecture.md", "architecture.svg"))
     table = dict(re.findall(r"^\| `(?:warp_lcp/)?(\w+)(?:\.py)?` \| (.*?) \|", page, flags=re.M))
