@@ -17,17 +17,15 @@ from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem, Join
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.joints import Joint, JointRows, joined_pairs
-from warp_lcp.rigid.planar_contacts import AHEAD, SLOP, PlanarContacts, PlanarImpulses
+from warp_lcp.rigid.planar_contacts import AHEAD, RATE, ROUGH, SLOP, PlanarContacts, PlanarImpulses
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
-RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
 BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
 FALL = 1.5  # times gravity: what falls beside what rests is not faster, and more is another impact's
 EXACT = StoppingCriteria(rtol=1e-7, max_iterations=600)  # a stack then drifts by 1e-7 of its size in a second
 UNSOLVED = 1e-5  # residual of sweeps from which on Newton's methods are worth their time
 TINY = 1e-6  # of a step: what is left of it after an impact at its end
-ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)  # for overlaps, which take several steps anyway
 ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
 JOINED = 1e-9  # of the smallest body's size, and in rad: errors of joints at the end of a step that are none
@@ -335,9 +333,9 @@ class ContactSolve:
         pushed, bodies = self._pushed, self.bodies
         if not len(contacts):
             return None
-        if pushed is not None and pushed.contacts is contacts and pushed.dt == dt and detour is None and not pushed.deep:
+        if pushed is not None and pushed.contacts is contacts and pushed.dt == dt and detour is None:
             if np.array_equal(pushed.values, bodies.values):  # nothing has pushed them since
-                return None
+                return pushed.ways
         velocities = self._velocities() if detour is None else self._velocities() + detour / dt
         gap = contacts.gap + dt * contacts.velocities(velocities)[:, 0]
         deep = gap < -SLOP * contacts.size

@@ -42,13 +42,12 @@ FIND = HostKernel(
     LEVEL=LEVEL, SAME=SAME, OTHER_SIDE=OTHER_SIDE, FLAT=FLAT[2], MORE=MORE, MOST_OF_PAIR=MOST[2],
 )  # fmt: skip
 SLOP = 1e-5  # of a body's size: overlap that is left alone
+RATE = 0.3  # part of a larger overlap that a step removes
+ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30)  # for overlaps, which take several steps anyway
 PUSH = HostKernel(
     KernelFile(Path(__file__).parent / "headers/planar_impulses.h")["warp_lcp.rigid.planar_impulses.push"],
-    YIELDS=YIELDS,
-    SAME_PLACE=SAME_PLACE,
-    SLOP=SLOP,
-    BEARS=BEARS,
-)
+    YIELDS=YIELDS, SAME_PLACE=SAME_PLACE, SLOP=SLOP, BEARS=BEARS, RATE=RATE, ROUGH_RTOL=ROUGH.rtol, ROUGH_MOST=ROUGH.max_iterations,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,8 @@ class PlanarImpulses:
         iterations: the most of an island.
         dt: of the step [s].
         values: of the bodies after it.
-        deep: whether a contact will overlap by more than `SLOP` at the end of the step.
+        ways: displacements that reduce overlaps at the end of the step (m, rad), shape (n, 3); None: no contact will overlap by more
+            than `SLOP`.
         memory: what a `ContactMemory` keeps of the contacts, shape (k, 8).
         squares: G'J'JG of the rows J that hold a body against walls and solids, and the diagonal of the root G of its inverse mass,
             by body; None: bodies that are held touch others.
@@ -74,7 +74,7 @@ class PlanarImpulses:
     iterations: int
     dt: float
     values: np.ndarray
-    deep: bool
+    ways: np.ndarray | None
     memory: np.ndarray
     squares: dict[int, tuple[np.ndarray, np.ndarray]] | None
 
@@ -185,7 +185,7 @@ class PlanarContacts:
         """
         c, n, k = contacts, len(self.bodies), len(contacts)
         of_contacts = (c.point, c.frames, c.size, c.one, c.other, c.wall, c.target, c.friction, c.gap)
-        given, work = (self.bodies.values, self._masses, *of_contacts, before), 45 * k + 23 * (n + 1)
+        given, work = (self.bodies.values, self._masses, *of_contacts, before), 45 * k + 26 * (n + 1)
         reals, (worst, iterations, deep, stacked) = PUSH.run(
             given, (c.first, c.second), work=work, places=5 * k + n + 2, count=n, contacts=k, old=0 if resumed else len(before),
             resumed=resumed, rtol=stopping.rtol, most=stopping.max_iterations, unsolved=unsolved, dt=dt,
@@ -195,10 +195,10 @@ class PlanarContacts:
         values = reals[: 26 * n].reshape(n, 26).copy()
         self.bodies.values[:] = values
         begin = 45 * n + 27 * k + before.size
-        ends = list(accumulate((begin, 2 * k, 8 * k, 9 * n, 3 * (n + 1), n)))
-        impulses, memory, squares, roots, holding = (reals[start:end].copy() for start, end in pairwise(ends))
+        ends = list(accumulate((begin, 2 * k, 8 * k, 9 * n, 3 * (n + 1), 3 * n, n)))
+        impulses, memory, squares, roots, ways, holding = (reals[start:end].copy() for start, end in pairwise(ends))
         held = np.flatnonzero(holding).tolist() if not stacked[0] else None
         of_body = None if held is None else {i: (squares[9 * i : 9 * i + 9].reshape(3, 3), roots[3 * i : 3 * i + 3]) for i in held}
-        return PlanarImpulses(
-            contacts, impulses.reshape(k, 2), float(worst[0]), int(iterations[0]), dt, values, bool(deep[0]), memory.reshape(k, 8), of_body
-        )
+        apart = ways.reshape(n, 3) if deep[0] else None
+        solved = impulses.reshape(k, 2), float(worst[0]), int(iterations[0])
+        return PlanarImpulses(contacts, *solved, dt, values, apart, memory.reshape(k, 8), of_body)

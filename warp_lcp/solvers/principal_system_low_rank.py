@@ -12,6 +12,7 @@ from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
@@ -109,7 +110,8 @@ class LowRankCorrection:
     def __init__(self, low: LowRankOperator, hierarchy: Hierarchy) -> None:
         self._low, self._hierarchy, self._columns = low, hierarchy, low.columns
         n, device = low.rank, hierarchy.device
-        self._S, self._E = (wp.zeros(n * n, dtype=wp.float64, device=device) for _ in range(2))
+        self._inverses = HostArray((2, n * n), wp.float64, device)  # of S and E
+        self._S, self._E = self._inverses.array[0], self._inverses.array[1]
         self._sums, self._kept, self._force, self._t = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4))
         self._squares = Reading(device, n + n // low.columns.width)
         self._of_slot = wp.zeros(n, dtype=wp.int32, device=device)
@@ -237,9 +239,9 @@ class LowRankCorrection:
         scale = 1.0 / np.sqrt(ratios[felt])
         skew = np.abs(scale[:, None] * (V.T @ odd @ V) * scale).max(initial=0.0)
         E = even + G.T @ W @ G
-        for target, matrix in ((self._S, S), (self._E, E)):
-            inverse = V @ np.linalg.solve(V.T @ matrix @ V, V.T)
-            target[: m * m].assign(inverse.ravel())
+        for target, matrix in zip(self._inverses.host, (S, E), strict=True):
+            target[: m * m] = (V @ np.linalg.solve(V.T @ matrix @ V, V.T)).ravel()
+        self._inverses.send()
         self._force.zero_()
         return bool(skew <= SKEW and ratios.min(initial=0.0) > -SKEW)
 

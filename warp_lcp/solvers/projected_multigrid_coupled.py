@@ -76,6 +76,7 @@ class CoupledWorkspace(MultigridWorkspace):
         self.correction = LowRankCorrection(low, self.hierarchy)
         self._ahead = RunAhead(self, rebuilds=False) if RunAhead.suits(self) else None
         self._evaluation = LaunchGraph(problem.device, self._launch_evaluation, at_once=problem.layout.across is not None)
+        self._monotone = LaunchGraph(problem.device, self._launch_monotone, at_once=problem.layout.across is not None)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self._newton: Inner | None = None
@@ -111,9 +112,25 @@ class CoupledWorkspace(MultigridWorkspace):
         """
         return self._newton_step() if self._fails else super().monotone_step()
 
-    def _plan_monotone_step(self) -> None:
-        self._sum_products()
-        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, True], device=self.problem.device)
+    def _begin_cycles(self, count: int) -> None:
+        self._cycles_left = count
+        self._forget()
+        self.residual.classify = False
+        self._evaluation.run(self.x, variant=(False, *self.problem_key()))
+        self.residual.read()
+
+    def _move_monotonely(self, safe: bool, launch: Launch = wp.launch) -> None:
+        if not self.exact:
+            super()._move_monotonely(safe, launch)
+            return
+        self._monotone.run(safe, variant=(self.residual.classify, *self.problem_key()))
+
+    def _launch_monotone(self, safe: bool) -> None:
+        super()._move_monotonely(safe, launch_recorded)
+
+    def _plan_monotone_step(self, launch: Launch) -> None:
+        self._sum_products(launch=launch)
+        launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, True], device=self.problem.device)
 
     def _newton_step(self) -> Step:
         """Take a step of Newton's method on the minimum map, whose memory is made when the first solve needs it."""

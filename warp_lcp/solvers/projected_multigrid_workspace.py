@@ -341,29 +341,34 @@ class MultigridWorkspace(IterateMemory):
 
     def monotone_step(self) -> Step:
         """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
-        p, finest, descent = self.problem, self.hierarchy.finest, self.descent
+        descent = self.descent
         self._leave()
         self._cycles_left -= 1
         self._allowed -= 1
-        lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
-        with as_one_table(p.device) if self._ahead is not None else nullcontext():
+        with as_one_table(self.problem.device) if self._ahead is not None else nullcontext():
             self.rebuild()
-            kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(wp.launch)
-            (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
-            self._plan_monotone_step()
             self._classify_next()
-            self._advance()
+            self._move_monotonely(descent.safe, launch_recorded)
         self.residual.read()
         if self.floating is not None and self._cycles_left == 0:
             self._project()
         descent.weigh(self._judge())
         return Step("monotone cycle", 1, None, interim=descent.sinks)
 
-    def _plan_monotone_step(self) -> None:
+    def _move_monotonely(self, safe: bool, launch: Launch) -> None:
+        """Launch a projected cycle, or a sweep if `safe`, its step, and the evaluation where that ends."""
+        p, finest = self.problem, self.hierarchy.finest
+        lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
+        kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(launch)
+        (self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle).run()
+        self._plan_monotone_step(launch)
+        self._advance(launch=launch)
+
+    def _plan_monotone_step(self, launch: Launch) -> None:
         """Take the projected cycle's correction as it is."""
         finest = self.hierarchy.finest
-        finest.stencil.wrap(finest.x)
-        launch_recorded(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, False], device=self.problem.device)
+        finest.stencil.wrap(finest.x, launch=launch)
+        launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, False], device=self.problem.device)
 
     def truncated_step(self) -> Step:
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""

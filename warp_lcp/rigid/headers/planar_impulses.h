@@ -6,15 +6,16 @@
 // `contacts` contacts' points, frames, sizes, rows for both bodies, walls' velocities, targets,
 // frictions and gaps; `old` remembered ones, or impulses to start from if `resumed`. Then come
 // impulses, what to remember of the contacts, of each body G'J'JG of the rows that hold it, the
-// diagonal of G and whether there are such rows; then work. `indices` holds the contacts' bodies;
-// then comes work. Values get the impulses, if `worst` is no more than `unsolved`. `iterations`:
-// the most of an island. `deep`: how many contacts will overlap in `dt`. `stacked`: how many touch
-// a body that is held, and another one.
+// diagonal of G, ways that reduce overlaps, and whether there are rows that hold it; then work.
+// `indices` holds the contacts' bodies; then comes work. Values get the impulses, if `worst` is no
+// more than `unsolved`. `iterations`: the most of an island. `deep`: how many contacts will overlap
+// in `dt`. `stacked`: how many touch a body that is held, and another one.
 //   compute    float64
 //   whole      float64 reals; int32 indices
 //   box        float64 worst, iterations, deep, stacked
 //   numbers    int count, contacts, old; bool resumed; float64 rtol; int most;
-//              float64 unsolved, dt, YIELDS, SAME_PLACE, SLOP, BEARS
+//              float64 unsolved, dt, YIELDS, SAME_PLACE, SLOP, BEARS, RATE, ROUGH_RTOL;
+//              int ROUGH_MOST
 //   constants  EACH = 8
 EXACT_MATH
 #include "algebra.h:algebra"
@@ -29,7 +30,8 @@ const double *targets = walls + 2*contacts, *frictions = targets + contacts,
     *gaps = frictions + contacts, *before = gaps + contacts;
 double *impulses = reals + 45*n + 27*contacts + (resumed ? size : 8*old),
     *memory = impulses + size, *squares = memory + 8*contacts;
-double *roots = squares + 9*n, *holding = roots + 3*(n + 1), *largest = holding + n,
+double *roots = squares + 9*n, *ways = roots + 3*(n + 1),
+    *holding = ways + 3*n, *largest = holding + n,
     *V = largest + n + 1, *start = V + 3*(n + 1), *x = start + size, *J = x + size,
     *b = J + size*m, *e = b + size, *d = e + size, *mu = d + size;
 double *g = mu + contacts, *way = g + size, *best = way + size, *w = best + size,
@@ -155,6 +157,32 @@ for (int k = 0; k < contacts; ++k) {
             impulses[dim*k]*frames[6*k + a]) + 0.0;
     }
     deep[0] += gaps[k] + dt*velocity_of(k, 0) < -SLOP*sizes[k];
+}
+// the smallest ways that reduce these overlaps, see `ContactSolve.separation`: no friction
+for (int i = 0; i < 3*n; ++i) ways[i] = 0.0;
+if (deep[0] > 0.0) {
+    const int dim = 1, most = ROUGH_MOST;
+    const double rtol = ROUGH_RTOL;
+    for (int p = 0; p < contacts; ++p) {
+        const int k = order[p];
+        const double gap = gaps[k] + dt*velocity_of(k, 0);
+        for (int a = 0; a < m; ++a) J[m*p + a] = J[m*2*p + a];  // the normals' rows
+        const double *row = J + m*p;
+        b[p] = gap < -SLOP*sizes[k] ? RATE*gap : (gap > 0.0 ? gap : 0.0);
+        x[p] = e[p] = mu[p] = 0.0;
+        d[p] = ((row[0]*row[0] + row[1]*row[1]) + row[2]*row[2])
+            + ((row[3]*row[3] + row[4]*row[4]) + row[5]*row[5]);
+    }
+    for (int t = 0; t < islands; ++t) {
+#include "contact_nncg.h:island"
+    }
+    for (int i = 0; i < 3*(n + 1); ++i) pushes[i] = 0.0;
+    for (int p = 0; p < contacts; ++p) far[order[p]] = x[p];
+    for (int k = 0; k < contacts; ++k)
+        for (int a = 0; a < 3; ++a) pushes[3*first_of[k] + a] += far[k]*ones[6*k + a] + 0.0;
+    for (int k = 0; k < contacts; ++k)
+        for (int a = 0; a < 3; ++a) pushes[3*second_of[k] + a] += far[k]*others[6*k + a] + 0.0;
+    for (int i = 0; i < 3*n; ++i) ways[i] = roots[i]*(roots[i]*pushes[i] + 0.0) + 0.0;
 }
 // what walls and other solids hold, see `Firm`: G' J' J G of its rows
 for (int i = 0; i <= n; ++i) largest[i] = 0.0;
