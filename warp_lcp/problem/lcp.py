@@ -142,8 +142,9 @@ class LCP(Pickled):
         twin = copy.copy(self)
         for cached in ("lower", "upper", "_counts"):
             twin.__dict__.pop(cached, None)
-        twin.A, twin.b, twin.bounds = self.A.replica(), wp.clone(self.b), self.bounds.replica()  # type: ignore[attr-defined]  # has a form
-        twin.unknown = twin.A.cells.flatten()
+        operator: Any = self.A  # which has a form
+        twin.A, twin.b, twin.bounds = operator.replica(), wp.clone(self.b), self.bounds.replica()
+        twin.unknown = _unknown(twin.A, twin.layout)
         return twin
 
     def take(self, other: LCP) -> None:

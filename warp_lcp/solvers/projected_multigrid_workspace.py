@@ -346,7 +346,8 @@ class MultigridWorkspace(IterateMemory):
         self._cycles_left -= 1
         self._allowed -= 1
         lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
-        with as_one_table(p.device) if self._ahead is not None else nullcontext():
+        plain = type(self) is MultigridWorkspace and self._ahead is not None  # others read on the way
+        with as_one_table(p.device) if plain else nullcontext():
             self.rebuild()
             kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(wp.launch)
             (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
