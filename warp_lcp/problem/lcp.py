@@ -128,9 +128,9 @@ class LCP(Pickled):
 
     @property
     def form(self) -> Hashable | None:
-        """What a copy must have in common that can `take` this problem: sizes, types and numbers; None: it has no copies.
+        """Sizes, types and numbers of problems that can `take` each other's data.
 
-        Problems with copies are those of a `GridPoisson` on the CPU whose fields are not used in place.
+        None if the problem has no copies: only problems of a `GridPoisson` on the CPU have, whose fields are not used in place.
         """
         form = getattr(self.A, "form", None)
         if form is None or self.bounds.form is None or self.in_place or self.preconditioner is not None or type(self) is not LCP:
