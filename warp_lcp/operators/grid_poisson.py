@@ -152,7 +152,10 @@ class GridPoisson(GridOperator):
 
     @property
     def form(self) -> Hashable | None:
-        """What a copy must have in common that can `take` this operator; None: it has no copies (subclasses, GPUs, ranks, large grids)."""
+        """Sizes, types and numbers of operators that can `take` each other's data.
+
+        None if the operator has no copies: subclasses, principal systems, GPUs, ranks and large grids.
+        """
         plain = type(self) is GridPoisson and self._mask is None and self._ghosts is None and self.layout.across is None
         if not plain or self.device.is_cuda or self.layout.chunks is not None:
             return None

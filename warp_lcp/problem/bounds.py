@@ -80,7 +80,10 @@ class Bounds:
 
     @property
     def form(self) -> Hashable | None:
-        """What a copy must have in common that can `take` these bounds; None: they have no copies."""
+        """Sizes and numbers of bounds that can `take` each other's data.
+
+        None if they have no copies: bounds that depend on x, or are used in place.
+        """
         if self.affine is not None or self.in_place:
             return None
         return tuple(field.size for field in (*self.fields, self.code)), self.varying, *map(float.hex, self.values)

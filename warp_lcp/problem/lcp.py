@@ -128,9 +128,9 @@ class LCP(Pickled):
 
     @property
     def form(self) -> Hashable | None:
-        """What a copy must have in common that can `take` this problem: sizes, types and numbers; None: it has no copies.
+        """Sizes, types and numbers of problems that can `take` each other's data.
 
-        Problems with copies are those of a `GridPoisson` on the CPU whose fields are not used in place.
+        None if the problem has no copies: only problems of a `GridPoisson` on the CPU have, whose fields are not used in place.
         """
         form = getattr(self.A, "form", None)
         if form is None or self.bounds.form is None or self.in_place or self.preconditioner is not None or type(self) is not LCP:
@@ -142,8 +142,9 @@ class LCP(Pickled):
         twin = copy.copy(self)
         for cached in ("lower", "upper", "_counts"):
             twin.__dict__.pop(cached, None)
-        twin.A, twin.b, twin.bounds = self.A.replica(), wp.clone(self.b), self.bounds.replica()  # type: ignore[attr-defined]  # has a form
-        twin.unknown = twin.A.cells.flatten()
+        operator: Any = self.A  # which has a form
+        twin.A, twin.b, twin.bounds = operator.replica(), wp.clone(self.b), self.bounds.replica()
+        twin.unknown = _unknown(twin.A, twin.layout)
         return twin
 
     def take(self, other: LCP) -> None:

@@ -248,7 +248,7 @@ class KeepsWorkspace(Protocol):
     """A method that keeps the workspace of a solve for later ones."""
 
     def spare(self, problem: Any) -> Spare | None:
-        """Return a workspace for the problem; None: `init` makes one."""
+        """Return a workspace for the problem, None if `init` has to make one."""
 
 
 def solve(

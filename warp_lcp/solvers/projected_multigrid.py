@@ -69,11 +69,11 @@ class ProjectedMultigrid(Settings):
         return CoupledWorkspace(problem, *terms, self)
 
     def spare(self, problem: LCP) -> SpareWorkspace | None:
-        """Return the workspace of an earlier solve, with a problem's data; None: `init` makes one.
+        """Return the workspace of an earlier solve with a problem's data.
 
-        From the second solve of a form in succession on one workspace is kept, see `wl.release_workspace`.
+        None if `init` has to make one. From the second solve of a form in succession on one workspace is kept, see `wl.release_workspace`.
         """
-        return lend(problem, self)
+        return lend(problem, self) if type(self) is ProjectedMultigrid else None
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle or a truncated one.

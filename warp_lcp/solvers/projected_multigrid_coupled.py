@@ -119,7 +119,7 @@ class CoupledWorkspace(MultigridWorkspace):
         self._evaluation.run(self.x, variant=(False, *self.problem_key()))
         self.residual.read()
 
-    def _move_monotonely(self, safe: bool, launch: Launch = wp.launch) -> None:
+    def _move_monotonely(self, safe: bool, launch: Launch) -> None:
         if not self.exact:
             super()._move_monotonely(safe, launch)
             return

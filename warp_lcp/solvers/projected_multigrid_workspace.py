@@ -345,7 +345,8 @@ class MultigridWorkspace(IterateMemory):
         self._leave()
         self._cycles_left -= 1
         self._allowed -= 1
-        with as_one_table(self.problem.device) if self._ahead is not None else nullcontext():
+        plain = type(self) is MultigridWorkspace and self._ahead is not None  # others read on the way
+        with as_one_table(self.problem.device) if plain else nullcontext():
             self.rebuild()
             self._classify_next()
             self._move_monotonely(descent.safe, launch_recorded)
