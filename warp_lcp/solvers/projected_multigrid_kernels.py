@@ -135,7 +135,7 @@ def keep_row(scalars: f64, rows: f64, n: int):
     rows[n * ROW + ROW_SIZE] = scalars[SIZE]
 
 
-@forward_kernel(module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 def take_unit_kernel(scalars: f64, square: f64):
     """Take ||b|| as the unit of right-hand sides, 1 if it is 0; no step has been taken."""
     size = wp.sqrt(square[0])
@@ -146,13 +146,13 @@ def take_unit_kernel(scalars: f64, square: f64):
     scalars[STEP] = wp.float64(0.0)
 
 
-@forward_kernel(module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 def keep_row_kernel(scalars: f64, rows: f64, n: int):
     """Keep what an evaluation has found as row n."""
     keep_row(scalars, rows, n)
 
 
-@forward_kernel(module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 def begin_kernel(
     scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int,
     rtol: wp.float64, atol: wp.float64, counted: f64, noise: wp.float64,

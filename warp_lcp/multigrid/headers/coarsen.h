@@ -78,6 +78,7 @@ if (make) {
                 if (BOTH) add(upper, Yes());
                 excess[i] = sum; bx[i] = bx_; ax[i] = ax_; ay[i] = ay_; bz[i] = bz_; az[i] = az_;
                 first_by[i] = by_; };
+            if constexpr (COUNTS && MASKED_BYTES) { MASKED64 for (int i = begin; i < end; ++i) cell(i); return; }
             const int bytes = COUNTS ? begin + (end - begin)/64*64 : begin;
             SIMD64 for (int i = begin; i < bytes; ++i) cell(i);
             SIMD for (int i = bytes; i < end; ++i) cell(i); };

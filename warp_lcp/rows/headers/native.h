@@ -18,11 +18,16 @@
 #define OPAQUE(POINTER) asm("" : "+r"(POINTER))
 #endif
 #define SIMD VECTORS(16)
-// MASKED: what is left of a row after its last whole vector as a vector with a mask, where the processor has masks
+// MASKED: what is left of a row after its last whole vector as a vector with a mask, where the processor has masks. MASKED64: of bytes; there
+// a loop of 64 bytes needs no second one for what is left, which takes as long to compile.
 #if !defined(__CUDA_ARCH__) && defined(__AVX512BW__) && defined(__AVX512VL__)
 #define MASKED PRAGMA(clang loop vectorize_predicate(enable)) SIMD
+#define MASKED64 PRAGMA(clang loop vectorize_predicate(enable)) VECTORS(64)
+#define MASKED_BYTES 1
 #else
 #define MASKED SIMD
+#define MASKED64 VECTORS(64)
+#define MASKED_BYTES 0
 #endif
 #define SIMD8 VECTORS(8)
 #define SIMD64 VECTORS(64)
