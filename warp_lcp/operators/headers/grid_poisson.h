@@ -20,8 +20,8 @@ const auto count = [&](int k) {
         + open(k + zm, along_z) + open(k + zp, along_z);
     diagonal[k] = cells[k] == 1 ? v : (unsigned char)0; };
 const int whole = n/64*64;
-SIMD64 for (int k = 0; k < whole; ++k) count(k);
-SIMD for (int k = whole; k < n; ++k) count(k);
+if (MASKED_BYTES) { MASKED64 for (int k = 0; k < n; ++k) count(k); }
+else { SIMD64 for (int k = 0; k < whole; ++k) count(k); SIMD for (int k = whole; k < n; ++k) count(k); }
 
 // kernel grid_poisson.diagonal: The sum of the coefficients over a FLUID cell's open faces, plus
 // the shift
