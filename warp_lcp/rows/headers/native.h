@@ -6,7 +6,6 @@
 #define VECTORS(WIDTH)
 #define UNROLLED _Pragma("unroll 4")  // so that several loads are under way at a time
 #define BUFFERED 1
-#define OPAQUE(POINTER)
 #else
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define FAST_MATH PRAGMA(clang fp reassociate(on) contract(fast))
@@ -14,20 +13,13 @@
 #define VECTORS(WIDTH) PRAGMA(clang loop vectorize(assume_safety) vectorize_width(WIDTH) interleave_count(1))
 #define UNROLLED
 #define BUFFERED 128
-// OPAQUE: the compiler forgets how a pointer was computed. Else it looks for common terms in the addresses of a loop over many fields, long.
-#define OPAQUE(POINTER) asm("" : "+r"(POINTER))
 #endif
 #define SIMD VECTORS(16)
-// MASKED: what is left of a row after its last whole vector as a vector with a mask, where the processor has masks. MASKED64: of bytes; there
-// a loop of 64 bytes needs no second one for what is left, which takes as long to compile.
+// MASKED: what is left of a row after its last whole vector as a vector with a mask, where the processor has masks
 #if !defined(__CUDA_ARCH__) && defined(__AVX512BW__) && defined(__AVX512VL__)
 #define MASKED PRAGMA(clang loop vectorize_predicate(enable)) SIMD
-#define MASKED64 PRAGMA(clang loop vectorize_predicate(enable)) VECTORS(64)
-#define MASKED_BYTES 1
 #else
 #define MASKED SIMD
-#define MASKED64 VECTORS(64)
-#define MASKED_BYTES 0
 #endif
 #define SIMD8 VECTORS(8)
 #define SIMD64 VECTORS(64)
