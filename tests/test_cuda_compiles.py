@@ -283,11 +283,22 @@ def one_a_family(names):
     return list({family(name): name for name in sorted(names, key=len)}.values())
 
 
-def lines_of(names):
-    """Return a line for each module: its name, the hash of its source and Warp's version."""
+def source_hash(name):
+    """Return the hash of a module, less what only its compilation for CPUs depends on."""
     from warp._src.context import user_modules
 
-    return sorted(f"{name} {user_modules[name].hash_module().hex()[:20]} {wp.__version__}" for name in names)
+    module = user_modules[name]
+    for_cpus = {key: module.options.get(key) for key in ("cpu_compiler_flags", "extra_build_options")}
+    module.options.update(dict.fromkeys(for_cpus))
+    found = module.hash_module().hex()
+    wp.set_module_options(for_cpus, module=name)
+    module.mark_modified()
+    return found
+
+
+def lines_of(names):
+    """Return a line for each module: its name, the hash of its source and Warp's version."""
+    return sorted(f"{name} {source_hash(name)[:20]} {wp.__version__}" for name in names)
 
 
 def compile_for_cuda(name, archs, folder):
@@ -314,12 +325,10 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
     if len(archs) == 1:
         compiled = set(COMPILED.read_text().splitlines())
         names = [line.split()[0] for line in lines_of(one_a_family(names)) if line not in compiled]
-    from warp._src.context import user_modules
-
     known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"  # minutes for all modules, so each once while it stays as it is
     known.mkdir(exist_ok=True)
     for name in names:
-        mark = known / f"{name}-{user_modules[name].hash_module().hex()}-{'-'.join(map(str, archs))}"
+        mark = known / f"{name}-{source_hash(name)}-{'-'.join(map(str, archs))}"
         if mark.exists():
             continue
         try:

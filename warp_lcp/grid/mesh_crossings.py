@@ -97,7 +97,7 @@ def height(x: wp.vec3d, origin: wp.vec3d, normal: wp.vec3d, shared: bool) -> wp.
     return wp.where(shared or wp.abs(h) < wp.float64(NEAR), wp.float64(0.0), h)
 
 
-@forward_kernel(module=MODULE, inline_first=False)
+@forward_kernel(module=MODULE)
 @typing.no_type_check
 def find_crossings(mesh: wp.uint64, points: Points, corners: Corners, crosses: wp.array(dtype=wp.uint8)):
     """Mark the triangles that cross another one."""
@@ -153,7 +153,7 @@ def find_crossings(mesh: wp.uint64, points: Points, corners: Corners, crosses: w
             crosses[t] = wp.uint8(1)
 
 
-@forward_kernel(module=MODULE, inline_first=False)
+@forward_kernel(module=MODULE)
 @typing.no_type_check
 def look_beside(
     mesh: wp.uint64, points: Points, corners: Corners, which: wp.array(dtype=wp.int32), at: Points, kind: wp.array(dtype=wp.uint8)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, no_type_check
 
 import numpy as np
-import scipy.ndimage
+import scipy
 import warp as wp
 
 from warp_lcp.operators.components import FloatingComponents, null_vectors, numbered_components

@@ -16,47 +16,44 @@ HEADER_FLAGS = "-DWP_NO_BFLOAT16= -fpch-instantiate-templates"
 # version may not have, where no kernel would compile: so for versions of Warp that it was tried with.
 INLINE_FIRST = "-mllvm=-enable-module-inliner"
 INLINE_FIRST_VERSIONS = ("1.19",)
+# Not so in these modules: sums of the first two would be rounded in another order; the last one has
+# large functions that are called from many places, and would be four times as long.
+INLINE_LATER = ("warp_lcp.interior_point.", "warp_lcp.nonsmooth_map.", "warp_lcp.grid.mesh_crossings")
 # Warp writes functions to add structs for gradients. Local to the module, they are not compiled.
 LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE
 #define CUDA_CALLABLE __attribute__((internal_linkage))
 """
 
 
-def forward_kernel(*, module: str, inline_first: bool = True, **options: Any) -> Any:
+def forward_kernel(*, module: str, **options: Any) -> Any:
     """Declare a Warp kernel without a backward pass, in a module of the project.
 
     Args:
         module: Warp module of the kernel, see `project_module`.
-        inline_first: likewise.
         **options: of `wp.kernel`.
 
     Returns:
         The decorator.
     """
-    project_module(module, inline_first)
+    project_module(module)
     return wp.kernel(enable_backward=False, module=module, **options)
 
 
-def project_module(name: str, inline_first: bool = True) -> Any:
+def project_module(name: str) -> Any:
     """Return a Warp module, made if need be, with the project's compiler flags.
 
-    All modules of the project should have the same: there is one precompiled header for each set of
-    flags, and each takes a second.
-
-    Args:
-        name: of the module.
-        inline_first: False where a large function is called from many places, and would be compiled
-            in each.
-
-    Returns:
-        The module. Flags are added to `wp.config.cpu_compiler_flags` as it is when a kernel of the
-        module is declared.
+    Most modules have the same flags, which is quickest: each set of flags has a precompiled header of
+    its own, and that takes a second. They are added to `wp.config.cpu_compiler_flags` as it is when a
+    kernel of the module is declared.
     """
     flags = wp.config.cpu_compiler_flags
     flags = "-march=native" if flags is None else flags  # what Warp takes for None
     checked = ".".join(wp.__version__.split(".")[:2]) in INLINE_FIRST_VERSIONS
-    added = [HEADER_FLAGS, INLINE_FIRST] if inline_first and checked else [HEADER_FLAGS]
-    module = wp.get_module(name)
-    module.options["cpu_compiler_flags"] = " ".join([flags, *added]).strip()
-    module.options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS)
-    return module
+    inline_first = checked and not name.startswith(INLINE_LATER)
+    added = [HEADER_FLAGS, INLINE_FIRST] if inline_first else [HEADER_FLAGS]
+    options = {
+        "cpu_compiler_flags": " ".join([flags, *added]).strip(),
+        "extra_build_options": wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS),
+    }
+    wp.set_module_options(options, module=name)
+    return wp.get_module(name)

@@ -71,7 +71,7 @@ class RowPass:
         constants: numbers that are known when the kernel is made, with their usual values; those that are given are integers, and macros.
         declared: the kernel's name in the header, see `kernel_file.py`; empty: the header is the row function alone.
         module: Warp module of passes that are used together. They are compiled at once for each set of types: a module of its own costs
-            0.13 s before its first kernel. Not for a pass over a box, whose module its name begins with.
+            0.04 s before its first kernel. Not for a pass over a box, whose module its name begins with.
 
     Raises:
         ValueError: a name cannot be one in C++, is the layer's own, or stands for two things; a role or a letter is of no array.

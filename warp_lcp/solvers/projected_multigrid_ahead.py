@@ -64,7 +64,7 @@ def keep_row(scalars: f64, rows: f64, n: int):
     rows[n * ROW + ROW_SIZE] = scalars[SIZE]
 
 
-@forward_kernel(module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
 def take_unit_kernel(scalars: f64, square: f64):
     """Take ||b|| as the unit of right-hand sides, 1 if it is 0; no step has been taken."""
@@ -76,14 +76,14 @@ def take_unit_kernel(scalars: f64, square: f64):
     scalars[STEP] = wp.float64(0.0)
 
 
-@forward_kernel(module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
 def keep_row_kernel(scalars: f64, rows: f64, n: int):
     """Keep what an evaluation has found as row n."""
     keep_row(scalars, rows, n)
 
 
-@forward_kernel(module="warp_lcp.projected_multigrid")
+@forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
 def begin_kernel(
     scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int,

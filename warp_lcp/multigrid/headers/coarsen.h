@@ -13,6 +13,7 @@
 //   whole      uint8 changed
 //   numbers    int cells; bool periodic_x, periodic_y, periodic_z; S stiffen, held
 //   module     multigrid
+#include "snippets.h:bytes"
 const int fx = pairs ? 2 : 1, z0 = L.fz*P.k, y0 = L.fy*P.j, z_last = z0 + deep - 1, y_last = y0 + wide - 1;
 const bool all = fx*L.fy*L.fz == 8, begins_y = y0 == 0, ends_y = y_last == L.n2 - 1, begins_z = z0 == 0, ends_z = z_last == L.n1 - 1;
 const auto due = [&]() {
@@ -42,33 +43,46 @@ if (make) {
     const T sy = whole_y ? (T)0 : L.fy == 2 ? scale : scale*stiffen, sz = whole_z ? (T)0 : L.fz == 2 ? scale : scale*stiffen;
     B excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M], none[2*M];
     const auto one = [](B v) { return (unsigned char)(v < (B)1 ? v : (B)1); };
-    const auto face = [&](auto here, auto there, T c, const auto* w, int i) -> B {  // between two cells of these diagonals
+    // the weight of a face between two cells of these diagonals
+    const auto face = [&](auto here, auto there, T c, const auto* w, int i) -> B {
         if constexpr (COUNTS) return (B)(one(here) & one(there) & (unsigned char)(c > 0));
         else if constexpr (STENCIL == 'v') return ((here != 0) & (there != 0)) ? (B)w[i] : (B)0;
         else return ((here != 0) & (there != 0)) ? (B)c : (B)0; };
-    const auto from = [&](const auto* field, long long first) { const auto* q = field + first; OPAQUE(q); return q; };
+    const auto from = [&](const auto* field, long long first) {
+        const auto* q = field + first; OPAQUE(q);
+        return q; };
     for (int begin = 0; begin < n; begin += M) {
         const int m = n - begin < M ? n - begin : (int)M, last = cells - 1 - fx*(P.first + begin); const long long p = fx*begin;
-        // Cell i of row y in one plane or both: what it adds to the aggregate's excess and to the outer faces below and above it. Rows go one
-        // after another, for memory is fetched ahead best along them; planes together, which halves the passes. One loop serves both rows:
-        // this kernel takes longest to compile.
+        // Cell i of row y in one plane or both: what it adds to the aggregate's excess and to the outer
+        // faces below and above it. Rows go one after another, for memory is fetched ahead best along
+        // them; planes together, which halves the passes. One loop serves both rows: this kernel takes
+        // longest to compile.
         const auto row = [&](auto both, int y, int begin, int end, long long left, long long right) {
             enum { BOTH = decltype(both)::value };
-            const long long at = p + y*yp, low_y = y ? -yp : below_y, high_y = y || wide == 1 ? above_y : yp;
+            const long long at = p + y*yp, low_y = y ? -yp : below_y;
+            const long long high_y = y || wide == 1 ? above_y : yp;
             B* first_by = y ? none : by;
-            struct Plane { const decltype(d + 0) e, e_left, e_right, e_below, e_above, e_down, e_up; decltype(wx + 0) left, right, below, above, down, up; };
+            struct Plane {  // a row of it: diagonals of cells and their neighbors, weights between
+                const decltype(d + 0) e, e_left, e_right, e_below, e_above, e_down, e_up;
+                decltype(wx + 0) left, right, below, above, down, up; };
             const auto plane = [&](long long k, long long down, long long up) -> Plane {
-                return {from(d, k), from(d, k + left), from(d, k + right), from(d, k + low_y), from(d, k + high_y), from(d, k + down), from(d, k + up),
-                        from(wx, k), from(wx, k + 1), from(wy, k), from(wy, k + yp), from(wz, k), from(wz, k + zp)}; };
-            const Plane lower = plane(at, below_z, BOTH ? zp : above_z), upper = BOTH ? plane(at + zp, -zp, above_z) : lower;
+                return {from(d, k), from(d, k + left), from(d, k + right), from(d, k + low_y),
+                        from(d, k + high_y), from(d, k + down), from(d, k + up), from(wx, k),
+                        from(wx, k + 1), from(wy, k), from(wy, k + yp), from(wz, k),
+                        from(wz, k + zp)}; };
+            const Plane lower = plane(at, below_z, BOTH ? zp : above_z);
+            const Plane upper = BOTH ? plane(at + zp, -zp, above_z) : lower;
             const auto cell = [&](int i) {
                 B sum = excess[i], bx_ = bx[i], ax_ = ax[i], by_ = 0, ay_ = 0, bz_ = bz[i], az_ = az[i];
                 const auto add = [&](const Plane& P, auto is_upper) {
                     enum { UPPER = decltype(is_upper)::value };
                     const auto e = P.e[i];
-                    const B f = face(e, P.e_left[i], cx, P.left, i), g = face(e, P.e_right[i], cx, P.right, i);
-                    const B h = face(e, P.e_below[i], cy, P.below, i), l = face(e, P.e_above[i], cy, P.above, i);
-                    const B o = face(e, P.e_down[i], cz, P.down, i), q = face(e, P.e_up[i], cz, P.up, i);
+                    const B f = face(e, P.e_left[i], cx, P.left, i);
+                    const B g = face(e, P.e_right[i], cx, P.right, i);
+                    const B h = face(e, P.e_below[i], cy, P.below, i);
+                    const B l = face(e, P.e_above[i], cy, P.above, i);
+                    const B o = face(e, P.e_down[i], cz, P.down, i);
+                    const B q = face(e, P.e_up[i], cz, P.up, i);
                     if constexpr (COUNTS) sum += (B)(e - f - g - h - l - o - q);
                     else { const B s = unit*(T)e, v = s - f - g - h - l - o - q; sum += v > least*s ? v : (B)0; }
                     bx_ += f; ax_ += g; by_ += h; ay_ += l;  // the last row's l counts
@@ -78,6 +92,9 @@ if (make) {
                 if (BOTH) add(upper, Yes());
                 excess[i] = sum; bx[i] = bx_; ax[i] = ax_; ay[i] = ay_; bz[i] = bz_; az[i] = az_;
                 first_by[i] = by_; };
+            if constexpr (COUNTS && MASKED_BYTES) {
+                MASKED64 for (int i = begin; i < end; ++i) cell(i);
+                return; }
             const int bytes = COUNTS ? begin + (end - begin)/64*64 : begin;
             SIMD64 for (int i = begin; i < bytes; ++i) cell(i);
             SIMD for (int i = bytes; i < end; ++i) cell(i); };
@@ -86,8 +103,11 @@ if (make) {
             if (part == 1 && (P.first + begin > 0 || below_x == -1)) continue;
             if (part == 2 && (last >= fx*m || above_x == 1)) continue;
             const long long left = part == 1 ? below_x : -1, right = part == 2 ? above_x : 1;
-            SIMD for (int i = from; i < to; ++i) { excess[i] = 0; bx[i] = 0; ax[i] = 0; bz[i] = 0; az[i] = 0; }
-            for (int y = 0; y < wide; ++y) { if (deep == 1) row(No(), y, from, to, left, right); else row(Yes(), y, from, to, left, right); } }
+            SIMD for (int i = from; i < to; ++i) {
+                excess[i] = 0; bx[i] = 0; ax[i] = 0; bz[i] = 0; az[i] = 0; }
+            for (int y = 0; y < wide; ++y) {
+                if (deep == 1) row(No(), y, from, to, left, right);
+                else row(Yes(), y, from, to, left, right); } }
         T *dc = coarse_d + begin, *wxc = coarse_wx + begin, *wyc = coarse_wy + begin, *wzc = coarse_wz + begin;
         if (fx == 2) {
             SIMD for (int k = 0; k < m; ++k) {
@@ -276,7 +296,8 @@ if (old[0] != now[0] || old[1] != now[1]) {
 #ifdef __CUDA_ARCH__
             for (int k = from; k < to; ++k) field[k] = 0;
 #else
-            if (from < to) __builtin_memset(field + from, 0, (to - from)*sizeof(*field));  // no loop to vectorize, seven times over
+            // no loop to vectorize, seven times over
+            if (from < to) __builtin_memset(field + from, 0, (to - from)*sizeof(*field));
 #endif
         };
         if (field) { zero(old[0], below); zero(above, old[1]); } };

@@ -13,6 +13,7 @@ const auto face_z = [&](long long k) -> T { if constexpr (FIELD_Z) return fz[k];
 //   writes     uint8 diagonal
 //   numbers    bool around_x, around_y, around_z
 //   module     grid
+#include "snippets.h:bytes"
 const unsigned char along_x = around_x, along_y = around_y, along_z = around_z;
 const auto open = [&](long long k, unsigned char axis) -> unsigned char { return cells[k] != 2 ? axis : (unsigned char)0; };
 const auto count = [&](int k) {
@@ -20,8 +21,10 @@ const auto count = [&](int k) {
         + open(k + zm, along_z) + open(k + zp, along_z);
     diagonal[k] = cells[k] == 1 ? v : (unsigned char)0; };
 const int whole = n/64*64;
-SIMD64 for (int k = 0; k < whole; ++k) count(k);
-SIMD for (int k = whole; k < n; ++k) count(k);
+if (MASKED_BYTES) { MASKED64 for (int k = 0; k < n; ++k) count(k); }
+else {
+    SIMD64 for (int k = 0; k < whole; ++k) count(k);
+    SIMD for (int k = whole; k < n; ++k) count(k); }
 
 // kernel grid_poisson.diagonal: The sum of the coefficients over a FLUID cell's open faces, plus
 // the shift

@@ -6,7 +6,6 @@
 #define VECTORS(WIDTH)
 #define UNROLLED _Pragma("unroll 4")  // so that several loads are under way at a time
 #define BUFFERED 1
-#define OPAQUE(POINTER)
 #else
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define FAST_MATH PRAGMA(clang fp reassociate(on) contract(fast))
@@ -14,8 +13,6 @@
 #define VECTORS(WIDTH) PRAGMA(clang loop vectorize(assume_safety) vectorize_width(WIDTH) interleave_count(1))
 #define UNROLLED
 #define BUFFERED 128
-// OPAQUE: the compiler forgets how a pointer was computed. Else it looks for common terms in the addresses of a loop over many fields, long.
-#define OPAQUE(POINTER) asm("" : "+r"(POINTER))
 #endif
 #define SIMD VECTORS(16)
 // MASKED: what is left of a row after its last whole vector as a vector with a mask, where the processor has masks

@@ -1,5 +1,21 @@
 // Snippets for kernels of several areas.
 
+// snippet bytes: Loops that compile quickly. MASKED64, where MASKED_BYTES: bytes in one loop, what
+// is left after its last whole vector under a mask, where the processor has masks. OPAQUE: the
+// compiler forgets how a pointer was computed; else it looks long for terms that addresses share.
+#ifdef __CUDA_ARCH__
+#define OPAQUE(POINTER)
+#else
+#define OPAQUE(POINTER) asm("" : "+r"(POINTER))
+#endif
+#if !defined(__CUDA_ARCH__) && defined(__AVX512BW__) && defined(__AVX512VL__)
+#define MASKED64 PRAGMA(clang loop vectorize_predicate(enable)) SIMD64
+#define MASKED_BYTES 1
+#else
+#define MASKED64 SIMD64
+#define MASKED_BYTES 0
+#endif
+
 // snippet entries: A matrix in compressed rows: ROWS {...} visits rows i, cells k of the piece,
 // ENTRIES the entries e of row i, too few for vectors.
 #define ROWS for (long long i = p, k = 0; k < n; ++i, ++k)
