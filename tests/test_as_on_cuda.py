@@ -101,7 +101,7 @@ def test_a_step_of_a_liquid_hardly_stops_the_device() -> None:
     ("name", "most"),
     [
         ("dam-break", {"calls": 4, "readbacks": 2, "launches": 230}),
-        pytest.param("column-collapse", {"calls": 9, "readbacks": 4, "launches": 900}, marks=pytest.mark.slow),
+        pytest.param("column-collapse", {"calls": 7, "readbacks": 3, "launches": 900}, marks=pytest.mark.slow),
         pytest.param("floating-bodies", {"calls": 50, "readbacks": 12, "launches": 450}, marks=pytest.mark.slow),
     ],
 )

@@ -40,6 +40,7 @@ class Rearrangement:
         reseeding: the reseeding; None: the scene does not ask for it.
         density_monitor: decides when to correct; None: the scene decides, or there is no correction.
         correction: the density correction; None: it has not acted yet, or never does.
+        moved: whether the last `apply` may have moved particles.
     """
 
     def __init__(self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> None:
@@ -54,6 +55,7 @@ class Rearrangement:
             self.correction = self._made()
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
+        self.moved = False
         self._looked = False  # whether this step has measured the density_monitor
 
     def look(self, step: int, density: wp.array | None, particles: Particles, window: Window) -> None:
@@ -96,13 +98,15 @@ class Rearrangement:
             What the log says of it.
         """
         row: dict[str, float | int | str] = {}
-        if self.reseeding is not None and self._evens(step):
+        self.moved = self._evens(step)
+        if self.reseeding is not None and self.moved:
             with watch.stage("reseeding", *particles.arrays().values()):
                 row["reseeded"] = self.reseeding.apply(particles, window, step)
         if self._parts(step):
             correction = self.correction = self.correction or self._made()
             with watch.stage("density correction", particles.position, correction.density, correction.x, *correction.displacement):
                 done = correction.apply(particles, window, fill=fill, contact=contact, share=self._share(dt))
+            self.moved = self.moved or done.result is not None
             row["density_status"] = done.result.status.name if done.result is not None else "NOTHING_TO_DO"
             row["density_iterations"] = done.result.iterations if done.result is not None else 0
             row["max_density"] = done.max_density

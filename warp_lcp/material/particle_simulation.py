@@ -377,8 +377,9 @@ class ParticleSimulation(ParticleCheckpoints):
             rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, dt, self.watch, fill, contact)
             if self.outlets is not None:  # the density correction may push particles out through open sides
                 exchanged["departed"] += self._remove_departed(self.outlets)
-            self.measure_particles()
-            after = self.checked_totals("after the density correction of")
+            if self.rearrangement.moved or self.outlets is not None or self.shared:
+                self.measure_particles()
+                after = self.checked_totals("after the density correction of")
         self.particles.totals_stay(True)
         self.time += dt
         self.step_count += 1
