@@ -32,12 +32,12 @@ class SharedReseeding(Reseeding):
         beside = Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), part.grid.device).common(part.grid.domain)
         assert beside is not None, "a box has cells"
         self._asked = beside
-        self._before: np.ndarray | None = None  # how many particles the box's cells hold, before any has moved
+        self._before = np.zeros(0)  # how many particles the box's cells hold, before any has moved
+        self._finding.at_once = self._exchanging.at_once = part.grid.device.is_cuda  # ranks exchange halos through the host
 
     def apply(self, particles: Particles, window: Window, step: int) -> int:
         """Move this rank's particles; return how many of all ranks have moved."""
         assert isinstance(particles, SharedParticles), "particles of ranks"
-        self._before = None
         moved = super().apply(particles, window, step)
         particles.drop_ghosts()
         return moved
@@ -50,11 +50,11 @@ class SharedReseeding(Reseeding):
 
     def _join(self) -> None:
         self.part.fill(self._count)
-        if self._before is None:
-            self._before = self._held()
+
+    def _note(self) -> None:
+        self._before = self._held()
 
     def _moved(self) -> int:
-        assert self._before is not None, "cells were counted"
         return int(self.part.ranks.sum(np.maximum(self._held() - self._before, 0).sum()))
 
     def _held(self) -> np.ndarray:
