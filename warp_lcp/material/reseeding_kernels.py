@@ -78,9 +78,7 @@ def emptiest(planes: int, cell: wp.vec3i, start: int, here: int, inverse_dx: flo
 
 
 @wp.func
-def take_from(
-    cell: int, way: wp.vec3i, seed: int, s: ReseedingSetting, offsets: INTS, count: I32, position: POINTS, numbers: INTS
-):
+def take_from(cell: int, way: wp.vec3i, seed: int, s: ReseedingSetting, offsets: INTS, count: I32, position: POINTS, numbers: INTS):
     """Let a cell that wants particles take some from the neighbor in one direction.
 
     No race, though a cell may be the neighbor of another that takes: whoever gives holds more than `at_rest` before and no less after,
