@@ -15,7 +15,8 @@ def pressure_kernel(
 ):  # fmt: skip
     """Count the closed parts of faces that pressure acts on in a row, or with `values` write its impulses on them: `scale` x a share.
 
-    x is continued from a cell's center to the wall, see `warp_lcp.fluids.forces`; `kick_x`, `kick_y`, `kick_z` [m/s] are what gravity adds to velocities.
+    x is continued from a cell's center to the wall, see `warp_lcp.fluids.forces`; the kick [m/s] is what gravity adds to
+    velocities.
     """
     row = k * x.shape[1] + j
     begin = int(0)

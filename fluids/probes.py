@@ -68,8 +68,8 @@ def probe_kernel(
 ):  # fmt: skip
     """Find x [m/s], velocity [m/s] and level [cells] at points in array coordinates, in which cell i reaches from i to i + 1.
 
-    `kick_x`, ... [m/s] are what gravity adds to x from a cell to the next along each axis, `up` points against it and has length 1. The surface is
-    looked for between two distances from the point, `reach` [cells].
+    The kick [m/s] is what gravity adds to x from a cell to the next along each axis, `up` points against it and has
+    length 1. The surface is looked for between two distances from the point, `reach` [cells].
     """
     t = wp.tid()
     kick = wp.vec3(kick_x, kick_y, kick_z)

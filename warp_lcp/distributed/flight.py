@@ -109,12 +109,17 @@ class SharedFlights(Flights):
         found = np.where(number[roots] >= 0, number[roots] + 1, np.where(held[roots] > 0, GROUND, ALONE))
         return cells, found.astype(np.int32)
 
-    def _board(self, particles: Particles) -> tuple[wp.array, wp.array]:
+    def _board(self, particles: Particles) -> int:
         particles.number()  # without ghosts
-        who, tree = (found.numpy() for found in super()._board(particles))
-        body = self._row[tree]
-        flying, device = body >= 0, self.grid.device
-        return wp.array(who[flying], dtype=wp.int32, device=device), wp.array(body[flying], dtype=wp.int32, device=device)
+        count = super()._board(particles)
+        who, tree = (found.numpy() for found in (self._flight.who, self._flight.body))
+        body = self._row[tree[:count]]
+        flying = np.flatnonzero(body >= 0)
+        who[: len(flying)], tree[: len(flying)] = who[flying], body[flying]
+        if self.grid.device.is_cuda:
+            self._flight.who.assign(who)
+            self._flight.body.assign(tree)
+        return len(flying)
 
     def _everyone(self, particles: Particles) -> int:
         assert isinstance(particles, SharedParticles), "particles of ranks"

@@ -199,6 +199,11 @@ class Particles:
         return self._capacity
 
     @property
+    def listed_count(self) -> Scalar:
+        """The number of particles, for recorded launches."""
+        return self._memory.count
+
+    @property
     def position(self) -> wp.array:
         """Positions [m], wp.vec3, shape (count,)."""
         return self._columns["position"].view

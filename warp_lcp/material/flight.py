@@ -9,15 +9,18 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.particle_loops import PARTICLE
+from warp_lcp.grid.particle_loops import PARTICLE, ListMemory
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.material import flight_kernels as kernels
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, clear
 from warp_lcp.rows.readings import Reading
 
 NARROW = 1.0  # [cells^2] the least second moment about an axis, a particle, of a body whose turning the grid resolves
+ROOM, LEAST = 2, 64  # of bodies that memory is for, over those there are; at least
+VECTORS = 5  # of a body that kernels need
 Sums = np.ndarray  # of `kernels.add_up`, float64, shape (bodies, COLUMNS)
 NOTHING: Sums = np.zeros((0, kernels.COLUMNS))
 
@@ -57,6 +60,11 @@ class Flights:
         self._flight.origin = wp.vec3i(*grid.origin)
         self._before: Sums = NOTHING
         self._growing = LaunchGraph(grid.device, self._launch_growth)
+        self._rate, self._quanta = Scalar(), Scalar()  # see `flight_kernels.add_up`
+        self._list = ListMemory(grid.device)  # of the bodies' particles
+        self._vectors, self._start = np.zeros((0, VECTORS, 3), dtype=np.float32), wp.zeros(0, dtype=wp.vec3, device=grid.device)
+        launches = self._launch_boarding, self._launch_lift, self._launch_flight, self._launch_landing
+        self._boarding, self._lifting, self._flying, self._landing = (LaunchGraph(grid.device, launch) for launch in launches)
 
     def find(self, window: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
         """Look for bodies, without waiting for their number; arguments as of `begin`, which does it where nobody has."""
@@ -97,13 +105,55 @@ class Flights:
         self._before = np.zeros((bodies, kernels.COLUMNS)) if bodies else NOTHING
         if bodies == 0:
             return 0
-        self._flight.who, self._flight.body = self._board(particles)
-        self._flight.rate = dt / self.grid.spacing
-        self._take(particles)
-        self._start = wp.empty(len(self._flight.who), dtype=wp.vec3, device=self.grid.device)
-        self._launch(kernels.lift_kernel, [particles.position, self._start])
-        self._before, self._change = self._sums(), change * self._flight.rate
+        self._reserve(particles, bodies)
+        self._list.resize(self._board(particles))
+        self._rate.value = dt / self.grid.spacing
+        # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
+        longest = max(self.grid.domain_counts)
+        self._quanta.value = 2.0 ** math.floor(60.0 - math.log2(self._everyone(particles) * longest**2))
+        self._lifting.run(particles)
+        self._before = self._sums(bodies)
+        self._change = change * self._rate.value
         return bodies
+
+    def _reserve(self, particles: Particles, bodies: int) -> None:
+        """Have room for so many bodies of some of these particles."""
+        flight, device, most = self._flight, self.grid.device, particles.capacity
+        if bodies <= len(self._vectors) and most <= len(self._start):
+            return
+        rows = max(ROOM * bodies, LEAST)
+        flight.who, flight.body = (wp.zeros(most, dtype=wp.int32, device=device) for _ in range(2))
+        self._list.take(0, {"who": flight.who})
+        flight.sums = wp.zeros((rows, kernels.COLUMNS), dtype=wp.int64, device=device)
+        self._vectors = np.zeros((rows, VECTORS, 3), dtype=np.float32)
+        self._motion = wp.array(self._vectors, dtype=wp.vec3, device=device, copy=device.is_cuda)
+        self._start, self._end, self._x = (wp.zeros(most, dtype=wp.vec3, device=device) for _ in range(3))
+        self._near = wp.zeros(most, dtype=wp.uint8, device=device)
+        for graph in (self._boarding, self._lifting, self._flying, self._landing):
+            graph.forget()
+
+    def _launch_boarding(self, particles: Particles) -> None:
+        """Launch the list of the particles of bodies."""
+        inputs = [particles.key, self._parent, self._number, self._flight.who, self._flight.body, self._count.array]
+        launch_list(kernels.board_kernel, particles.count, inputs, device=self.grid.device, ordered=True)
+
+    def _launch_lift(self, particles: Particles) -> None:
+        """Launch the sums over the bodies' particles where they are."""
+        clear(self._flight.sums)
+        self._add(kernels.lift_kernel, particles, [particles.position, self._start])
+
+    def _launch_flight(self, particles: Particles, velocity: list[wp.array]) -> None:
+        """Launch the way of the bodies' particles, and the sums over them where they come to."""
+        clear(self._flight.sums)
+        wall, arrived = self.boundary, [self._x, self._near]
+        inputs = [*three_components(velocity), self._motion, wall.base, wall.touch, self._start, self._end, *arrived]
+        self._carry(kernels.fly_kernel, [self._rate, particles.velocity, *inputs])
+        self._add(kernels.arrive_kernel, particles, arrived)
+
+    def _launch_landing(self, particles: Particles) -> None:
+        """Launch what gives the bodies' particles their places and velocities."""
+        moved = [particles.velocity, *three_components(particles.affine)]
+        self._carry(kernels.land_kernel, [*moved, self._motion, self._end, particles.position])
 
     def end(self, particles: Particles, velocity: Sequence[wp.array]) -> None:
         """Move the bodies' particles anew, after all have moved, and give them what they lack.
@@ -114,18 +164,14 @@ class Flights:
         """
         if len(self._before) == 0:
             return
-        before, dx, dt, had = self._before, self.grid.spacing, self._flight.rate * self.grid.spacing, _about_center(self._before)
+        rate = self._rate.value
+        before, dx, dt, had = self._before, self.grid.spacing, rate * self.grid.spacing, _about_center(self._before)
         number = np.maximum(before[:, :1], 1.0)
         center, drift = before[:, 1:4] / number, before[:, 4:7] / number + self._change
         spin = np.zeros_like(drift) if self._flight.straight else _turning(before, had)[0]
-        self._take(particles)
-        end = wp.empty_like(self._start)
-        fields, wall = three_components(velocity), self.boundary
-        motion = self._motion(drift * dx / dt, spin / dt, center * dx)
-        came = [wp.empty_like(end), wp.empty(len(end), dtype=wp.uint8, device=self.grid.device)]
-        self._carry(kernels.fly_kernel, [*fields, motion, wall.base, wall.touch, self._start, end, *came])
-        self._launch(kernels.arrive_kernel, came)
-        after = self._sums()
+        self._tell(drift * dx / dt, spin / dt, center * dx)
+        self._flying.run(particles, list(velocity))
+        after = self._sums(len(before))
         has, missing = _about_center(after), drift - after[:, 4:7] / number
         rigid, turn = _turning(after, had, had - has)
         least, most = (rigid * had).sum(axis=1), _about_mean(before)
@@ -136,22 +182,18 @@ class Flights:
         push, turn = share * missing + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
         share[after[:, kernels.LEAVES] > 0.0] = -1.0  # it meets a wall in this step
         shift, center = center + drift - after[:, 1:4] / number, center + drift
-        motion = self._motion(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
-        self._carry(kernels.land_kernel, [motion, end, particles.position])
+        self._tell(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
+        self._landing.run(particles)
 
     def _bodies(self) -> int:
         """Return how many bodies were found."""
         return int(self._count.numpy()[0])
 
-    def _board(self, particles: Particles) -> tuple[wp.array, wp.array]:
-        """Return the numbers of the bodies' particles, and the body of each, int32."""
-        who, body = (wp.empty(particles.count, dtype=wp.int32, device=self.grid.device) for _ in range(2))
-        listed = [particles.key, self._parent, self._number, who, body, self._count.array]
-        wp.launch(kernels.board_kernel, particles.count, listed, device=self.grid.device)
+    def _board(self, particles: Particles) -> int:
+        """List the bodies' particles, and the body of each; return how many there are."""
+        self._boarding.run(particles)
         self._count.changed()
-        flying = int(self._count.numpy()[1])
-        nobody = wp.empty(0, dtype=wp.int32, device=self.grid.device)  # Warp's arrays have no empty slices
-        return (who[:flying], body[:flying]) if flying else (nobody, nobody)
+        return int(self._count.numpy()[1])
 
     def _everyone(self, particles: Particles) -> int:
         """Return how many particles the material has."""
@@ -161,30 +203,29 @@ class Flights:
         """Return sums over all particles of the bodies, int64 as given."""
         return sums
 
-    def _take(self, particles: Particles) -> None:
-        """Point the kernels at the particles, and at sums of nothing."""
-        flight = self._flight
-        flight.velocity = particles.velocity
-        flight.gradient_u, flight.gradient_v, flight.gradient_w = three_components(particles.affine)
-        flight.sums = wp.zeros(self._before.shape, dtype=wp.int64, device=self.grid.device)
-        # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
-        flight.quanta = 2.0 ** math.floor(60.0 - math.log2(self._everyone(particles) * max(self.grid.domain_counts) ** 2))
-
-    def _sums(self) -> Sums:
-        """Return the sums of the last launch."""
-        sums = self._of_all(self._flight.sums.numpy()).astype(np.float64)
-        sums[:, 1 : kernels.LEAVES] /= float(self._flight.quanta)
+    def _sums(self, bodies: int) -> Sums:
+        """Return the sums over each body of the last launch."""
+        sums = self._of_all(self._flight.sums.numpy()[:bodies]).astype(np.float64)
+        sums[:, 1 : kernels.LEAVES] /= self._quanta.value
         return sums
 
-    def _motion(self, *vectors: np.ndarray) -> wp.array:
-        """Return what kernels need of each body, wp.vec3, shape (bodies, vectors)."""
-        return wp.array(np.stack(vectors, axis=1).astype(np.float32), dtype=wp.vec3, device=self.grid.device)
+    def _tell(self, *vectors: np.ndarray) -> None:
+        """Tell kernels vectors of each body, shape (bodies, 3) each."""
+        for number, values in enumerate(vectors):
+            self._vectors[: len(values), number] = values
+        if self.grid.device.is_cuda:
+            self._motion.assign(self._vectors)
 
-    def _launch(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
-        wp.launch(kernel, len(self._flight.body), [self._flight, *inputs], device=self.grid.device)
+    def _add(self, kernel: wp.Kernel, particles: Particles, inputs: Sequence[object]) -> None:
+        """Launch a kernel that adds up the bodies' particles."""
+        flight = self._flight
+        given = [flight.who, flight, self._rate, self._quanta, particles.velocity, *inputs]
+        launch_list(kernel, int(self._list.count.value), given, device=self.grid.device, ordered=True)
 
     def _carry(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
-        launch_list(kernel, len(self._flight.body), [self._flight, *inputs], device=self.grid.device, cost=PARTICLE)
+        """Launch a kernel that moves the bodies' particles."""
+        flight, count = self._flight, int(self._list.count.value)
+        launch_list(kernel, count, [flight.who, flight, *inputs], device=self.grid.device, cost=PARTICLE)
 
 
 def _about_center(sums: Sums) -> np.ndarray:

@@ -13,7 +13,6 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import KernelFile
-from warp_lcp.rows.compiler import forward_kernel
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
@@ -23,7 +22,6 @@ _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 _SOLID = wp.constant(wp.int8(SOLID))
 
 
-options = {"module": "warp_lcp.material.flight"}
 Integers, Bytes = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
 Kinds = I8
 Motions = wp.array2d(dtype=wp.vec3)
@@ -32,18 +30,12 @@ Vectors, Field = wp.array(dtype=wp.vec3), F32
 
 @wp.struct
 class Flight:
-    """What particles carry and which bodies they belong to, for kernels."""
+    """The particles of bodies, and sums over each body, for kernels."""
 
     planes: int
     straight: int  # whether particles go straight on
     inverse_dx: float  # [1/m]
     origin: wp.vec3i  # cells of a larger grid before the first one of this
-    rate: float  # cells a step in one m/s
-    quanta: wp.float64  # of the sums, in one cell or cell a step or product of two of them
-    velocity: Vectors  # [m/s]
-    gradient_u: Vectors  # [1/s], empty but for APIC
-    gradient_v: Vectors
-    gradient_w: Vectors
     who: Integers  # the particles of all bodies
     body: Integers  # of each of them
     sums: wp.array2d(dtype=wp.int64)
@@ -72,14 +64,14 @@ def put(sums: wp.array2d(dtype=wp.int64), body: int, column: int, quanta: wp.flo
 
 
 @wp.func
-def add_up(flight: Flight, n: int, x: wp.vec3):
+def add_up(flight: Flight, rate: float, q: wp.float64, velocity: Vectors, n: int, x: wp.vec3):
     """Add the n-th particle at x [cells] to its body's sums, in cells and steps.
 
+    `rate` is cells a step in one m/s, and q of the sums' units are one cell or cell a step or product of two of them.
     [0] particles; [1:4] x; [4:7] v; [7:10] x cross v; [10:16] xx, yy, zz, xy, xz, yz; [16] v v.
     """
     b = flight.body[n]
-    q = flight.quanta
-    v = flight.velocity[flight.who[n]] * flight.rate
+    v = velocity[flight.who[n]] * rate
     turn = wp.cross(x, v)
     wp.atomic_add(flight.sums, b, 0, wp.int64(1))
     for d in range(3):
@@ -93,24 +85,22 @@ def add_up(flight: Flight, n: int, x: wp.vec3):
     put(flight.sums, b, 16, q, wp.dot(v, v))
 
 
-@forward_kernel(**options)
-def board_kernel(key: Integers, parent: Integers, number: Integers, who: Integers, body: Integers, count: Integers):
+@list_kernel("warp_lcp.material.flight")
+def board_kernel(i, key: Integers, parent: Integers, number: Integers, who: Integers, body: Integers, count: Integers):
     """List the particles of bodies; count[1] becomes their number. All others take no more than this look."""
-    p = wp.tid()
-    b = number[root_of(parent, key[p])]
+    b = number[root_of(parent, key[i])]
     if b >= 0:
         n = wp.atomic_add(count, 1, 1)
-        who[n] = p
+        who[n] = i
         body[n] = b
 
 
-@forward_kernel(**options)
-def lift_kernel(flight: Flight, position: Vectors, start: Vectors):
+@list_kernel("warp_lcp.material.flight")
+def lift_kernel(i, who: Integers, flight: Flight, rate: float, quanta: wp.float64, velocity: Vectors, position: Vectors, start: Vectors):
     """Note where particles are, and add them up."""
-    n = wp.tid()
-    x = position[flight.who[n]]
-    start[n] = x
-    add_up(flight, n, x * flight.inverse_dx)
+    x = position[who[i]]
+    start[i] = x
+    add_up(flight, rate, quanta, velocity, i, x * flight.inverse_dx)
 
 
 @wp.func
@@ -151,16 +141,15 @@ def is_near(base: Kinds, touch: U8, planes: int, origin: wp.vec3i, x: wp.vec3):
 
 @list_kernel("warp_lcp.material.flight")
 def fly_kernel(
-    i, flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8, start: Vectors, end: Vectors, x: Vectors,
-    near: Bytes,
+    i, who: Integers, flight: Flight, h: float, velocity: Vectors, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8,
+    start: Vectors, end: Vectors, x: Vectors, near: Bytes,
 ):  # fmt: skip
     """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, to x [cells].
 
     What they have of the body's spin turns with it. A motion is the body's [0] velocity, [1] spin, [2] center.
     """
-    p = flight.who[i]
+    p = who[i]
     b = flight.body[i]
-    h = flight.rate
     x0 = start[i] * flight.inverse_dx
     mean = motion[b, 0]
     spin = motion[b, 1]
@@ -173,7 +162,7 @@ def fly_kernel(
     x1 = x0 + way
     end[i] = start[i] + way / flight.inverse_dx
     rigid = wp.cross(spin, start[i] - motion[b, 2])
-    flight.velocity[p] = flight.velocity[p] + turned(spin * (h / flight.inverse_dx), rigid) - rigid
+    velocity[p] = velocity[p] + turned(spin * (h / flight.inverse_dx), rigid) - rigid
     longest = wp.max(wp.max(wp.abs(way[0]), wp.abs(way[1])), wp.abs(way[2]))
     strides = wp.clamp(int(wp.ceil(longest)), 1, MOST_STRIDES)
     met = wp.uint8(0)
@@ -184,31 +173,33 @@ def fly_kernel(
     near[i] = met
 
 
-@forward_kernel(**options)
-def arrive_kernel(flight: Flight, x: Vectors, near: Bytes):
+@list_kernel("warp_lcp.material.flight")
+def arrive_kernel(i, who: Integers, flight: Flight, rate: float, quanta: wp.float64, velocity: Vectors, x: Vectors, near: Bytes):
     """Add up the particles where they have come to [cells], and those that came near a wall or an open side."""
-    n = wp.tid()
-    add_up(flight, n, x[n])
-    if near[n] != wp.uint8(0):
-        wp.atomic_add(flight.sums, flight.body[n], LEAVES, wp.int64(1))
+    add_up(flight, rate, quanta, velocity, i, x[i])
+    if near[i] != wp.uint8(0):
+        wp.atomic_add(flight.sums, flight.body[i], LEAVES, wp.int64(1))
 
 
 @list_kernel("warp_lcp.material.flight")
-def land_kernel(i, flight: Flight, motion: Motions, end: Vectors, position: Vectors):
+def land_kernel(
+    i, who: Integers, flight: Flight, velocity: Vectors, gradient_u: Vectors, gradient_v: Vectors, gradient_w: Vectors, motion: Motions,
+    end: Vectors, position: Vectors,
+):  # fmt: skip
     """Give particles their places, a share of their velocity and a rigid motion; bodies without a share stay as they are.
 
     A motion is [0] the shift, [1] the velocity, [2] the spin, [3] the center, [4] the share, three times.
     """
-    p = flight.who[i]
+    p = who[i]
     b = flight.body[i]
     s = motion[b, 4][0]
     if s >= 0.0:
         x = end[i] + motion[b, 0]
         w = motion[b, 2]
         position[p] = x
-        flight.velocity[p] = s * flight.velocity[p] + motion[b, 1] + wp.cross(w, x - motion[b, 3])
-        if flight.gradient_u:
-            flight.gradient_u[p] = s * flight.gradient_u[p] + wp.vec3(0.0, -w[2], w[1])
-            flight.gradient_v[p] = s * flight.gradient_v[p] + wp.vec3(w[2], 0.0, -w[0])
+        velocity[p] = s * velocity[p] + motion[b, 1] + wp.cross(w, x - motion[b, 3])
+        if gradient_u:
+            gradient_u[p] = s * gradient_u[p] + wp.vec3(0.0, -w[2], w[1])
+            gradient_v[p] = s * gradient_v[p] + wp.vec3(w[2], 0.0, -w[0])
             if flight.planes == 2:
-                flight.gradient_w[p] = s * flight.gradient_w[p] + wp.vec3(-w[1], w[0], 0.0)
+                gradient_w[p] = s * gradient_w[p] + wp.vec3(-w[1], w[0], 0.0)

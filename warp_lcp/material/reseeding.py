@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import typing
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.particle_loops import PARTICLE, ListMemory
 from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.particles_kernels import offset_kernel
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.material import reseeding_kernels as kernels
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph, clear, launch
+
+COST = 8 * PARTICLE  # of a cell that wants particles, in cells of a usual pass
 
 
 class Reseeding:
@@ -52,10 +59,22 @@ class Reseeding:
         beside = grid.window(low[::-1], [n - 1 for n in high[::-1]], grow=1).common(grid.domain)
         assert beside is not None, "a process has cells"
         self._asked = beside  # cells that may take: this process's, and those beside them
+        self._inside = ActiveWindow(grid.domain)  # those of a step
+        self._setting = self._settings()
+        self._seed, self._list = Scalar(), ListMemory(grid.device)
+        self._finding, self._exchanging = (LaunchGraph(grid.device, f, at_once=grid.part.at_once) for f in (self._find, self._exchange))
         self._offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
         self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)  # of takers, and of particles moved
         steps = [(-1, 0, 1) if axis < grid.dimension else (0,) for axis in (2, 1, 0)]
         self._directions = sorted((d for d in itertools.product(*steps) if any(d)), key=lambda d: sum(map(abs, d)))
+
+    def _settings(self) -> typing.Any:
+        """Return what is the same for all cells and steps, as kernels take it."""
+        grid, s = self.grid, kernels.ReseedingSetting()
+        s.planes, s.dx, s.inverse_dx = grid.planes, grid.spacing, 1.0 / grid.spacing
+        s.origin, s.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
+        s.least, s.at_rest, s.most = self.least, self.particles_a_cell, self.most
+        return s
 
     def apply(self, particles: Particles, window: Window, step: int) -> int:
         """Move particles; return their number.
@@ -65,36 +84,47 @@ class Reseeding:
             window: cells that hold all particles, with two to spare on each side.
             step: number of the step, which the random part of the new places depends on.
         """
-        part = self.grid.part
-        if not part.ranks.any(particles.count > 0):
+        ranks = self.grid.part.ranks
+        if not ranks.any(particles.count > 0):
             return 0
-        grid = self.grid
         particles.arrange(SORTED)
-        offsets = particles.offsets
-        if offsets is None:
-            offsets = self._offsets
-            wp.launch(offset_kernel, grid.size + 1, [particles.key, particles.count, offsets], device=grid.device)
-        self._numbers.zero_()
-        window.launch(kernels.count_kernel, [offsets, self._count])
-        part.fill(self._count)
-        before = self._held()
-        b, s = self.boundary, kernels.ReseedingSetting()
-        s.planes, s.seed, s.dx, s.inverse_dx = grid.planes, step, grid.spacing, 1.0 / grid.spacing
-        s.origin, s.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
-        s.least, s.at_rest, s.most = self.least, self.particles_a_cell, self.most
         inside = window.common(self._asked)  # beyond open sides lies air without particles, and nothing beyond that
+        self._seed.value = step
         if inside is not None:
-            inside.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
-        takers = int(self._numbers.numpy()[0])
-        if not part.ranks.any(takers > 0):
+            self._inside.move_to(inside)
+        variant = window.near is None, inside is None or inside.near is None
+        self._finding.run(particles, window, inside is None, variant=variant)
+        before, takers = self._held(), int(self._numbers.numpy()[0])
+        if not ranks.any(takers > 0):
             particles.drop_ghosts()
             return 0
-        inputs = [s, self._takers, offsets, self._count, particles.position, self._numbers]
-        for direction in self._directions:
-            wp.launch(kernels.exchange_kernel, takers, [wp.vec3i(*direction), *inputs], device=grid.device)
-            part.fill(self._count)
+        self._list.take(takers, {"takers": self._takers})
+        self._exchanging.run(particles)
         particles.drop_ghosts()
         return self._moved(before)
+
+    def _find(self, particles: Particles, window: Window, nothing: bool) -> None:
+        """Launch the count of the particles of each cell, and the search for cells that want some, of which there may be none."""
+        b, offsets = self.boundary, particles.offsets
+        if offsets is None:
+            offsets, count = self._offsets, particles.listed_count
+            launch(offset_kernel, self.grid.size + 1, [particles.key, count, offsets], device=self.grid.device)
+        clear(self._numbers)
+        window.launch(kernels.count_kernel, [offsets, self._count])
+        self.grid.part.fill(self._count)
+        if not nothing:
+            inputs = [self._setting, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers]
+            self._inside.launch(kernels.find_kernel, inputs)
+
+    def _exchange(self, particles: Particles) -> None:
+        """Launch what lets cells take from their neighbors, one direction after another."""
+        offsets = self._offsets if particles.offsets is None else particles.offsets
+        count = int(self._list.count.value)
+        inputs = [self._seed, self._setting, self._takers, offsets, self._count, particles.position, self._numbers]
+        for direction in self._directions:
+            given = [wp.vec3i(*direction), *inputs]
+            launch_list(kernels.exchange_kernel, count, given, device=self.grid.device, cost=COST, ordered=True)
+            self.grid.part.fill(self._count)
 
     def _held(self) -> np.ndarray | None:
         """Return how many particles the cells of a rank hold, before any has moved; None: one process counts what it moves."""

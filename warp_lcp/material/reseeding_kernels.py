@@ -3,10 +3,9 @@
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kernel, list_kernel
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
-from warp_lcp.rows.compiler import forward_kernel
 
 JITTER = 0.25  # of half a cell: how far from the center of its part of a cell a particle is put at random, as at the start
 FULL = 0.75  # of what the cells around one can hold: less, and it is near a surface (a level one: 2/3), or in a bubble of more than a cell
@@ -22,7 +21,6 @@ class ReseedingSetting:
     planes: int
     origin: wp.vec3i  # cells of a larger grid before the first one of this
     across: wp.vec2i  # stored cells of the larger grid along x and y
-    seed: int
     dx: float
     inverse_dx: float
     least: int
@@ -79,14 +77,13 @@ def emptiest(planes: int, cell: wp.vec3i, start: int, here: int, inverse_dx: flo
     return part
 
 
-@forward_kernel(module="warp_lcp.material.reseeding")
-def exchange_kernel(way: wp.vec3i, s: ReseedingSetting, takers: INTS, offsets: INTS, count: I32, position: POINTS, numbers: INTS):
-    """Let each cell that wants particles take some from the neighbor in one direction.
+@wp.func
+def take_from(cell: int, way: wp.vec3i, seed: int, s: ReseedingSetting, offsets: INTS, count: I32, position: POINTS, numbers: INTS):
+    """Let a cell that wants particles take some from the neighbor in one direction.
 
     No race, though a cell may be the neighbor of another that takes: whoever gives holds more than `at_rest` before and no less after,
     whoever takes holds less before and no more after.
     """
-    cell = takers[wp.tid()]
     i = cell % count.shape[2]
     j = (cell // count.shape[2]) % count.shape[1]
     k = cell // (count.shape[2] * count.shape[1])
@@ -107,7 +104,7 @@ def exchange_kernel(way: wp.vec3i, s: ReseedingSetting, takers: INTS, offsets: I
     taken = int(0)
     while gives > at_rest and (has < least or (has < at_rest and gives > most)):
         part = (first_part + has - here) % (2 << planes)
-        state = wp.rand_init(s.seed, own * 64 + has)
+        state = wp.rand_init(seed, own * 64 + has)
         x = float(place[0] - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
         y = float(place[1] - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
         z = float(place[2] - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)
@@ -119,3 +116,11 @@ def exchange_kernel(way: wp.vec3i, s: ReseedingSetting, takers: INTS, offsets: I
     count[k, j, i] = has
     count[k + dk, j + dj, i + di] = gives
     wp.atomic_add(numbers, 1, taken)
+
+
+@list_kernel("warp_lcp.material.reseeding")
+def exchange_kernel(
+    i, way: wp.vec3i, seed: int, s: ReseedingSetting, takers: INTS, offsets: INTS, count: I32, position: POINTS, numbers: INTS
+):
+    """Let each cell that wants particles take some from the neighbor in one direction."""
+    take_from(takers[i], way, seed, s, offsets, count, position, numbers)
