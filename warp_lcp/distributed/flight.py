@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -111,14 +111,14 @@ class SharedFlights(Flights):
 
     def _board(self, particles: Particles) -> int:
         particles.number()  # without ghosts
-        count = super()._board(particles)
-        who, tree = (found.numpy() for found in (self._flight.who, self._flight.body))
+        count, flight = super()._board(particles), cast(Any, self._flight)
+        who, tree = flight.who.numpy(), flight.body.numpy()
         body = self._row[tree[:count]]
         flying = np.flatnonzero(body >= 0)
         who[: len(flying)], tree[: len(flying)] = who[flying], body[flying]
         if self.grid.device.is_cuda:
-            self._flight.who.assign(who)
-            self._flight.body.assign(tree)
+            flight.who.assign(who)
+            flight.body.assign(tree)
         return len(flying)
 
     def _everyone(self, particles: Particles) -> int:
