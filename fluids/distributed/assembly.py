@@ -10,7 +10,6 @@ from warp_lcp.distributed.narrow_band import SharedNarrowBand
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
-from warp_lcp.distributed.sources import SharedSources
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed.simulation import DistributedLiquid
 from warp_lcp.fluids.scene import LiquidScene
@@ -41,7 +40,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
 
     def make_parts(part: Subdomain) -> Parts:
         boundary, warnings[:] = boundary_of_part(scene, part, solids)
-        sources = make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part))
+        sources = make_sources(scene, part.grid, boundary, folder)
         return Parts(boundary, sources, make_narrow_band(scene, part.grid, boundary, folder, partial(SharedNarrowBand, part)))
 
     parts = make_parts(part)

@@ -9,7 +9,6 @@ from warp_lcp.distributed.bodies import SharedBodies
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
-from warp_lcp.distributed.sources import SharedSources
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.distributed.simulation import DistributedSand
 from warp_lcp.granular.scene import SandScene
@@ -43,7 +42,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
         boundary, notes = boundary_of_part(scene, part, placed)
         solids = SandSolids(part.grid, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source), cuts=True)
         warnings[:] = [*notes, *solids.notes]
-        return Parts(boundary, make_sources(scene, part.grid, boundary, folder, partial(SharedSources, part)), solids=solids)
+        return Parts(boundary, make_sources(scene, part.grid, boundary, folder), solids=solids)
 
     parts = make_parts(part)
     particles, notes = particles_of_part(scene, part, parts, folder)

@@ -231,10 +231,8 @@ def start_velocities(scene: ParticleScene) -> np.ndarray:
     return np.array([_vector(material.velocity or [0.0, 0.0]) for material in scene.materials()[1]] or [_vector([0.0, 0.0])])
 
 
-def make_sources(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, make: Callable[..., Sources] = Sources
-) -> Sources | None:
-    """Return the scene's sources, if it has any, made by what takes the arguments of `Sources`.
+def make_sources(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> Sources | None:
+    """Return the scene's sources, if it has any; collective.
 
     Raises:
         ValueError: a source has no open cell.
@@ -254,7 +252,7 @@ def make_sources(
         for number, source in enumerate(scene.source)
     ]
     settings = scene.particles
-    return make(grid, boundary, sources, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed)
+    return Sources(grid, boundary, sources, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed)
 
 
 def make_outlets(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> Outlets | None:

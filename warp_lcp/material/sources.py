@@ -87,8 +87,10 @@ class Sources:
         self._slots = np.zeros(grid.shape, dtype=np.int32)
         self._slots[tuple((cells + 1).T)] = np.arange(1, len(cells) + 1)
         self._owner = owner[tuple(cells.T)].astype(np.int32)
-        self._check_cells(np.bincount(self._owner, minlength=len(self.sources)))
-        self._emits = np.ones(1 + len(cells), dtype=bool)  # by slot
+        part = grid.part
+        self._check_cells(part.ranks.sum(np.bincount(self._owner, minlength=len(self.sources))))
+        low, high = np.array(part.owned.low) - 1, np.array(part.owned.high) - 1
+        self._emits = np.append(True, ((cells >= low) & (cells < high)).all(axis=1))  # by slot: whether the cell is this process's
         self._boxes = [self._box(cells[self._owner == number]) for number in range(len(self.sources))]
         device = grid.device
         self._fields = [
@@ -149,7 +151,7 @@ class Sources:
         self._imposing.run(velocity, known, shown, False, variant=(*own, False))
 
     def emit(self, particles: Particles, before: float | None, now: float) -> int:
-        """Add the incoming particles and return their number.
+        """Add the incoming particles of this process's cells, and return their number; collective.
 
         Args:
             particles: the material (updated).
@@ -167,7 +169,7 @@ class Sources:
             found = self._entered(number, min(max(since, start), now) if starts else since, now, starts=starts)
             if len(found[-1]):
                 entered.append((number, found))
-        if not self._anything(entered):
+        if not entered and not self.grid.part.shared:  # ranks count together
             return 0
         held = self._occupants(particles) / self.per_axis**self.grid.dimension
         emitted = 0
@@ -176,10 +178,6 @@ class Sources:
             particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape), source.kept)
             emitted += len(points)
         return emitted
-
-    def _anything(self, entered: Sequence[typing.Any]) -> bool:
-        """Return whether points of a lattice have entered a source."""
-        return len(entered) > 0
 
     def _check_cells(self, counts: np.ndarray) -> None:
         """Refuse sources without an open cell, given how many each has."""
@@ -191,9 +189,23 @@ class Sources:
                 )
 
     def _occupants(self, particles: Particles) -> np.ndarray:
-        """Return how many particles each cell holds."""
+        """Return how many particles each cell holds, of all processes: some have come into cells that are not their process's yet."""
         self._counting.run(particles)
-        return np.asarray(self._counts.numpy())
+        mine, part = np.asarray(self._counts.numpy()), self.grid.part
+        if part.across is None:
+            return mine
+        nx, ny, _ = self.grid.domain_counts
+        k, j, i = (self._cells + np.array(self.grid.origin)[::-1]).T.astype(np.int64)
+        cells = (k * ny + j) * nx + i
+        found = np.flatnonzero(mine)
+        everyone = np.concatenate(part.ranks.collect(np.stack([cells[found], mine[found]])), axis=1)
+        order = np.argsort(cells)
+        place = np.searchsorted(cells[order], everyone[0])
+        known = place < len(cells)
+        known[known] = cells[order][place[known]] == everyone[0][known]
+        total = np.zeros(len(cells), dtype=np.int64)
+        np.add.at(total, order[place[known]], everyone[1][known])
+        return total
 
     def _count(self, particles: Particles) -> None:
         """Launch the count of the particles in each cell."""
