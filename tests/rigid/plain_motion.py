@@ -27,6 +27,11 @@ def rotation_by(vector):
     return np.eye(3) + sinc(angle) * K + (0.5 * sinc(0.5 * angle) ** 2 * K) @ K
 
 
+def orthonormal(rotation):
+    """The rotations nearest to almost orthonormal matrices R: R (3 - R'R) / 2 is Newton's step to the polar factor."""
+    return 0.5 * rotation @ (3.0 * np.eye(3) - rotation.swapaxes(-1, -2) @ rotation)
+
+
 def advanced(values, mass, inverse_inertia, dt):
     """Values of bodies, shape (n, 26), after times dt, shape (n,)."""
     values, time = values.copy(), dt[:, None]
@@ -38,8 +43,7 @@ def advanced(values, mass, inverse_inertia, dt):
         left = left[~(np.abs(half[left] - before).max(axis=1) <= 1e-15)]
         if not len(left):
             break
-    turned = rotation_by(2.0 * half) @ R
-    turned = 0.5 * turned @ (3.0 * np.eye(3) - turned.swapaxes(-1, -2) @ turned)
+    turned = orthonormal(rotation_by(2.0 * half) @ R)
     values[:, :3] += time * (values[:, 12:15] / mass[:, None])
     values[:, 3:12] = turned.reshape(-1, 9)
     values[:, 18] += dt * spins(turned, inverse_inertia, L)[:, 2]

@@ -4,12 +4,13 @@ from copy import copy
 
 import numpy as np
 import pytest
+from plain_motion import orthonormal
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid import motion as prescribed
 from warp_lcp.grid.motion import Motion, Motions
-from warp_lcp.rigid.body import BodyMotion, BodyStates, RigidBody, orthonormal
+from warp_lcp.rigid.body import BodyMotion, BodyStates, RigidBody
 from warp_lcp.rigid.mass_properties import MassProperties
 
 CENTER = np.array([0.3, -0.2, 0.7])

@@ -438,14 +438,6 @@ def shift_states(values: np.ndarray, ways: np.ndarray) -> None:
     values[:, ANGLE] += ways[:, 5]
 
 
-def orthonormal(rotation: np.ndarray) -> np.ndarray:
-    """Return the rotations nearest to almost orthonormal matrices, shape (..., 3, 3).
-
-    R (3 - R'R) / 2 is Newton's step to the polar factor of R (Newton-Schulz): |R'R - 1| = d becomes 3/4 d^2, which is below rounding.
-    """
-    return np.asarray(0.5 * rotation @ (3.0 * UNIT - rotation.swapaxes(-1, -2) @ rotation))
-
-
 def rotation_by(vector: np.ndarray) -> np.ndarray:
     """Return matrices of rotations by |v| [rad] about vectors v, shape (..., 3).
 

@@ -100,7 +100,7 @@ class PlanarContacts:
         self.still = all(obstacle.motion is None for obstacle in self.obstacles)
         self._standing = [self._placed(obstacle, 0.0) if obstacle.motion is None else None for obstacle in self.obstacles]
         self._around: tuple[float, np.ndarray] | None = None  # obstacles that all stand, and the margin around them
-        self._capacity = 64
+        self._capacity = 8 * (len(shapes) + 8)  # contacts
         self._masses = np.concatenate(
             [np.ravel(of) for of in (bodies.mass, bodies.inverse_inertia, np.linalg.cholesky(bodies.inverse_inertia))]
         )

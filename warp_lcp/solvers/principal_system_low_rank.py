@@ -117,6 +117,8 @@ class LowRankCorrection:
         self._of_slot = wp.zeros(n, dtype=wp.int32, device=device)
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
+        self._spare = self._Z  # in which potentials lie that get other slots
+        self._bound: dict[int, tuple[Reduction, Any, Any]] = {}  # by the number of slots
         self._dots: Reduction | None = None
         self._slot_columns = list[int]()
         self._seen = np.zeros(n)  # U_q' U_q when a potential was made
@@ -193,22 +195,34 @@ class LowRankCorrection:
         """Give these columns slots; those that have one keep their potentials, the others' must be made."""
         old, low, n = {q: slot for slot, q in enumerate(self._slot_columns)}, self._low, self._size
         kept = [q for q in strong if q in old and self._seen[q] > 0.0]
-        before = wp.clone(self._Z) if kept else self._Z
+        before = self._Z
+        if kept:
+            if self._spare.size < before.size:
+                self._spare = wp.empty_like(before)
+            wp.copy(self._spare, before, count=before.size)
+            before = self._spare
         if len(strong) * n > self._Z.size:
             self._Z = wp.zeros(len(strong) * n, dtype=before.dtype, device=before.device)
+            self._bound = {}
         order = np.zeros(low.rank, dtype=np.int32)
         order[: len(strong)] = strong
         self._of_slot.assign(order)
         self._slot_columns = strong
-        self._dots, finest = None, self._hierarchy.finest
+        self._dots = None
         if strong:
-            rows, slots = finest.stencil.rows, len(strong)
-            self._dots = Reduction(n, low.device, self._sums, columns=len(strong), threads=rows.places, across=low.layout.across)
-            self._multiply = DOTS.bind(rows, r=finest.b, out=self._dots.partials, Z=self._Z, slots=slots, size=n)
-            self._subtract = SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, Z=self._Z, slots=slots, size=n)
+            if len(strong) not in self._bound:
+                self._bound[len(strong)] = self._bind(len(strong))
+            self._dots, self._multiply, self._subtract = self._bound[len(strong)]
         for q in kept:
             wp.copy(self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n)
         self._seen[[q for q in range(low.rank) if q not in kept]] = 0.0
+
+    def _bind(self, slots: int) -> tuple[Reduction, Any, Any]:
+        """Return the sums Z'r of so many slots, what multiplies them, and what subtracts Z t."""
+        finest, rows, n, across = self._hierarchy.finest, self._hierarchy.finest.stencil.rows, self._size, self._low.layout.across
+        dots = Reduction(n, self._low.device, self._sums, columns=slots, threads=rows.places, across=across)
+        multiply = DOTS.bind(rows, r=finest.b, out=dots.partials, Z=self._Z, slots=slots, size=n)
+        return dots, multiply, SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, Z=self._Z, slots=slots, size=n)
 
     def _fill(self, columns: list[int], squares: np.ndarray) -> None:
         """Make the potentials B U_q of columns."""

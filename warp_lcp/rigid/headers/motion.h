@@ -45,7 +45,9 @@ const auto advance = [&](double *values, double mass, const double *inverse, dou
     for (int i = 0; i < 3; ++i) half[i] *= 2.0;
     rotation_by(half, turn);
     product(turn, R, turned);
-    double scaled[9], rest[9];  // Newton's step to the nearest rotation
+    // R (3 - R'R)/2: Newton's step to the nearest rotation (Newton-Schulz), |R'R - 1| = d becomes
+    // 3/4 d^2, which is below rounding
+    double scaled[9], rest[9];
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) rest[3*i + j] = (i == j ? 3.0 : 0.0)
             - along(turned + i, 3, turned + j, 3);
