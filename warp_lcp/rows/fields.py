@@ -57,8 +57,7 @@ def zeros(n: int | tuple[int, ...], dtype: Any, device: wp.Device, *, small_page
         host: np.ndarray = np.frombuffer(memory, dtype=np.uint8)
     else:
         host = np.zeros(size, dtype=np.uint8)
-    where = ctypes.addressof(ctypes.c_char.from_buffer(host.data))
-    return wp.array(ptr=where, dtype=dtype, shape=shape, device=device, deleter=partial(_release, host))
+    return wp.array(ptr=host.__array_interface__["data"][0], dtype=dtype, shape=shape, device=device, deleter=partial(_release, host))
 
 
 def _release(host: np.ndarray, pointer: int, size: int) -> None:
