@@ -30,17 +30,17 @@ LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE
 """
 
 
-def forward_kernel(*, module: str, **options: Any) -> Any:
+def forward_kernel(*, module: Any, **options: Any) -> Any:
     """Declare a Warp kernel without a backward pass, in a module of the project.
 
     Args:
-        module: Warp module of the kernel, see `project_module`.
+        module: Warp module of the kernel, or its name; see `project_module`.
         **options: of `wp.kernel`.
 
     Returns:
         The decorator.
     """
-    project_module(module)
+    project_module(module if isinstance(module, str) else module.name)
     return wp.kernel(enable_backward=False, module=module, **options)
 
 
