@@ -176,7 +176,7 @@ class Level:
         `kind` may be one that goes into or out of a ring; `rows` are all unless told.
         """
         lower, upper = self._sides(projected)
-        start = {"from_zero": from_zero} if "from_zero" in kind.numbers else {}
+        start: dict[str, Any] = {"from_zero": from_zero} if "from_zero" in kind.numbers else {}
         make = lambda: kind.bind(  # noqa: E731
             rows or self.stencil.rows, stencil=self.stencil, x=x, y=y, b=self.b, lower=lower, upper=upper, omega=omega,
             projected=projected, **start,
