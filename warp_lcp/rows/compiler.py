@@ -18,12 +18,7 @@ INLINE_FIRST = "-mllvm=-enable-module-inliner"
 INLINE_FIRST_VERSIONS = ("1.19",)
 # Not so in these modules: sums of the first three would be rounded in another order; the last one has
 # large functions that are called from many places, and would be four times as long.
-INLINE_LATER = (
-    "fluids.viscosity",
-    "warp_lcp.interior_point.",
-    "warp_lcp.nonsmooth_map.",
-    "warp_lcp.grid.mesh_crossings",
-)
+INLINE_LATER = ("fluids.viscosity", "warp_lcp.interior_point.", "warp_lcp.nonsmooth_map.", "warp_lcp.grid.mesh_crossings")
 # Warp writes functions to add structs for gradients. Local to the module, they are not compiled.
 LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE
 #define CUDA_CALLABLE __attribute__((internal_linkage))
