@@ -12,30 +12,36 @@ import warp as wp
 # compiled, not again in each module. Neither changes a module's object code.
 HEADER_FLAGS = "-DWP_NO_BFLOAT16= -fpch-instantiate-templates"
 # LLVM inlines the functions of a module before it optimizes any, instead of optimizing a kernel again
-# at each level of calls: a fifth less time for code of the same size. An option of LLVM that a later
-# version may not have, where no kernel would compile: so for versions of Warp that it was tried with.
+# at each level of calls: a fifth less time for code of the same size.
 INLINE_FIRST = "-mllvm=-enable-module-inliner"
-INLINE_FIRST_VERSIONS = ("1.19",)
-# Not so in these modules: sums of the first two would be rounded in another order; the last one has
+# Not so in these modules: sums of the first three would be rounded in another order; the last one has
 # large functions that are called from many places, and would be four times as long.
-INLINE_LATER = ("warp_lcp.interior_point.", "warp_lcp.nonsmooth_map.", "warp_lcp.grid.mesh_crossings")
+INLINE_LATER = (
+    "fluids.viscosity",
+    "warp_lcp.interior_point.",
+    "warp_lcp.nonsmooth_map.",
+    "warp_lcp.grid.mesh_crossings",
+)  # fmt: skip
 # Warp writes functions to add structs for gradients. Local to the module, they are not compiled.
 LOCAL_FUNCTIONS = """#undef CUDA_CALLABLE
 #define CUDA_CALLABLE __attribute__((internal_linkage))
 """
+# Versions of Warp with which INLINE_FIRST and LOCAL_FUNCTIONS were tried. Others might not have that
+# option of LLVM, and then no kernel would compile, or this experimental interface.
+TRIED_VERSIONS = ("1.19",)
 
 
-def forward_kernel(*, module: str, **options: Any) -> Any:
+def forward_kernel(*, module: Any, **options: Any) -> Any:
     """Declare a Warp kernel without a backward pass, in a module of the project.
 
     Args:
-        module: Warp module of the kernel, see `project_module`.
+        module: Warp module of the kernel, or its name; see `project_module`.
         **options: of `wp.kernel`.
 
     Returns:
         The decorator.
     """
-    project_module(module)
+    project_module(module if isinstance(module, str) else module.name)
     return wp.kernel(enable_backward=False, module=module, **options)
 
 
@@ -47,13 +53,10 @@ def project_module(name: str) -> Any:
     kernel of the module is declared.
     """
     flags = wp.config.cpu_compiler_flags
-    flags = "-march=native" if flags is None else flags  # what Warp takes for None
-    checked = ".".join(wp.__version__.split(".")[:2]) in INLINE_FIRST_VERSIONS
-    inline_first = checked and not name.startswith(INLINE_LATER)
-    added = [HEADER_FLAGS, INLINE_FIRST] if inline_first else [HEADER_FLAGS]
-    options = {
-        "cpu_compiler_flags": " ".join([flags, *added]).strip(),
-        "extra_build_options": wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS),
-    }
-    wp.set_module_options(options, module=name)
+    words = ["-march=native" if flags is None else flags, HEADER_FLAGS]  # what Warp takes for None
+    options: dict[str, Any] = {}
+    if ".".join(wp.__version__.split(".")[:2]) in TRIED_VERSIONS:
+        options["extra_build_options"] = wp.ModuleBuildOptions(extra_cpu_preamble=LOCAL_FUNCTIONS)
+        words += [] if name.startswith(INLINE_LATER) else [INLINE_FIRST]
+    wp.set_module_options({**options, "cpu_compiler_flags": " ".join(words).strip()}, module=name)
     return wp.get_module(name)
