@@ -100,7 +100,7 @@ class SandSimulation(ParticleSimulation):
         self.carried = None if self.bodies is None else self._carried(self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress, self.outcome = self._stresses(box=box, rate=rate, bodies=self.carried)
-        self._work = self.method.init(self.stress)
+        self._work: Any = self.method.init(self.stress)
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
 
