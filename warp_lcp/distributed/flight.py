@@ -112,13 +112,13 @@ class SharedFlights(Flights):
     def _board(self, particles: Particles) -> int:
         particles.number()  # without ghosts
         count = super()._board(particles)
-        who, tree = (found.numpy() for found in (self._flight.who, self._flight.body))
+        who, tree = (found.numpy() for found in (self._who, self._body))
         body = self._row[tree[:count]]
         flying = np.flatnonzero(body >= 0)
         who[: len(flying)], tree[: len(flying)] = who[flying], body[flying]
         if self.grid.device.is_cuda:
-            self._flight.who.assign(who)
-            self._flight.body.assign(tree)
+            self._who.assign(who)
+            self._body.assign(tree)
         return len(flying)
 
     def _everyone(self, particles: Particles) -> int:
