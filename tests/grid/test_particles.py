@@ -184,6 +184,18 @@ def test_removing_keeps_the_others_in_order_and_in_place(keep: float) -> None:
     np.testing.assert_array_equal(particles.position.numpy()[-3:], position[:3])
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_removed_particles_are_counted_by_their_marks(seed: int) -> None:
+    draw = np.random.default_rng([99, seed])
+    particles = random_particles(FLAT, 300, seed)
+    for _ in range(3):
+        marks, position = draw.choice([0, 0, 0, 1, 2, 7], particles.count), particles.position.numpy().copy()
+        particles.marks.assign(marks.astype(np.int32))
+        particles.launch_removal(particles.marks)
+        assert particles.finish_removal(particles.marks) == ((marks == 1).sum(), (marks > 1).sum())
+        np.testing.assert_array_equal(particles.position.numpy(), position[marks == 0])
+
+
 def test_there_may_be_no_particles() -> None:
     particles = Particles(FLAT, np.zeros((0, 3)), np.zeros((0, 3)), affine=True, indexed=True)
     particles.arrange(0)

@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from small_liquids import advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.material.sources import Sources
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.run.stepping import take_step
 from warp_lcp.simulation import SimulationFailed
@@ -113,6 +114,66 @@ def test_what_comes_in_askew_does_not_depend_on_the_steps() -> None:
     area = 0.125 * 0.7 + 0.0625 * 1.2
     row = area / np.hypot(1.2, 0.7) * 64
     assert counts.pop() == pytest.approx(8 * 4 + area * 0.144 * 64**2, abs=row)
+
+
+def mixed(word: np.ndarray) -> np.ndarray:
+    """Return the finalizer of SplitMix64 of 64-bit words."""
+    word = word + np.uint64(0x9E3779B97F4A7C15)
+    word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return word ^ (word >> np.uint64(31))
+
+
+def lattice_points(sources: Sources, number: int, low: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return jittered points of a source's lattice before it moves [m], x fastest, shape (n, 3)."""
+    k, j, i = np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij")
+    lattice = np.stack([i.ravel(), j.ravel(), k.ravel()], axis=1) + low
+    with np.errstate(over="ignore"):
+        state = np.full(len(lattice), ((sources.random_seed + number) * 0x9E3779B97F4A7C15 + 1) % 2**64, dtype=np.uint64)
+        for word in lattice.astype(np.int64).astype(np.uint64).T:
+            state = mixed(state ^ word)
+        drawn = [mixed(state + np.uint64((axis + 1) * 0x9E3779B97F4A7C15 % 2**64)) for axis in range(3)]
+    jitter = sources.jitter * (np.stack(drawn, axis=1).astype(np.float64) / 2.0**64 - 0.5)
+    return (lattice + 0.5 + jitter) * (sources.grid.spacing / sources.per_axis)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_points_enter_cells_as_a_fine_look_along_their_way_tells(seed: int) -> None:
+    """The kernel's cells at both ends and its numbers of entries are those of 4000 places along each point's way."""
+    draw = np.random.default_rng([20261129, seed])
+    dimension = 2 + seed % 2
+    low = draw.integers(2, 6, dimension) / 16
+    high = low + draw.integers(1, 4, dimension) / 16
+    way = draw.normal(size=dimension)
+    velocity = np.append(way / np.abs(way).max(), np.zeros(3 - dimension))
+    source = box(list(low), list(high), velocity=velocity[:dimension].tolist())
+    simulation = create(scene(size=[1.0] * dimension, resolution=16, liquid=[], source=[source], particles={"seed": seed}))
+    sources, since = simulation.sources, draw.uniform(0.0, 3.0)
+    now = since + draw.uniform(0.01, 0.2)
+    sources._entered(0, since, now, starts=False)
+    count = int(sources._lattice.count.value)
+    entries, slot, filled, points = (array[:count] for array in sources._found)
+    span = sources._span_on_host
+    first, sizes = span[9:12], np.append(span[12:14], count / span[12:14].prod()).astype(int)
+    at_rest = lattice_points(sources, 0, first, sizes)
+
+    def cells(time: float) -> np.ndarray:
+        x = (at_rest + velocity * time) / sources.grid.spacing
+        cell = np.clip(np.floor(x[:, ::-1]).astype(int) + 1, 0, np.array(sources.grid.shape) - 1)
+        if dimension == 2:
+            cell[:, 0] = 1
+        return sources._slots[tuple(cell.T)]
+
+    np.testing.assert_array_equal(filled, cells(since))
+    looks = np.array([cells(time) for time in np.linspace(since, now, 4001)]) > 0
+    came = (looks[1:] & ~looks[:-1]).sum(axis=0)
+    assert (entries != came).mean() < 2e-3  # those that graze a corner between two looks
+    assert entries.sum() > 0
+    last = cells(now)
+    stays = (entries == 1) & (last > 0) & (came == 1)
+    assert (slot[stays] > 0).all()
+    inside = points[stays][:, :dimension]
+    np.testing.assert_allclose(inside, (at_rest + velocity * now)[stays][:, :dimension], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(("ends", "acts"), [((0.1, 0.11), True), ((0.09, 0.1), True), ((0.1004, 0.1008), True), ((0.05, 0.1), False)])

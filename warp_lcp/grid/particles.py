@@ -125,7 +125,12 @@ class Column:
             self._view.slot, self._view.listed = self.slot, memory
 
     def set_from(self, first: int, values: np.ndarray | float) -> None:
-        """Set the vectors in use from a number on: shape (count - first, 3), or one number for all."""
+        """Set the vectors in use from a number on.
+
+        Args:
+            first: that number.
+            values: shape (count - first, 3), or one number for all.
+        """
         if self._host is not None:
             self._host[first : self.count] = values
         elif isinstance(values, np.ndarray):
@@ -289,7 +294,10 @@ class Particles:
         return sum(self.finish_removal(marks))
 
     def launch_removal(self, marks: wp.array) -> None:
-        """Launch `remove`, or record it; `finish_removal` then ends it. There are particles."""
+        """Launch the removal of marked particles, of which there are some.
+
+        It may be recorded; `finish_removal` then ends it.
+        """
         self._removal.run(marks)
 
     def _launch_removal(self, marks: wp.array) -> None:

@@ -122,8 +122,9 @@ class Flights:
         if bodies <= len(self._vectors) and most <= len(self._start):
             return
         rows = max(ROOM * bodies, LEAST)
-        flight.who, flight.body = (wp.zeros(most, dtype=wp.int32, device=device) for _ in range(2))
-        self._list.take(0, {"who": flight.who})
+        self._who, self._body = (wp.zeros(most, dtype=wp.int32, device=device) for _ in range(2))
+        flight.who, flight.body = self._who, self._body
+        self._list.take(0, {"who": self._who})
         flight.sums = wp.zeros((rows, kernels.COLUMNS), dtype=wp.int64, device=device)
         self._vectors = np.zeros((rows, VECTORS, 3), dtype=np.float32)
         self._motion = wp.array(self._vectors, dtype=wp.vec3, device=device, copy=device.is_cuda)
@@ -134,7 +135,7 @@ class Flights:
 
     def _launch_boarding(self, particles: Particles) -> None:
         """Launch the list of the particles of bodies."""
-        inputs = [particles.key, self._parent, self._number, self._flight.who, self._flight.body, self._count.array]
+        inputs = [particles.key, self._parent, self._number, self._who, self._body, self._count.array]
         launch_list(kernels.board_kernel, particles.count, inputs, device=self.grid.device, ordered=True)
 
     def _launch_lift(self, particles: Particles) -> None:
@@ -219,13 +220,13 @@ class Flights:
     def _add(self, kernel: wp.Kernel, particles: Particles, inputs: Sequence[object]) -> None:
         """Launch a kernel that adds up the bodies' particles."""
         flight = self._flight
-        given = [flight.who, flight, self._rate, self._quanta, particles.velocity, *inputs]
+        given = [self._who, flight, self._rate, self._quanta, particles.velocity, *inputs]
         launch_list(kernel, int(self._list.count.value), given, device=self.grid.device, ordered=True)
 
     def _carry(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
         """Launch a kernel that moves the bodies' particles."""
         flight, count = self._flight, int(self._list.count.value)
-        launch_list(kernel, count, [flight.who, flight, *inputs], device=self.grid.device, cost=PARTICLE)
+        launch_list(kernel, count, [self._who, flight, *inputs], device=self.grid.device, cost=PARTICLE)
 
 
 def _about_center(sums: Sums) -> np.ndarray:

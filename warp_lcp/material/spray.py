@@ -9,10 +9,13 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
+from warp_lcp.grid.cell_kernel import launch_list, list_kernel
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import LaunchGraph
 
 EVERY = 8  # steps between looks for particles that have left the others
 TILE = 8  # cells: clusters of particles are told apart by empty tiles between them
@@ -22,14 +25,20 @@ MOST_TILES = 1 << 22  # else they are larger
 CLEAR = 3  # cells from a solid or a wall, and its way in a step: nearer than that it is on the grid
 
 
+<<<<<<< HEAD
 @forward_kernel(module="warp_lcp.material.spray")
+=======
+@list_kernel("warp_lcp.material.spray")
+>>>>>>> wip-stretch2
 @no_type_check
-def fly_kernel(change: wp.vec3, dt: float, position: wp.array(dtype=wp.vec3), velocity: wp.array(dtype=wp.vec3)):
+def fly_kernel(
+    i, change_x: float, change_y: float, change_z: float, dt: float, position: wp.array(dtype=wp.vec3),
+    velocity: wp.array(dtype=wp.vec3),
+):  # fmt: skip
     """Change velocities, then move for a time step."""
-    p = wp.tid()
-    v = velocity[p] + change
-    velocity[p] = v
-    position[p] = position[p] + dt * v
+    v = velocity[i] + wp.vec3(change_x, change_y, change_z)
+    velocity[i] = v
+    position[i] = position[i] + dt * v
 
 
 class Spray:
@@ -60,6 +69,8 @@ class Spray:
             grid.extent,
             grid.dimension,
         )
+        self._numbers = [Scalar() for _ in range(4)]  # change of the velocity [m/s], time step [s]
+        self._flying = LaunchGraph(grid.device, self._launch)
         nothing = np.zeros((0, 3), dtype=np.float32)
         self.particles = Particles(grid, nothing, nothing, affine=False, kept=nothing[:, 0] if keeps else None, indexed=False)
 
@@ -86,7 +97,14 @@ class Spray:
         """Move by a time step [s], after a change of the velocity [m/s], shape (3,)."""
         own = self.particles
         if own.count:
-            wp.launch(fly_kernel, own.count, [wp.vec3(*change), dt, own.position, own.velocity], device=own.grid.device)
+            for number, value in zip(self._numbers, (*change, dt), strict=True):
+                number.value = float(value)
+            self._flying.run()
+
+    def _launch(self) -> None:
+        """Launch the way of the particles in a step."""
+        own = self.particles
+        launch_list(fly_kernel, own.count, [*self._numbers, own.position, own.velocity], device=own.grid.device)
 
     def behind(self, name: str, array: np.ndarray) -> np.ndarray:
         """Return an array of the particles on the grid with that of those that fly behind it, shape (n, 3)."""
