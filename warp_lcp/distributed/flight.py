@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -111,24 +111,14 @@ class SharedFlights(Flights):
 
     def _board(self, particles: Particles) -> int:
         particles.number()  # without ghosts
-<<<<<<< HEAD
-        count, flight = super()._board(particles), cast(Any, self._flight)
-        who, tree = flight.who.numpy(), flight.body.numpy()
-=======
         count = super()._board(particles)
         who, tree = (found.numpy() for found in (self._who, self._body))
->>>>>>> wip-stretch2
         body = self._row[tree[:count]]
         flying = np.flatnonzero(body >= 0)
         who[: len(flying)], tree[: len(flying)] = who[flying], body[flying]
         if self.grid.device.is_cuda:
-<<<<<<< HEAD
-            flight.who.assign(who)
-            flight.body.assign(tree)
-=======
             self._who.assign(who)
             self._body.assign(tree)
->>>>>>> wip-stretch2
         return len(flying)
 
     def _everyone(self, particles: Particles) -> int:

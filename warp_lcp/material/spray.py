@@ -13,7 +13,6 @@ from warp_lcp.grid.cell_kernel import launch_list, list_kernel
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
-from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph
 
@@ -25,11 +24,7 @@ MOST_TILES = 1 << 22  # else they are larger
 CLEAR = 3  # cells from a solid or a wall, and its way in a step: nearer than that it is on the grid
 
 
-<<<<<<< HEAD
-@forward_kernel(module="warp_lcp.material.spray")
-=======
 @list_kernel("warp_lcp.material.spray")
->>>>>>> wip-stretch2
 @no_type_check
 def fly_kernel(
     i, change_x: float, change_y: float, change_z: float, dt: float, position: wp.array(dtype=wp.vec3),
