@@ -107,13 +107,16 @@ class HeavyBallProjectedGradient(Settings):
         return MomentumWorkspace(problem, self)
 
     def step(self, problem: Stress, work: MomentumWorkspace, x: wp.array) -> wl.Step:
-        """Take `check_every` periods of steps, or more where the device decides; evaluate the residual if it is due."""
+        """Take `check_every` periods of steps, or more without the host.
+
+        The residual is evaluated when it is due.
+        """
         taken, due, stagnates = work.take_steps()
         failure = wl.SolveStatus.STAGNATED if stagnates else None
         return wl.Step("projection", taken, failure=failure, interim=True, iterations=taken, due=due, final=True)
 
     def steps(self, stress: Stress) -> tuple[float, float, float]:
-        """Return the lengths of steps of pressure and friction, relative to the diagonal, and the lookahead."""
+        """Return the steps of pressure and friction, and the lookahead."""
         flat = stress.packing.grid.dimension == 2
         return self.pressure_step, self.shear_step * (1.0 if flat else 0.5), self.lookahead
 
@@ -140,11 +143,13 @@ class MomentumWorkspace(StressWorkspace):
         self._allowed = 0
 
     def allow(self, steps: int) -> None:
-        """Say how many steps of the next solve may be taken without the host; 0: it takes each step."""
+        """Limit the steps of the next solve without the host; 0: none."""
         self._allowed, self._leads, self._news = steps, False, None
 
     def begin_ahead(self, guess: None, criteria: wl.StoppingCriteria) -> float | None:
-        """Begin a solve on the device; return the residual at its start, None where the host leads.
+        """Begin a solve on the device; return the residual at its start.
+
+        None: the host leads.
 
         Args:
             guess: None: the solve begins with the stresses as they are.
@@ -167,11 +172,14 @@ class MomentumWorkspace(StressWorkspace):
         return self.norm
 
     def evaluate(self, x: wp.array) -> float:
-        """Return the norm of the natural residual, see the base class; the device may have found it."""
+        """Return the norm of the natural residual; see the base class."""
         return super().evaluate(x) if self._news is None else self._take(self._news)
 
     def take_steps(self) -> tuple[int, bool, bool]:
-        """Take steps; return how many, whether to evaluate the residual, and whether progress has ended."""
+        """Take steps; return their number, and two decisions.
+
+        Whether to evaluate the residual, and whether progress has ended.
+        """
         if self._ahead is None or not self._leads:
             taken = self.method.check_every * PERIOD
             return taken, *self.judge(self.problem.advance(self.method.check_every), taken)

@@ -195,8 +195,9 @@ class Stress(wl.VariationalInequality):
         before = bound.k, bound.cohesion, bound.tension, *map(float, gravity * kick_dt)
         after = dt / self.packing.grid.spacing, bound.gain, bound.halfway
         self._host[:] = *before, 1.0, 1.0, 0.0, *after
-        for number, value in zip(self._yields, (*before, *after), strict=True):
-            number.value = value
+        if self.packing.grid.device.is_cuda:
+            for number, value in zip(self._yields, (*before, *after), strict=True):
+                number.value = value
         self._cells = max(self._count(), 1) if self.shared else None
         self.cold = kick_dt > GROWN * self.kick_dt
         self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
@@ -257,13 +258,16 @@ class Stress(wl.VariationalInequality):
         self._restarting.run()
 
     def set_steps(self, pressure_step: float, shear_step: float, lookahead: float) -> None:
-        """Set the host's copy of the lengths of steps, see `restart`, and the bodies' response to steps so long."""
+        """Set the lengths of steps on the host; see `restart`.
+
+        The bodies' response to a step depends on them.
+        """
         self._host[[PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD]] = pressure_step, shear_step, lookahead
         if self.bodies is not None:
             self.bodies.prepare(self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step)
 
     def start_from_now(self) -> None:
-        """Launch or record what makes the stresses those before, and those at which the gradient is taken."""
+        """Start the momentum from the present stresses; launches or records."""
         for stress in (self._point, self._before):
             copy(stress, self.now)
 
