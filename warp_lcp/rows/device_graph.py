@@ -22,7 +22,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.joined import settle, waits
 from warp_lcp.rows.layout import RowLayout, make_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
-from warp_lcp.rows.program import Conditional, DeviceCopy, Program, Task
+from warp_lcp.rows.program import Conditional, DeviceCopy, Loop, Program, Task
 
 ALIGNED = 16  # bytes
 FIRST = "tasks_"  # member of a kernel's arguments: number of its tasks
@@ -263,8 +263,16 @@ class DeviceProgram(Program):
             self.launch_now()
 
     def launch_now(self) -> None:
-        """Launch the graph with what its buffer holds."""
-        super().run()
+        """Launch the graph with what its buffer holds; loops that are new launch a graph of their own."""
+        if self._runs:
+            super().run()
+        else:
+            for command in self._commands:
+                if isinstance(command, Loop):
+                    command.program.run_while(command.condition)
+                else:
+                    command.launch()
+            self._runs = 1
         self._note_copy()
 
     def note_launch(self) -> None:

@@ -378,11 +378,19 @@ class Program:
         if RECORDING.program is not None and self.device.is_cuda:
             RECORDING.program.record(Loop(condition, self))
         elif self._loops_here():
-            if condition.ptr not in self._loops:
-                self._loops[condition.ptr] = self._captured_loop(condition)
-            self._loops[condition.ptr]()
+            self._loop(condition)
+        elif self.device.is_cuda and loops_on_device(self.device) and not self._has_tasks:
+            wp.capture_if(condition, self._run_in_time)  # launch by launch, which loads the kernels
+            if self._runs:
+                self._loop(condition)
         else:
             wp.capture_while(condition, self._run_in_time)
+
+    def _loop(self, condition: wp.array[Any]) -> None:
+        """Launch everything while the condition is not 0, without the host."""
+        if condition.ptr not in self._loops:
+            self._loops[condition.ptr] = self._captured_loop(condition)
+        self._loops[condition.ptr]()
 
     def _loops_here(self) -> bool:
         """Return whether `run_while` can do without the host now."""
