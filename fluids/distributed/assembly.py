@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 
 from warp_lcp.distributed.bodies import SharedBodies
-from warp_lcp.distributed.narrow_band import SharedNarrowBand
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
@@ -41,7 +40,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     def make_parts(part: Subdomain) -> Parts:
         boundary, warnings[:] = boundary_of_part(scene, part, solids)
         sources = make_sources(scene, part.grid, boundary, folder)
-        return Parts(boundary, sources, make_narrow_band(scene, part.grid, boundary, folder, partial(SharedNarrowBand, part)))
+        return Parts(boundary, sources, make_narrow_band(scene, part.grid, boundary, folder))
 
     parts = make_parts(part)
     particles, notes = particles_of_part(scene, part, parts, folder)

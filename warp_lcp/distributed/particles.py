@@ -24,7 +24,7 @@ from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import launch
-from warp_lcp.grid.particles import SORT_EVERY, UNSORTED, Particles, ParticleTotals
+from warp_lcp.grid.particles import MOST_A_CELL, NEW, SORT_EVERY, UNSORTED, Particles, ParticleTotals
 from warp_lcp.rows import KernelFile
 
 INNER, BORDER, OUTSIDE = 0, 1, 2  # of a box: in it and away from its cuts, within reach of them, beyond them
@@ -32,11 +32,9 @@ KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
 WHERE = KERNELS["warp_lcp.distributed.particles.where"]
 
 
-MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
 REACH = 1  # cells from a box within which particles touch its faces and cells
 ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
 ENDLESS = 1e30  # a coordinate beyond all
-NEW = 1 << 62  # places from which on particles have come since the last sort
 COUNT, DATA = 7101, 7102  # tags of messages
 
 

@@ -26,6 +26,9 @@ THREADS = 1024  # the most threads of a sum, each a partial result that the host
 CUDA_CHUNK, CUDA_THREADS = 16, 1 << 15  # the same on a GPU
 GROWTH = 1.5  # of the storage when it is full: n appended particles are copied 2 n times at most, a third of it lies idle at most
 SORT_PIECES = 32  # of the keys that are sorted: with more there is more to add up between two passes
+# Places of particles in the order of all ranks' particles, see `warp_lcp.distributed.particles`.
+MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
+NEW = 1 << 62  # places from which on particles have come since the last sort
 SORTED, UNSORTED = 0, 1  # steps in which `arrange` sorts, and in which it need not
 SORT_EVERY = 8  # steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL 2, a sort costs 25 ns
 

@@ -29,6 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ import warp as wp
 
 from warp_lcp.grid.advection import CENTERS, carry_field
 from warp_lcp.grid.cell_kernel import launch_list, scan
-from warp_lcp.grid.particles import Particles, ParticleTotals
+from warp_lcp.grid.particles import MOST_A_CELL, NEW, Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.grid.transfer import faces_to_particles
 from warp_lcp.material import narrow_band_kernels as kernels
@@ -101,13 +102,15 @@ class NarrowBand:
         self.held = self.fresh = 0
         self._numbered = kernels.Numbered()
         self._numbered.origin, self._numbered.across = wp.vec3i(*grid.origin), wp.vec2i(*(n + 2 for n in grid.domain_counts[:2]))
-        self._own, self._before = grid.domain, (0, 0, 0)
+        self._own, self._before = grid.part.owned, grid.origin
         self._window, self._owned, self._inner = (ActiveWindow(w) for w in (grid.everywhere, grid.domain, grid.domain))
         self._last = Scalar(), Scalar()  # plane and row of the window
         self._each, self._at_rest, self._way, self._behind = (Scalar() for _ in range(4))
         self._shift = Scalar(), Scalar(), Scalar()  # of fresh particles' lattice
         launches = (self._launch_depth, self._fall, self._launch_quota, self._launch_carry, self._launch_seeds)
-        self._depths, self._falling, self._quota, self._carrying, self._seeding = (LaunchGraph(grid.device, launch) for launch in launches)
+        self._depths, self._falling, self._quota, self._carrying, self._seeding = (
+            LaunchGraph(grid.device, launch, at_once=grid.part.at_once) for launch in launches
+        )
         self._leaving = LaunchGraph(grid.device, self._launch_leaving, at_once=grid.device.is_cuda)  # a scan of Warp's
         self._move_to(grid.everywhere)
         self.interior = self._summed(grid.everywhere)
@@ -144,13 +147,13 @@ class NarrowBand:
         wp.copy(self.depth, self._now)
         deep = (self.depth.numpy() > self.width) & (padded >= 0)
         own = tuple(map(slice, self._own.low, self._own.high))
-        self.held = self._of_all(int(deep[own].sum())) * self.particles_a_cell
+        self.held = self._sum_over_ranks(int(deep[own].sum())) * self.particles_a_cell
         for axis, field in enumerate(self.velocity):
             speed = np.where(padded >= 0, velocities[padded, axis], np.nan)
             both = np.stack([speed, np.roll(speed, 1, axis=2 - axis)])
             known = np.isfinite(both)
             field.assign((np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)).astype(np.float32))
-        self._join(*self.velocity)
+        self.grid.part.fill(*self.velocity)
         self.interior = self._summed(grid.everywhere)
         return np.asarray(grid.interior(deep))
 
@@ -204,6 +207,7 @@ class NarrowBand:
             step: number of the step, which the random part of new places depends on.
             saved: velocity as it came from the particles [m/s], for FLIP.
         """
+        first = self._prepare_places(particles)
         self._move_to(window)
         self._each.value = self.particles_a_cell * self.density
         self._depths.run(kind, phi, contact, variant=phi is None)
@@ -213,15 +217,15 @@ class NarrowBand:
             marks = particles.marks
             self._leaving.run(particles, marks)
             removed = sum(particles.finish_removal(marks))
-        self.held += self._of_all(removed)
+        self.held += self._sum_over_ranks(removed)
         shift = (self._steps * step) % 1.0
         for number, part in zip(self._shift, shift, strict=True):
             number.value = float(part)
         self._quota.run(variant=self._here)
         self.fresh = int(self._sum.numpy()[0])
         if self._here and self.fresh:
-            self._seed(particles, saved)
-        self.held -= self._of_all(self.fresh)
+            self._seed(particles, saved, first)
+        self.held -= self._sum_over_ranks(self.fresh)
 
     def carry(self, velocity: list[wp.array], dt: float) -> None:
         """Advect depth and velocity for a time step.
@@ -244,7 +248,7 @@ class NarrowBand:
         for axis, field, out in [(CENTERS, self._now, self.depth), *zip(range(3), velocity, self.velocity, strict=False)]:
             clear(out)
             carry_field(field=field, out=out, axis=axis, **more)
-        self._join(self.depth, *self.velocity)
+        self.grid.part.fill(self.depth, *self.velocity)
         if self._here:
             self._launch_sums(self._owned)
 
@@ -308,6 +312,7 @@ class NarrowBand:
         self.depth.assign(state["depth"])
         for axis, field in enumerate(self.velocity):
             field.assign(state[f"interior_velocity_{axis}"])
+        self.grid.part.fill(self.depth, *self.velocity)
         self.held = int(held)
         velocity, center, low, high = np.reshape(vectors, (4, 3))
         self.interior = ParticleTotals(int(cells), squares, velocity, center, low, high, fastest)
@@ -357,27 +362,59 @@ class NarrowBand:
         self._window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=self.grid.planes, last_plane=plane, last_row=row)
 
     def _relax(self, fallen: int = 0) -> None:
-        """Let the depth fall until it is what neighbors allow, after so many passes."""
+        """Let the depth fall until it is what neighbors allow, after so many passes; a way to the shore may lead over several ranks."""
+        self._relax_here(fallen)
+        part, falls = self.grid.part, self.grid.part.across is not None
+        while falls:
+            before = self._now.numpy().copy()
+            part.fill(self._now)
+            after = np.minimum(before, self._now.numpy())
+            self._now.assign(after)
+            falls = part.ranks.any(bool((after < before).any()))
+            if falls:
+                self._relax_here(0)
+
+    def _relax_here(self, fallen: int) -> None:
+        """Let the depth of this process's cells fall."""
         for number in range(fallen, math.ceil(self.width + BEYOND) + 1):
             if number and self.grid.device.is_cpu and self._changed.numpy()[0] == 0:  # rows one after the other: three passes or so
                 break
             self._falling.run(number % 2 == 1, variant=number % 2 == 1)
 
-    def _of_all(self, count: int) -> int:
-        """Return how many there are of what this grid has so many of."""
-        return count
+    def _sum_over_ranks(self, count: int) -> int:
+        """Return how many there are on all processes of what this one has so many of."""
+        return int(self.grid.part.ranks.sum(count))
 
-    def _join(self, *fields: wp.array) -> None:
-        """Give fields what others who have parts of the grid know of them."""
+    def _prepare_places(self, particles: Any) -> int:
+        """Keep a rank's own particles alone, numbered; return the first place of fresh ones, behind those of all ranks."""
+        part = self.grid.part
+        if not part.shared:
+            return 0
+        particles.drop_ghosts()
+        particles.number()
+        return max(NEW, 1 + int(part.ranks.max(particles.place.max(initial=0))))
 
-    def _seed(self, particles: Particles, saved: Sequence[wp.array]) -> None:
-        """Put fresh particles behind the others."""
+    def _add_places(self, particles: Any, behind: int) -> None:
+        """Tell a rank's fresh particles their places, in the order of the whole domain's cells."""
+        counts = np.diff(self._total.numpy(), prepend=0)
+        stored = np.flatnonzero(counts)
+        counts = counts[stored]
+        k, j, i = np.unravel_index(stored, self.grid.shape)
+        x, y, z = (cells + before for cells, before in zip((i, j, k), self.grid.origin, strict=True))
+        nx, ny, _ = (n + 2 for n in self.grid.domain_counts)
+        first = ((z * ny + y) * nx + x) * MOST_A_CELL - np.cumsum(counts) + counts
+        particles.add_places(behind + np.repeat(first, counts) + np.arange(counts.sum()))
+
+    def _seed(self, particles: Particles, saved: Sequence[wp.array], behind: int) -> None:
+        """Put fresh particles behind the others; `behind`: their first place, on ranks."""
         first = particles.make_room(self.fresh)
         self._behind.value = first
         self._seeding.run(particles)
         if saved:
             tail = particles.position[first:], particles.velocity[first:]
             faces_to_particles(self.grid, list(saved), *tail, [])
+        if self.grid.part.shared:
+            self._add_places(particles, behind)
 
     def _launch_seeds(self, particles: Particles) -> None:
         """Launch what puts fresh particles on their sites."""
@@ -393,7 +430,11 @@ class NarrowBand:
         box.launch_rows(kernels.sum_kernel, [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums])
 
     def _summed(self, window: Window, *, launched: bool = False) -> ParticleTotals:
-        """Add up the cells without particles, once the sums over rows are launched."""
+        """Add up the cells of all processes without particles, once the sums over rows are launched."""
+        return reduce(ParticleTotals.joined, self.grid.part.ranks.collect(self._summed_here(window, launched=launched)))
+
+    def _summed_here(self, window: Window, *, launched: bool) -> ParticleTotals:
+        """Add up those of this process."""
         box = window.common(self._own)
         if box is None:
             return ParticleTotals()

@@ -266,14 +266,12 @@ def make_outlets(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> Out
     return Outlets(grid, drains, side_bits(scene.domain.open))
 
 
-def make_narrow_band(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, make: Callable[..., NarrowBand] = NarrowBand
-) -> NarrowBand | None:
-    """Return what carries the material deeper than a band, made by what takes the arguments of `NarrowBand`; None: nothing does."""
+def make_narrow_band(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> NarrowBand | None:
+    """Return what carries the material deeper than a band; None: nothing does. Collective."""
     settings, particles = scene.particles.narrow_band, scene.particles
     if settings is None:
         return None
-    return make(
+    return NarrowBand(
         grid, boundary, width=settings.width, per_axis=particles.per_axis, jitter=particles.jitter, random_seed=particles.seed,
         keep=_exchange_cells(scene, grid, folder),
     )  # fmt: skip
