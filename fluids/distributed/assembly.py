@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from warp_lcp.distributed.bodies import SharedBodies
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
@@ -13,6 +12,7 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed.simulation import DistributedLiquid
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.material.particle_assembly import Parts, make_bodies, make_narrow_band, make_outlets, make_sources, placed_solids
+from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 
 METHODS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks
@@ -35,7 +35,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     check_shared(scene, ranks, [], METHODS)
     part = part_of(scene, ranks, device, smoothing=scene.pressure.smoothing)
     solids = placed_solids(scene, folder)
-    bodies, warnings = make_bodies(scene, solids, partial(SharedBodies, ranks)), list[str]()
+    bodies, warnings = make_bodies(scene, solids, partial(RigidBodies, ranks=ranks)), list[str]()
 
     def make_parts(part: Subdomain) -> Parts:
         boundary, warnings[:] = boundary_of_part(scene, part, solids)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from warp_lcp.distributed.bodies import SharedBodies
 from warp_lcp.distributed.particle_assembly import check_shared, part_of, particles_of_part
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
@@ -14,6 +13,7 @@ from warp_lcp.granular.distributed.simulation import DistributedSand
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.solids import SandSolids
 from warp_lcp.material.particle_assembly import Parts, make_bodies, make_outlets, make_sources, placed_solids
+from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 
 METHODS = ("accelerated-projection",)  # that solve problems of several ranks
@@ -36,7 +36,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     check_shared(scene, ranks, refusals(scene), METHODS)
     part = part_of(scene, ranks, device)
     placed = placed_solids(scene, folder)
-    bodies, warnings = make_bodies(scene, placed, partial(SharedBodies, ranks)), list[str]()
+    bodies, warnings = make_bodies(scene, placed, partial(RigidBodies, ranks=ranks)), list[str]()
 
     def make_parts(part: Subdomain) -> Parts:
         boundary, notes = boundary_of_part(scene, part, placed)

@@ -293,10 +293,19 @@ class Mixed:
     weight: wp.float64
 
 
+@wp.struct
+class Small:
+    """Members of four bytes, and so aligned."""
+
+    count: int
+    weight: float
+    place: wp.vec3i
+
+
 @wp.kernel(enable_backward=False, module="tests.rows.packing")
 def packing_kernel(
-    flag: wp.bool, a: wp.array(dtype=wp.float32), n: int, b: wp.array3d(dtype=wp.uint8), x: wp.float64, place: wp.vec3i, y: float,
-    many: wp.int64, m: Mixed, point: wp.vec2d, turn: wp.mat22, c: wp.array2d(dtype=wp.vec2i), last: bool,
+    flag: wp.bool, a: wp.array(dtype=wp.float32), n: int, small: Small, b: wp.array3d(dtype=wp.uint8), x: wp.float64, place: wp.vec3i,
+    y: float, many: wp.int64, m: Mixed, point: wp.vec2d, turn: wp.mat22, c: wp.array2d(dtype=wp.vec2i), last: bool,
 ):  # fmt: skip
     """a[n] = y, of arguments of all kinds."""
     a[n] = y
@@ -304,7 +313,8 @@ def packing_kernel(
 
 def drawn_arguments(rng):
     """Return arguments of `packing_kernel`: arrays, some of them strided or empty, vectors, a struct, numbers."""
-    m, sizes = Mixed(), rng.integers(0, 6, 7)
+    m, small, sizes = Mixed(), Small(), rng.integers(0, 6, 7)
+    small.count, small.weight, small.place = int(rng.integers(9)), rng.standard_normal(), wp.vec3i(*map(int, rng.integers(-9, 9, 3)))
     m.flag, m.weight, m.place = bool(rng.integers(2)), rng.standard_normal(), wp.vec3i(*map(int, rng.integers(-9, 9, 3)))
     m.values = wp.zeros(int(sizes[0]), dtype=wp.float64, device=CPU)
     a = wp.zeros(2 * int(sizes[1]) + 8, dtype=wp.float32, device=CPU)[:: int(rng.integers(1, 3))]
@@ -314,7 +324,7 @@ def drawn_arguments(rng):
     y = rng.choice([0.1, -0.0, math.inf, 1e-46, 1e39, 3.0000001])
     number = int(rng.integers(-(1 << 62), 1 << 62))
     flag, last = bool(rng.integers(2)), bool(rng.integers(2))
-    return [flag, a, int(rng.integers(-9, 4)), b, rng.standard_normal(), m.place, float(y), number, m, point, turn, c, last]
+    return [flag, a, int(rng.integers(-9, 4)), small, b, rng.standard_normal(), m.place, float(y), number, m, point, turn, c, last]
 
 
 def test_arguments_are_packed_as_warp_packs_them():
@@ -324,6 +334,6 @@ def test_arguments_are_packed_as_warp_packs_them():
         inputs = drawn_arguments(np.random.default_rng(seed))
         recorded = wp.launch(packing_kernel, 1, inputs, device=CPU, record_cmd=True)
         assert signature.pack(inputs) == bytes(team.arguments_of(recorded))
-    others = {1: inputs[3], 2: 1 << 31, 3: inputs[1], 5: (1, 2, 3), 8: wp.vec3i(), 9: wp.vec2f(), 11: None}
+    others = {1: inputs[4], 2: 1 << 31, 3: Mixed(), 4: inputs[1], 6: (1, 2, 3), 9: wp.vec3i(), 10: wp.vec2f(), 12: None}
     for place, other in others.items():
         assert signature.pack([*inputs[:place], other, *inputs[place + 1 :]]) is None, f"argument {place}"

@@ -41,9 +41,16 @@ class OneProcess:
         """Return an array of every process, shape (processes, *values.shape)."""
         return np.asarray(values)[None]
 
+    def share(self, value: Any) -> Any:
+        """Return the object of the first process."""
+        return value
+
     def collect(self, value: Any) -> list[Any]:
         """Return an object of every process."""
         return [value]
+
+
+ONE_PROCESS = OneProcess()
 
 
 class GridPart:
@@ -63,7 +70,7 @@ class GridPart:
     shared: ClassVar[bool] = False
     cuts = 0
     joined: tuple[int, ...] = ()
-    ranks: Any = OneProcess()
+    ranks: Any = ONE_PROCESS
 
     def __init__(self, grid: StaggeredGrid) -> None:
         self.grid = grid

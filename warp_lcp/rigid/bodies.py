@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from warp_lcp.grid.part import ONE_PROCESS
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.rigid.body import STATE, BodyMotion, BodyStates, RigidBody, lengths
 from warp_lcp.rigid.contact_detection import ContactDetection
@@ -61,6 +63,8 @@ class RigidBodies:
         dimension: 2 or 3.
         solver: solves for the impulses of contacts and joints; the default handles only contacts.
         joints: between the bodies, numbered as in `bodies`; restitution must be 0 with them.
+        ranks: processes that share the bodies, see `warp_lcp.distributed.ranks.Ranks`. Each has all of them and takes the same steps from
+            the same numbers; `begin_step`, `solve_contacts` and `end_step` are collective.
 
     Attributes:
         motions: a `BodyMotion` of each, for the solids.
@@ -87,8 +91,10 @@ class RigidBodies:
         dimension: int,
         solver: ImpulseSolver = sweeps_and_newton,
         joints: Sequence[Joint] = (),
+        ranks: Any = ONE_PROCESS,
     ) -> None:
         """Prepare the shapes for contact, and check that bodies start apart."""
+        self._ranks = ranks
         self.bodies, self.numbers, self.dimension = BodyStates.of(bodies), list(numbers), dimension
         self.motions = [BodyMotion(body) for body in self.bodies]
         self._geometries = list(geometries)
@@ -136,6 +142,7 @@ class RigidBodies:
             self._solve.hold(contacts, impulses)
         self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = _Begun(states, free, contacts, impulses, self._solve.detour(contacts, before, impulses), dt, kick_dt)
+        self._agree()
 
     def solve_contacts(self) -> None:
         """Solve the contacts with the impulses of the material.
@@ -153,6 +160,7 @@ class RigidBodies:
             impulses = self._solve.push_apart(begun.contacts, begun.impulses, dt=begun.dt, kick_dt=begun.kick_dt)
             self.contact_residual, self.contact_iterations = self._solve.residual, self._solve.iterations
         self._begun = _Begun(begun.states, begun.free, begun.contacts, impulses, begun.detour, begun.dt, begun.kick_dt, True)
+        self.contact_residual = self._ranks.share(self.contact_residual)
 
     def end_step(self, dt: float) -> None:
         """Move the bodies; calls `solve_contacts` if it has not been called.
@@ -176,6 +184,20 @@ class RigidBodies:
             if way is not None:
                 self.bodies.shift(way)
         self._begun = None
+        self._agree()
+
+    def _agree(self) -> None:
+        """Take the bodies, what holds them and the memory of contacts from the root rank.
+
+        Processors of another kind may round otherwise, and ranks that disagree by a bit would in time disagree on a contact.
+        """
+        if self._ranks.size == 1:
+            return
+        mine = self.state(), [body.hold for body in self.bodies], self.contacts, self.contact_residual
+        state, holds, self.contacts, self.contact_residual = self._ranks.share(mine)
+        self._take(state)
+        for body, hold in zip(self.bodies, holds, strict=True):
+            body.hold = hold
 
     def gone(self) -> np.ndarray:
         """Return which bodies have left the domain, bool, shape (n,)."""

@@ -341,6 +341,9 @@ def _arguments(*types: Any) -> Any:
     return type("LaunchArguments", (ctypes.Structure,), {"_fields_": [(f"p{i}", kind) for i, kind in enumerate(types)]})
 
 
+ALIGNED = {1: "B", 2: "H", 4: "I", 8: "Q"}  # formats of `struct` by their alignment
+
+
 class Signature:
     """Types of a Warp kernel's arguments: packs them as C has them, in a tenth of the time that Warp takes to record a launch.
 
@@ -358,6 +361,12 @@ class Signature:
         self._packing = struct.Struct("".join(formats) + "0Q") if formats and all(formats) else None
         structs = [kind for kind in self._kinds if isinstance(getattr(kind, "ctype", None), type)]
         self._structs = {kind: type(kind()) for kind in structs} if self._packing else {}
+
+    def check(self, inputs: Sequence[Any], memory: Any) -> None:
+        """Leave all to Warp from now on if it has packed arguments in another way."""
+        mine = self.pack(inputs)
+        if mine is not None and mine[: ctypes.sizeof(memory)] != bytes(memory):
+            self._packing = None
 
     def pack(self, inputs: Sequence[Any]) -> bytes | None:
         """Return arguments as C has them; None where Warp should convert or refuse one."""
@@ -392,7 +401,7 @@ def _format(kind: Any) -> str:
     if isinstance(kind, wp.array):
         return f"0Q{ctypes.sizeof(kind.__ctype__())}s"
     if isinstance(getattr(kind, "ctype", None), type):  # a struct
-        return f"0Q{ctypes.sizeof(kind.ctype)}s"
+        return f"0{ALIGNED[ctypes.alignment(kind.ctype)]}{ctypes.sizeof(kind.ctype)}s"
     of = kind._type_ if isinstance(kind, type) and issubclass(kind, ctypes.Array) else None  # a vector's or a matrix's numbers
     of = getattr(of, "_type_", "")
     return f"0{of}{ctypes.sizeof(kind)}s" if isinstance(of, str) and of else ""
@@ -411,6 +420,7 @@ def prepared(kernel: Any, dim: Any, inputs: Sequence[Any]) -> tuple[Entry, bytes
         return known[0], arguments, known[1]
     launch = wp.launch(kernel, dim, inputs, device="cpu", record_cmd=True)
     memory = arguments_of(launch)
+    signature.check(inputs, memory)
     if len(signature.entries) >= MOST_ENTRIES:
         signature.entries.clear()
     signature.entries[dim] = made = Entry(launch), type(memory)
