@@ -99,14 +99,11 @@ class SandSimulation(ParticleSimulation):
         self.packing = Packing(grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
         self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
-        self.stress, self.outcome = self._stresses(box=box, rate=rate, bodies=self.carried)
+        self.stress = Stress(self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried)
+        self.outcome = SandReport(self.stress)
         self._work: Any = self.method.init(self.stress)
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
-
-    def _stresses(self, **settings: Any) -> tuple[Stress, SandReport]:
-        stress = Stress(self.packing, self.solids.walls, **settings)
-        return stress, SandReport(stress)
 
     def regrid(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
         """Continue on another grid window of the domain; see the base class."""

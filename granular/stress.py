@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -13,7 +13,7 @@ import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.cut_walls import WALL_FACE
 from warp_lcp.granular.fields import StressFields, VelocityFields
-from warp_lcp.granular.packing import SHEARS, Packing
+from warp_lcp.granular.packing import REACH, SHEARS, Packing
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress_kernels import (
     BETA_X,
@@ -31,7 +31,7 @@ from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_ST
 from warp_lcp.grid.staggered import three_components
 from warp_lcp.rows import Rows
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch, launch_now
+from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch, launch_now, perform
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import renamed_method
 
@@ -141,10 +141,9 @@ class Stress(wl.VariationalInequality):
         last_residual: that of pressure and friction [m/s].
     """
 
-    shared: ClassVar = False  # whether others have parts of the stresses
-
     def __init__(self, packing: Packing, walls: Walls, *, box: bool = False, rate: bool = False, bodies: SandBodies | None = None) -> None:
         grid, self.packing, self.walls, self.box, self.rate, self.bodies = packing.grid, packing, walls, box, rate, bodies
+        self.shared, self._across = grid.part.shared, grid.part.across
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
         tractions = 0 if packing.cut is None else grid.dimension
         shape = (1 + normals + 4 * shears + tractions, *grid.shape)
@@ -153,7 +152,9 @@ class Stress(wl.VariationalInequality):
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
         self.momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
-        self.total = self._sums  # of all who have a part of the stresses
+        self.total = self._sums if self._across is None else wp.zeros_like(self._sums)  # of all processes
+        self._nothing = wp.zeros_like(self._sums)
+        self._found = np.zeros((PERIOD, 2 * COLUMNS))  # by the steps of a period on this rank
         threads = int(np.prod(packing.grid.shape[:2])) * packing.counted.cells.chunks
         self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
         self._wall_sums: Reduction | None = None
@@ -203,6 +204,7 @@ class Stress(wl.VariationalInequality):
         self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
         self._admitting.run()
         self.kick_dt = kick_dt
+        self.packing.grid.part.fill(self.now, width=REACH)  # of which cells without sand have lost theirs in ghost layers, too
 
     def _launch_admission(self) -> None:
         """Launch what makes the last stresses those of the new packing: rescaled, 0 where it admits none, without the checkerboard."""
@@ -218,8 +220,8 @@ class Stress(wl.VariationalInequality):
         p.counted.run(self.velocity.passes.damp, sand, stresses, source=self._point)
 
     def _count(self) -> int:
-        """Return how many cells hold sand."""
-        return self.packing.sand_cells
+        """Return how many cells of all processes hold sand."""
+        return int(self.packing.grid.part.ranks.sum(self.packing.sand_cells))
 
     @property
     def cells(self) -> int:
@@ -310,9 +312,36 @@ class Stress(wl.VariationalInequality):
         self._end_step(step, launch)
 
     def _end_step(self, step: int, launch: Launch) -> None:
-        """Add up what a step of a period has found, and choose the momentum of the next but one."""
-        self._add_up(launch)
-        self._choose_momentum(self.total, launch)
+        """Add up what a step of a period has found, and choose the momentum of the next but one.
+
+        The momentum changes by the sums once a period alone, and so ranks share them once a period.
+        """
+        self._add_up_here(launch)
+        if self._across is None:
+            self._choose_momentum(self.total, launch)
+            return
+        perform(partial(self._keep, step), launch)
+        last = step == PERIOD - 1
+        if last:
+            perform(self._share_period, launch)
+        self._choose_momentum(self.total if last else self._nothing, launch)
+
+    def _keep(self, step: int) -> None:
+        self._found[step] = self._sums.numpy()
+
+    def _share_period(self) -> None:
+        """Let the sums be those that a period's steps have found on all ranks, as the momentum would have added them up."""
+        assert self._across is not None
+        found = self._across.sum(self._found)
+        found = found[:, :COLUMNS] + found[:, COLUMNS:]
+        found[:, 6:] = np.sqrt(found[:, 6:])
+        total = found.sum(axis=0)
+        total[6:] **= 2  # of which the momentum takes the roots
+        self.total.assign(np.concatenate([total, np.zeros(COLUMNS)]))
+
+    def _share_sums(self) -> None:
+        assert self._across is not None
+        self.total.assign(self._across.sum(self._sums.numpy()))
 
     def _choose_momentum(self, sums: wp.array, launch: Launch) -> None:
         launch(momentum_kernel, 1, [sums, self.momentum], device=self.packing.grid.device)
@@ -357,6 +386,12 @@ class Stress(wl.VariationalInequality):
         return StressFields(self.now, self._before, self._point, self.momentum, self.numbers)
 
     def _add_up(self, launch: Launch) -> None:
+        """Launch the sums over cells and walls of all processes."""
+        self._add_up_here(launch)
+        if self._across is not None:
+            perform(self._share_sums, launch)
+
+    def _add_up_here(self, launch: Launch) -> None:
         self._cell_sums.add_up(0, COLUMNS, launch=launch)
         if self._wall_sums is not None:
             self._wall_sums.add_up(COLUMNS, COLUMNS, launch=launch)

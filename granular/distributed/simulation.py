@@ -11,8 +11,6 @@ import warp as wp
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.particles import SharedParticles
-from warp_lcp.granular.distributed.stress import SharedStress
-from warp_lcp.granular.report import SandReport
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation, percentile_place
 from warp_lcp.grid.staggered import Window
@@ -34,10 +32,6 @@ class DistributedSand(SandSimulation, SharedParticleSimulation):
         """Allocate the fields and find the sand's cells."""
         super().__init__(*arguments, **more)
         self.balance = Balance(fixed=STEP)
-
-    def _stresses(self, **settings: Any) -> tuple[SharedStress, SandReport]:
-        stress = SharedStress(self.part, self.packing, self.solids.walls, **settings)
-        return stress, SandReport(stress)
 
     def mark(self) -> None:
         """Find the sand's cells, as frames show them before the first step."""
