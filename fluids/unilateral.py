@@ -140,9 +140,9 @@ class UnilateralPressure(PressureProjection):
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
     def fluid_cells(self) -> np.ndarray:
-        """Return this process's cells with liquid or pressure in the last projection, shape (n, 3).
+        """Return the cells with liquid or pressure in the last projection.
 
-        Indices (k, j, i) in the stored shape.
+        Those of this process, shape (n, 3), as indices (k, j, i) in the stored shape.
         """
         part = self.grid.part
         cells, pressure = (part.box_of(field.numpy()) for field in (self.cells, self.pressure))

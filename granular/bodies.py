@@ -39,10 +39,10 @@ FIRST = {2: 2, 3: 4}  # layer of the first copy of a shear
 
 
 class SandBodies:
-    """Rigid bodies in the stress solve; `begin`, `prepare`, `respond` and `search` are collective.
+    """Rigid bodies in the stress solve.
 
-    A rank adds up what the stresses of its cells do to the bodies, their copies on edges at cuts included, and sums over ranks are the
-    force: all ranks give a body the same velocity, and so all faces of their parts.
+    `begin`, `prepare`, `respond` and `search` are collective. A rank adds up what the stresses of its cells do to the bodies, their copies
+    on edges at cuts included, and sums over ranks are the force: all ranks give a body the same velocity, and so all faces of their parts.
 
     With F = - sum of rows times stresses, see `granular.body_faces`, a body leaves the solve with V = V* + rho dx^d M^-1 F. That adds
     R M^-1 R' to the matrix of the stresses: a light body's part of it is far larger than sand's own. So a step of the stresses takes it

@@ -164,9 +164,9 @@ class Packing:
         return window.common(self.nodes) or self.nodes
 
     def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
-        """Give a field of stresses what others know of it: `REACH` layers of ghost cells, and the cells beyond periodic sides; collective.
+        """Fill `REACH` layers of ghost cells of a field of stresses; collective.
 
-        Cells without sand have stresses of 0 on all ranks.
+        Also the cells beyond periodic sides. Cells without sand have stresses of 0 on all ranks.
         """
         if self.grid.part.across is not None:
             perform(partial(self._fill, stress), launch)

@@ -16,7 +16,6 @@ import warp as wp
 
 import small_liquids
 import small_sands
-from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import row_pass
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
@@ -38,7 +37,7 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
     """Note each kernel module that a launch asks for and each allocation with the source files on the stack."""
     traces = Traces()
     allocator = type(wp.get_device("cpu").default_allocator)
-    load, allocate, entry, allocate_field = wp.Module.load, allocator.allocate, row_pass.Form.entry, StaggeredGrid.field
+    load, allocate, entry, make_array = wp.Module.load, allocator.allocate, row_pass.Form.entry, wp.array.__init__
 
     def noting_load(module: Any, *arguments: Any, **options: Any) -> Any:
         traces.modules.add(module.name)
@@ -63,16 +62,16 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
         note(size)
         return int(allocate(self, size))
 
-    def noting_field(self: StaggeredGrid, dtype: Any = wp.float32) -> Any:
-        made = allocate_field(self, dtype)  # of NumPy's memory
-        note(made.capacity)
-        return made
+    def noting_array(self: wp.array, *arguments: Any, **options: Any) -> None:
+        make_array(self, *arguments, **options)
+        if options.get("deleter") is not None:  # of NumPy's memory, see `rows.fields.zeros`
+            note(self.capacity)
 
     with patch.context() as patched:
         patched.setattr(wp.Module, "load", noting_load)
         patched.setattr(row_pass.Form, "entry", noting_entry)
         patched.setattr(allocator, "allocate", noting_allocate)
-        patched.setattr(StaggeredGrid, "field", noting_field)
+        patched.setattr(wp.array, "__init__", noting_array)
         yield traces
 
 

@@ -406,10 +406,13 @@ class Particles:
             self.number()
 
     def look_around(self) -> None:
-        """Let the particles within a cell of this process's be there, as ghosts with positions alone; collective. One process has all."""
+        """Take in the particles within a cell of this process's as ghosts; collective.
+
+        Ghosts have positions alone. One process has all particles already.
+        """
 
     def drop_ghosts(self) -> None:
-        """Keep this process's own particles alone."""
+        """Remove the ghosts of other processes."""
 
     def number(self) -> None:
         """Find the cell of each particle."""

@@ -35,7 +35,11 @@ MESH_POINT_BYTES = 80  # a point, its triangles and its velocity included
 
 
 def surface_layers(parts: int) -> int:
-    """Return how many layers of ghost cells the surface takes on a lattice of so many cells along the edge of a cell."""
+    """Return the number of layers of ghost cells that a surface takes.
+
+    Args:
+        parts: lattice cells along the edge of a cell.
+    """
     return -(-SEEN // parts) + 1
 
 

@@ -52,7 +52,9 @@ SHIFT = 1e-5  # of the diagonal: gives closed pockets a solution, and leaves 0.5
 
 
 class DensityMonitor:
-    """Density monitor: fraction of the material in overfull cells; `measure` and `found` are collective.
+    """Density monitor: fraction of the material in overfull cells.
+
+    `measure` and `found` are collective.
 
     Args:
         grid: the grid.
@@ -103,7 +105,10 @@ class DensityMonitor:
 
 
 def density_of_all(grid: StaggeredGrid, particles: Particles, window: Window, particles_a_cell: int, density: wp.array) -> None:
-    """Find the density of all processes' particles, see `particle_density`; collective."""
+    """Find the density of all processes' particles; collective.
+
+    Arguments as of `particle_density`.
+    """
     particles.look_around()
     particle_density(grid, particles, window, particles_a_cell, density)
     particles.drop_ghosts()

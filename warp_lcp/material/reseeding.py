@@ -22,7 +22,7 @@ COST = 8 * PARTICLE  # of a cell that wants particles, in cells of a usual pass
 
 
 class Reseeding:
-    """Reseeding: sparse cells deep inside take particles from dense neighbors; `apply` is collective.
+    """Reseeding: sparse cells deep inside take particles from dense neighbors.
 
     A flow draws particles together along some streamlines and apart along others. A density correction cures the first, but voids between
     particles remain: they count as material as long as the surface does not see them, and the volume grows. A cell that no wall touches,
@@ -34,8 +34,8 @@ class Reseeding:
       interpolation errs. Angular momentum and the center of mass change with the particles' places;
     - the surface and bubbles of more than a cell: what is not full around is left alone. A whole region that is thin stays thin.
 
-    The result is the same on every run. A rank does what its cells and those beside them do, whose particles it knows as ghosts; after each
-    direction all agree about how many particles cells hold.
+    The result is the same on every run. `apply` is collective: a rank does what its cells and those beside them do, whose particles it
+    knows as ghosts; after each direction all agree about how many particles cells hold.
 
     Args:
         grid: the grid.

@@ -151,7 +151,9 @@ class Sources:
         self._imposing.run(velocity, known, shown, False, variant=(*own, False))
 
     def emit(self, particles: Particles, before: float | None, now: float) -> int:
-        """Add the incoming particles of this process's cells, and return their number; collective.
+        """Add the incoming particles, and return their number; collective.
+
+        Each process adds those of its own cells.
 
         Args:
             particles: the material (updated).

@@ -51,7 +51,6 @@ with_bounds([&](auto lower, auto upper) {
 //   bounds
 //   reads      float64 b; int8 unknown
 //   sums       bad, nan_lower, nan_upper, crossed, no_lower, no_upper
-//   module     problem
 double bad = 0, nan_lower = 0, nan_upper = 0, crossed = 0, no_lower = 0, no_upper = 0; const double inf = (double)INFINITY;
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
