@@ -20,7 +20,7 @@ from warp._src.context import user_modules
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import Splash, natural, splash
 from warp_lcp.rows.layout import make_struct, put
-from warp_lcp.rows.row_pass import C
+from warp_lcp.rows.pass_form import C
 from warp_lcp.rows.vectors import CUDA_BLOCK
 
 ARCH, MULTIPROCESSORS, CLOCK, BANDWIDTH = 89, 128, 2.52e9, 0.8 * 1008e9  # of an RTX 4090: [Hz], [byte/s] that streaming kernels reach

@@ -30,7 +30,8 @@ from warp_lcp.material.density_correction import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.rows import Rows
 from warp_lcp.rows.native import sections
-from warp_lcp.rows.row_pass import Form, RowPass
+from warp_lcp.rows.pass_form import Form
+from warp_lcp.rows.row_pass import RowPass
 from warp_lcp.rows.vectors import CUDA_BLOCK
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.principal_system import principal_system

@@ -15,7 +15,7 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.density_correction import LONGEST, DensityCorrection
-from warp_lcp.rows.row_pass import Form
+from warp_lcp.rows.pass_form import Form
 
 BALL = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.23}
 

@@ -55,7 +55,7 @@ def threads(request, monkeypatch):
     """Have so many threads, and cut what is small."""
     before = wl.get_threads()
     wl.set_threads(request.param)
-    for module in ("team", "row_pass", "program"):
+    for module in ("team", "wave", "program"):
         monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 64)
     yield request.param
     wl.set_threads(before)

@@ -11,7 +11,7 @@ from code_blocks import blocks, run
 from oracle import assemble
 from warp_lcp.rows import Known, RowPass, Rows, Wave, layout
 from warp_lcp.rows.fields import Padding
-from warp_lcp.rows.row_pass import text
+from warp_lcp.rows.native import text
 
 SHAPE = (5, 6, 37)
 RNG = np.random.default_rng(12345)

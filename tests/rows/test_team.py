@@ -17,7 +17,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.gallery import splash
-from warp_lcp.rows import RowPass, Rows, Wave, row_pass, team
+from warp_lcp.rows import RowPass, Rows, Wave, team, wave
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.native import HEADERS
 from warp_lcp.rows.program import Program
@@ -41,7 +41,7 @@ def threads_as_before():
 def small_pieces(monkeypatch):
     """Cut what is small, too."""
     monkeypatch.setattr(team, "CELLS", 64)
-    monkeypatch.setattr("warp_lcp.rows.row_pass.CELLS", 64)
+    monkeypatch.setattr("warp_lcp.rows.wave.CELLS", 64)
     monkeypatch.setattr("warp_lcp.rows.program.CELLS", 64)
 
 
@@ -102,7 +102,7 @@ def test_slabs_of_a_wave_are_one_stream(planes, tmp_path, small_pieces):
 @pytest.mark.parametrize("threads", [2, 3, 8, 64])
 @pytest.mark.parametrize("planes", [20, 22, 47, 100, 128, 129, 256, 700])
 def test_slabs_fill_their_threads(planes, threads):
-    slabs, each = row_pass.slabs_of(planes, 10, threads)
+    slabs, each = wave.slabs_of(planes, 10, threads)
     last = planes - (slabs - 1) * each
     assert slabs >= 2
     assert each % 2 == 0

@@ -16,7 +16,7 @@ import warp as wp
 
 import small_liquids
 import small_sands
-from warp_lcp.rows import row_pass
+from warp_lcp.rows import pass_form
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
 ROOT = Path(__file__).parents[2]
@@ -37,7 +37,7 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
     """Note each kernel module that a launch asks for and each allocation with the source files on the stack."""
     traces = Traces()
     allocator = type(wp.get_device("cpu").default_allocator)
-    load, allocate, entry, make_array = wp.Module.load, allocator.allocate, row_pass.Form.entry, wp.array.__init__
+    load, allocate, entry, make_array = wp.Module.load, allocator.allocate, pass_form.Form.entry, wp.array.__init__
 
     def noting_load(module: Any, *arguments: Any, **options: Any) -> Any:
         traces.modules.add(module.name)
@@ -69,7 +69,7 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
 
     with patch.context() as patched:
         patched.setattr(wp.Module, "load", noting_load)
-        patched.setattr(row_pass.Form, "entry", noting_entry)
+        patched.setattr(pass_form.Form, "entry", noting_entry)
         patched.setattr(allocator, "allocate", noting_allocate)
         patched.setattr(wp.array, "__init__", noting_array)
         yield traces
@@ -253,8 +253,8 @@ def test_walls_without_friction_are_not_launched(slips: bool, monkeypatch: pytes
     """The kernel of Coulomb friction on walls runs and reads faces only where a wall rubs; a solid that does counts its own alone."""
     simulation = small_sands.create(small_sands.scene(**(SAND | {"friction": 0.0 if slips else 0.3})))
     ran: list[str] = []
-    entry = row_pass.Form.entry
-    monkeypatch.setattr(row_pass.Form, "entry", lambda form, *given: (ran.append(form.kernel.key), entry(form, *given))[1])
+    entry = pass_form.Form.entry
+    monkeypatch.setattr(pass_form.Form, "entry", lambda form, *given: (ran.append(form.kernel.key), entry(form, *given))[1])
     walls, faces = simulation.stress.walls, 2 * (16 + 8)  # those of the box
     assert walls.count == (0 if slips else faces)
     simulation.step(1e-3)

@@ -228,7 +228,7 @@ def outcomes(problem: wl.LCP, works: tuple[Any, ...], **options: Any) -> list[An
 def test_threads_take_the_steps_of_the_host(threads: int, both: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     before = wl.get_threads()
     wl.set_threads(threads)
-    for module in ("team", "row_pass", "program"):
+    for module in ("team", "wave", "program"):
         monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 64)
     try:
         problem, alone, ahead = both(4100 + threads)

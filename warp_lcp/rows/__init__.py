@@ -2,7 +2,8 @@
 
 from warp_lcp.rows.kernel_file import KernelFile
 from warp_lcp.rows.layout import Known, Rows
-from warp_lcp.rows.row_pass import Bound, RowPass, Wave
+from warp_lcp.rows.row_pass import Bound, RowPass
 from warp_lcp.rows.sequence import Sequence
+from warp_lcp.rows.wave import Wave
 
 __all__ = ["Bound", "KernelFile", "Known", "RowPass", "Rows", "Sequence", "Wave"]

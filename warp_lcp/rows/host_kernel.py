@@ -12,8 +12,9 @@ import warp as wp
 
 from warp_lcp.rows.layout import Rows
 from warp_lcp.rows.memory import Scalar, rows_memory
+from warp_lcp.rows.pass_form import PLACE
 from warp_lcp.rows.program import LaunchGraph
-from warp_lcp.rows.row_pass import PLACE, RowPass
+from warp_lcp.rows.row_pass import RowPass
 
 
 class HostKernel(threading.local):

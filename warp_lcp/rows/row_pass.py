@@ -4,9 +4,7 @@
 A row function sees a piece: pointers to its first cell, the number n of its cells, the offsets ym, yp, zm, zp of the rows beside it.
 """
 
-import ctypes
 import functools
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from operator import attrgetter, index
@@ -15,24 +13,12 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.layout import BoundFields, Known, Pattern, RowLayout, Rows, copy_of, make_struct, packed, put, stencil_struct, threads
-from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
-from warp_lcp.rows.native import HEADERS, sections, shared, text
-from warp_lcp.rows.program import Launch, device_program, is_recording, launch_now, perform
-from warp_lcp.rows.team import CELLS, SLABS, Entry, Operation, Patch, Stage, get_threads, ranges, team
-
-C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
-C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
-PLACE = ("k0", "j0", "i0")  # first stored cell of a box
-INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
-PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
-SIDES = struct.Struct("dd")  # the two numbers that end the struct of bounds
-LARGEST = 4  # passes of a wave
-SLAB_PIECES, SLAB_PLANES = 4, 8  # of waves: their pieces beside each other have work to finish together
-NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
-UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
-
+from warp_lcp.rows.layout import Known, Rows, copy_of, put, threads
+from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar
+from warp_lcp.rows.native import sections
+from warp_lcp.rows.pass_form import KNOWN, NUMBERS, PACKED, PLACE, TOGETHER, UNIFORM, VARIABLE, C, Form, form_of, make_kernels_of_module
+from warp_lcp.rows.program import Launch, device_program, is_recording, perform
+from warp_lcp.rows.team import Operation, Patch, Stage, ranges, team
 
 # names of the layer's own
 OWN = frozenset(("self", "rows", "stencil", "bounds", "given", "P", "n", "p", "ym", "yp", "zm", "zp", "down", "up", "c_", "_ctype"))
@@ -108,7 +94,7 @@ class RowPass:
             TOGETHER.setdefault(self.module, []).append(self)
         if self.box:
             object.__setattr__(self, "numbers", {**self.numbers, **dict.fromkeys(PLACE, int)})
-            assert _form(self, (), tuple(self.constants.items()), UNIFORM, NUMBERS).kernel
+            assert form_of(self, (), tuple(self.constants.items()), UNIFORM, NUMBERS).kernel
 
     def _check_names(self) -> None:
         """Check the declaration, in whose place a compiler would complain, or nobody."""
@@ -209,8 +195,8 @@ class RowPass:
             letters = tuple(sorted(self._letters(stencil, given).items()))
             numbers = tuple(zip(self.constants, constants, strict=True))
             shape = KNOWN if isinstance(stencil, Known) else stored[1] if stencil and stored[1] else VARIABLE if weights else UNIFORM
-            made = self._forms[key] = _form(self, letters, numbers, shape, kind)
-            _make_kernels_of_module(made, letters, shape, kind)
+            made = self._forms[key] = form_of(self, letters, numbers, shape, kind)
+            make_kernels_of_module(made, letters, shape, kind)
         self._check_memory(rows, given)
         return Bound(made, rows, made.fill(stencil, bounds, given), given, (stencil, bounds))
 
@@ -250,7 +236,7 @@ class RowPass:
         return frozenset({*self.arrays, *self.numbers})
 
     @functools.cached_property
-    def _forms(self) -> dict[Any, "Form"]:
+    def _forms(self) -> dict[Any, Form]:
         """Forms by what is given, so that types are checked once."""
         return {}
 
@@ -316,178 +302,6 @@ def _getter(names: list[str]) -> Any:
     if len(names) == 1:
         return lambda s, name=names[0]: (getattr(s, name),)
     return attrgetter(*names) if names else None
-
-
-@functools.cache
-def _form(declared: RowPass, letters: Any, constants: Any, shape: str | Pattern, bounds: str) -> "Form":
-    return Form(declared, dict(letters), dict(constants), shape, bounds)
-
-
-TOGETHER: dict[str, list[RowPass]] = {}  # passes by the Warp module in which they are compiled
-
-
-def _make_kernels_of_module(form: "Form", letters: Any, shape: str | Pattern, bounds: str) -> None:
-    """Make the kernels that belong to a form's module before Warp loads it: for one more it would compile all of them again."""
-    if not form.declared.module or form.pattern is not None:
-        return
-    for other in TOGETHER[form.declared.module]:
-        if other.letters == form.declared.letters and other.words(dict(letters), other.constants, shape, bounds) == form.words:
-            assert _form(other, letters, tuple(other.constants.items()), shape, bounds).kernel
-
-
-class Form:
-    """A pass whose types and constants are known.
-
-    Attributes:
-        words: what tells it from other forms.
-        joins: whether it is compiled with other passes.
-        name: of its kernel.
-        fields: struct of its arguments.
-        native: that struct in C.
-        run: native function (layout, fields, slab, row, chunk of the first task, number of tasks).
-    """
-
-    def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], shape: str | Pattern, bounds: str) -> None:
-        self.declared, self.letters, self.bounds, d = declared, letters, bounds, declared
-        self.pattern = pattern = shape if isinstance(shape, Pattern) else None
-        self.joins = bool(d.module) and pattern is None  # the module of other passes
-        shape = pattern.word if pattern else shape
-        of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
-        self.words = d.words(letters, constants, shape, bounds)
-        weights = of(d.stencil[1]) if d.stencil and (shape == VARIABLE or (pattern and pattern.names)) else wp.float32
-        parts = {"stencil": stencil_struct(of(d.stencil[0]), weights, pattern)} if d.stencil else {}
-        parts |= {"bounds": BoundFields} if d.bounds else {}
-        self.types = {name: of(kind) for name, kind in d.arrays.items()}
-        members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {n: of(t) for n, t in d.numbers.items()}
-        self._numbers = struct.Struct("".join(PACKED[of(t)] for t in d.numbers.values()))
-        self.fields = Fields = make_struct(f"{d.name.replace('.', '_')}_{'_'.join(self.words)}", parts | members)
-
-        def run(L: RowLayout, given: Fields, slab_: int, row_: int, chunk_: int, count_: int): ...
-
-        blank = Fields()
-        self._struct, self.native, self._entry = type(blank), type(blank.__ctype__()), None
-        self._size = ctypes.sizeof(self.native)
-        area, _, last = d.name.rpartition(".")
-        variant = ".".join(["warp_lcp", *([d.module] if self.joins else d.name.split(".")), "_".join(self.words)])
-        run.__module__ = area if d.box else variant  # apart from other forms, which Warp would take for overloads
-        self.name = d.name.replace(".", "_") if self.joins else last
-        run.__qualname__ = f"{self.name}_rows"
-        self.run = wp.func_native(self._source(letters, constants, ord(shape[0]), of))(run)
-
-    def _source(self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any) -> str:
-        """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
-        d, pattern = self.declared, self.pattern
-        into = not {*d.ring}.isdisjoint(d.writes)
-        levels = d.finer or bool(d.other)
-        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOX": bool(d.box)}
-        switches |= {"BOUNDS": ord(self.bounds[0]), "STENCIL": stencil, "FOUND": len(d.found), "SUMS": len(d.sums)}
-        macros = {n: v for n, v in constants.items() if hasattr(v, "__index__")}
-        head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
-        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
-        head += [f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros]
-        at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
-        each = ["const Piece P = piece(k_i, j_i, c_, ring_); const int n = P.n; const long long p = P.p;"]
-        each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
-        each += [f"const long long ym = {'-yp' if d.finer else 'P.ym'}, zm = {'-zp' if d.finer else 'P.zm'};"]
-        each += ["const long long down = P.down, up = P.up;" if d.ring and not into else "const long long down = zm, up = zp;"]
-        if levels:
-            each += ["const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2;"]
-            each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
-        for n in (n for n in d.arrays if n not in d.box and not (d.found and n == "out")):
-            pointer = f"given.{n}.data{at.get(n, '')}"
-            pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
-            each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
-        each += [f"const auto {n} = given.{n};" for n in d.numbers]
-        if d.box:
-            each += [f"double {n} = 0;" for n in d.found]
-            each += [f"const long long s2 = given.{next(iter(d.box))}.shape[2], s1 = s2*given.{next(iter(d.box))}.shape[1];"]
-            listed = [f"for (int m_ = P.first; m_ < P.first + n; ++m_) {{ const int at_ = {d.listed}[m_], k = at_ / (int)s1;"]
-            listed += ["const int j = (at_ - k*(int)s1) / (int)s2, first = at_ % (int)s2, last = first + 1;"]
-            each += listed if d.listed else ["const int k = P.k + k0, j = P.j + j0, first = P.first + i0, last = first + n;"]
-            each += [f"auto* {n} = given.{n}.data ? given.{n}.data + k*s1 + j*s2 : nullptr;" for n in d.box]
-        if d.stencil:
-            fields, numbers = (pattern.names, pattern.numbers) if pattern else (("wx", "wy", "wz"), ("cx", "cy", "cz"))
-            first = "P.q" if d.finer else "p"
-            each += [f"const auto* {n} = given.stencil.{n}.data + {first};" for n in ("d", *fields, "known")]
-            each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", *numbers)]
-            if pattern:
-                at = f"const long long e = k + {first} - {'L.o0' if d.finer else 'L.base'}, a = yp, b = zp;"
-                each += [
-                    f"const auto place = [&](long long k) {{ {at}",
-                    "return wp::vec3i((int)(e / b), (int)(e % b / a), (int)(e % a)); };",
-                ]
-                each += pattern.source()
-        sums = [f"#define EACH_FOUND(DO) {' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}", text(HEADERS / "sums.h")]
-        sums += ["#undef EACH_FOUND"]
-        common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
-        before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), shared("tasks.h"), '#line 1 "fields"', *each]
-        body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]  # there names may be those of the pass
-        closed = ["}"] * bool(d.listed)
-        macros |= {"EACH_WEIGHT": 0} if pattern and d.stencil else {}
-        tail = ['#line 1 "end"', "}}}", *(f"#undef {n}" for n in macros), ""]
-        return "\n".join(["", *before, *common, *body, *closed, '#line 1 "sums"', *(sums if d.found else []), *tail])
-
-    def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> bytes:
-        """Return the struct of arguments as C has it: structs and arrays, which fill whole eight bytes, side by side, then numbers."""
-        parts = [] if stencil is None else [stencil.struct.__ctype__()]
-        if bounds is not None:
-            lower, least, upper, most, code = bounds
-            parts += [*packed((lower, upper, code)), SIDES.pack(least.value, most.value)]
-        parts += packed([given[name] for name in self.types])
-        values = [value_of(given[name]) for name in self.declared.numbers]
-        try:
-            parts.append(self._numbers.pack(*values))
-        except struct.error as error:
-            named = zip(self.declared.numbers, values, strict=True)
-            raise TypeError(f"{self.declared.label}: {', '.join(f'{n} = {v!r}' for n, v in named)}: {error}") from None
-        return b"".join(parts).ljust(self._size, b"\0")
-
-    def struct_of(self, arguments: bytes, kept: Any) -> Any:
-        """Return the struct of arguments for Warp; `kept` must live as long."""
-        made = object.__new__(self._struct)
-        made.__dict__.update(_kept=kept, _ctype=self.native.from_buffer_copy(arguments))
-        return made
-
-    @functools.cached_property
-    def kernel(self) -> Any:
-        """The kernel of the pass alone."""
-        run, Fields, touch = self.run, self.fields, self.pattern.touch if self.pattern else None
-        if touch is not None:
-
-            def alone(L: RowLayout, F: Fields):
-                i, j, c = wp.tid()
-                if L.planes < 0:
-                    touch(0)
-                first = first_task(L)
-                run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
-        else:
-
-            def alone(L: RowLayout, F: Fields):
-                i, j, c = wp.tid()
-                first = first_task(L)
-                run(L, F, i + first[0], j + first[1], c + first[2], wp.max(L.end - L.begin, 1))
-
-        alone.__name__ = alone.__qualname__ = self.name
-        if touch is not None:  # the caller's function may need what the project's flags leave out
-            return wp.kernel(enable_backward=False, module=run.module.name)(alone)
-        return forward_kernel(module=run.module.name)(alone)
-
-    def entry(self, bound: "Bound") -> Entry:
-        """Return the kernel as the team calls it."""
-        if self._entry is None:
-            self._entry = Entry(wp.launch(self.kernel, (1, 1, 1), [bound.layout, bound.fields], device="cpu", record_cmd=True))
-        return self._entry
-
-
-@wp.func_native("""
-#ifdef __CUDA_ARCH__
-return wp::vec3i(0, 0, 0);
-#else
-return wp::vec3i(L.begin / (L.rows*L.chunks), L.begin / L.chunks % L.rows, L.begin % L.chunks);
-#endif
-""")
-def first_task(L: RowLayout) -> wp.vec3i:
-    """Slab, row and chunk of a range's first task; 0 on CUDA, where a thread has one of its own."""
 
 
 class Bound(NamedTuple):
@@ -563,82 +377,3 @@ class Bound(NamedTuple):
             L.n1,
             patches,
         )
-
-
-def slabs_of(planes: int, least: int, threads: int) -> tuple[int, int]:
-    """Return into how many slabs planes are cut, and how many planes each has but the last: an even number, coarser planes stand for two.
-
-    Args:
-        planes: to cut, at least twice `least`.
-        least: planes that a slab has at least.
-        threads: that take them.
-    """
-    cuts = [(count, planes // count // 2 * 2) for count in range(2, min(planes // least, SLAB_PIECES * threads) + 1)]
-    shares = [-(-count // threads) * each + planes - count * each for count, each in cuts]  # of the thread that has the last slab, and most
-    return max(cut for cut, share in zip(cuts, shares, strict=True) if share <= 1.1 * min(shares))
-
-
-class Wave:
-    """Passes each of which follows some planes behind the one before: a CPU streams through memory once; on CUDA, launches.
-
-    Args:
-        name: of the kernel, as a pass has one.
-        stages: at most four passes, each with how many planes it is behind the first.
-
-    Raises:
-        ValueError: there are too many, or the first is behind.
-    """
-
-    def __init__(self, name: str, *stages: tuple[RowPass, int]) -> None:
-        if not 0 < len(stages) <= LARGEST or stages[0][1] or min(lag for _, lag in stages) < 0:
-            raise ValueError(f"{name}: expected 1 to {LARGEST} passes, 0 and more planes behind the first")
-        self.name, self.stages = name, stages
-
-    def launch(self, *passes: Bound | None, launch: Any = launch_now) -> None:
-        """Launch the passes, or record them; None leaves one out.
-
-        Raises:
-            TypeError: passes are others, or in another order, than declared.
-            ValueError: threads share the rows of one out, as those of a flat field.
-        """
-        declared = tuple(stage for stage, _ in self.stages)
-        given = [(b, lag) for b, (_, lag) in zip(passes, self.stages, strict=False) if b is not None]
-        if len(passes) != len(declared) or any(b and b.form.declared is not stage for b, stage in zip(passes, declared, strict=True)):
-            raise TypeError(f"{self.name}: takes {', '.join(stage.name for stage in declared)}, in this order")
-        if not given:
-            return
-        if given[0][0].rows.device.is_cuda or max(b.layout.slab for b, _ in given) > 1:
-            for bound, _ in given:
-                bound.launch(launch)
-            return
-        if max([b.rows.single.chunks for b, _ in given]) > 1:
-            raise ValueError(f"{self.name}: takes whole rows, not chunks of them")
-        if team() is None:
-            self._launch_planes(given, launch)
-            return
-        perform(self._operation(given), launch)
-
-    def _launch_planes(self, given: list[tuple[Bound, int]], launch: Launch) -> None:
-        """Launch the wave plane after plane, as `team.h` works through a slab."""
-        for turn in range(max(b.layout.planes for b, _ in given) + max(lag for _, lag in given)):
-            for bound, lag in given:
-                L, i = bound.layout, turn - lag
-                finer = max(L.fz, 1)  # planes that one of a coarser level stands for, whose turn comes with the last of them
-                whole = finer == 1 or (i < L.n1 and ((i + 1) % finer == 0 or i == L.n1 - 1))
-                if 0 <= (k := i // finer) < L.planes and whole:
-                    there = put(copy_of(L), {"begin": k * L.rows, "end": (k + 1) * L.rows})
-                    launch(bound.form.kernel, (1, 1, 1), [there, bound.fields], device=bound.rows.device)
-
-    def _operation(self, given: list[tuple[Bound, int]]) -> Operation:
-        """Return the wave for the team, cut into slabs of planes."""
-        layouts = [b.layout for b, _ in given]
-        planes, most = max(L.planes for L in layouts), max(lag for _, lag in given)
-        least = 2 * (max(SLAB_PLANES, 2 * most + 5) // 2 + 1)  # so that the gaps lie apart, and three planes between those that are kept
-        alone = get_threads() == 1 or any(L.turn or L.lift for L in layouts) or planes * max(L.rows * L.nx for L in layouts) < 2 * CELLS
-        slabs, each = (1, planes) if alone or planes < 2 * least else slabs_of(planes, least, get_threads())
-        members = {}
-        if slabs > 1:
-            apart = max([lag for b, lag in given if b.form.declared.ring], default=0) + 1
-            members = {"cut": each, "slabs": slabs, "apart": apart}
-        stages = [b.stage(lag, **(members if b.form.declared.ring else {})) for b, lag in given]
-        return Operation(SLABS, stages, slabs, each, planes, most)

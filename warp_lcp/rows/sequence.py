@@ -9,8 +9,9 @@ import warp as wp
 
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.layout import RowLayout, make_struct
+from warp_lcp.rows.pass_form import Form
 from warp_lcp.rows.program import Launch, launch_now, perform
-from warp_lcp.rows.row_pass import Bound, Form
+from warp_lcp.rows.row_pass import Bound
 
 CUDA_THREADS = 512  # of the block: with 1024 a thread has 64 registers, and passes spill up to 2 kB of what it holds
 MOST = 5  # forms
