@@ -36,7 +36,7 @@ LONG = ("honey-coil", "hourglass", "column-collapse", "paint-pour")  # scenes of
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in particle_scenes()])
 def test_a_scene_has_the_same_bits_on_any_number_of_threads(name, monkeypatch):
-    for module in ("team", "program", "row_pass"):
+    for module in ("team", "program", "wave"):
         monkeypatch.setattr(f"warp_lcp.rows.{module}.CELLS", 100)
     before = wl.get_threads()
     try:
