@@ -233,8 +233,9 @@ class SandSimulation(ParticleSimulation):
         ]
 
     def _sand_cells(self) -> np.ndarray:
-        """Return where sand is that a frame shows, as (k, j, i) in the stored shape, shape (n, 3)."""
-        return np.argwhere(self.grid.interior(self.packing.kind.numpy()) == FLUID) + 1
+        """Return where this process's sand is that a frame shows, as (k, j, i) in the stored shape, shape (n, 3)."""
+        part = self.grid.part
+        return np.argwhere(part.box_of(self.packing.kind.numpy()) == FLUID) + np.array(part.owned.low)
 
     def pressures(self) -> np.ndarray:
         """Return the pressure p = rho dx x / dt [Pa] of the last solve.
@@ -263,6 +264,8 @@ class SandSimulation(ParticleSimulation):
         self.packing.kind.assign(state["cells"])
         self.packing.fraction.assign(state["fraction"])
         self.outcome.ratio.assign(state["yield_ratio"])
+        self.grid.part.fill(self.stress.now)
+        self.grid.part.fill(self.packing.kind, self.packing.fraction, self.outcome.ratio)
         self._start = float(state["front_at_start"])
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -387,6 +390,7 @@ class SandSimulation(ParticleSimulation):
         particle_density(self.grid, self.particles, window, self._at_rest, self.density)
         if self.sides is not None:
             self.sides.add(self.density)
+        self.grid.part.fill(self.density)
 
     def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
         """Continue the velocity among walls as the stresses meet them."""
@@ -412,18 +416,33 @@ class SandSimulation(ParticleSimulation):
         """Return the 99th percentile of x and of y [m]."""
         if self._percentiles is not None:
             return self._percentiles.read()
+        if self.grid.part.shared:
+            return self._front_of_all()
         position = self.particles.position.numpy()
         if not len(position):
             return 0.0, 0.0
         nth = percentile_place(len(position))
         return float(np.partition(position[:, 0], nth)[nth]), float(np.partition(position[:, 1], nth)[nth])
 
+    def _front_of_all(self) -> tuple[float, float]:
+        """Return the same of all ranks' particles, of which each tells those that may lie beyond it."""
+        position, ranks = self.particles.position.numpy()[:, :2], self.grid.part.ranks
+        count = int(ranks.sum(len(position)))
+        beyond = count - percentile_place(count)
+        if count == 0:
+            return 0.0, 0.0
+        first = max(len(position) - beyond, 0)
+        farthest = np.partition(position, first, axis=0)[first:] if len(position) else position
+        everyone = np.concatenate(ranks.collect(farthest))
+        x, y = np.partition(everyone, len(everyone) - beyond, axis=0)[len(everyone) - beyond]
+        return float(x), float(y)
+
     def _mass_below(self) -> float:
         """Return the mass below the gauge [kg; kg/m in 2-D], 0 without one."""
         if self.scene.gauge is None:
             return 0.0
         below = np.count_nonzero(self.particles.position.numpy()[:, 1] < self.scene.gauge.height)
-        return float(self._sum(int(below))) * self.particle_mass
+        return float(self.grid.part.ranks.sum(int(below))) * self.particle_mass
 
     def _flow_rate(self, below: float, row: Row, dt: float) -> float:
         left = sum(int(row.get(name) or 0) for name in ("drained", "departed")) * self.particle_mass
@@ -434,16 +453,12 @@ class SandSimulation(ParticleSimulation):
         return self._largest([self.packing.densest])[0]
 
     def _own(self, field: wp.array) -> np.ndarray:
-        """Return what of a field nobody else has."""
-        return np.asarray(field.numpy())
+        """Return what of a field no other process has."""
+        return np.asarray(self.grid.part.known_of(field.numpy()))
 
     def _largest(self, values: list[float]) -> list[float]:
-        """Return the largest of what all have, number by number."""
-        return values
-
-    def _sum(self, count: int) -> int:
-        """Return the sum of what all have."""
-        return count
+        """Return the largest of what all processes have, number by number."""
+        return [float(value) for value in self.grid.part.ranks.max(np.array(values))]
 
 
 def percentile_place(count: int) -> int:

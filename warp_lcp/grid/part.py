@@ -122,6 +122,10 @@ class GridPart:
         """Return the cells that all processes visit together, of a window around this one's material."""
         return window
 
+    def known_of(self, field: np.ndarray) -> np.ndarray:
+        """Return the view of a host's field on what this process alone knows."""
+        return field
+
     def box_of(self, field: Any) -> Any:
         """Return the view of a field, host or device, or of layers of one, on the owned cells."""
         low, high = self.owned.low, self.owned.high
