@@ -26,7 +26,6 @@ from warp_lcp.distributed.migration import cuts_of, handed_over
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
-from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import SORTED, UNSORTED, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.flight import Flights
@@ -100,19 +99,6 @@ class SharedParticleSimulation(ParticleSimulation):
         whole = [self.part.gathered(volume.values[inside]) for volume in mine]
         return [replace(volume, values=v, origin=(0, 0, 0)) for volume, v in zip(mine, whole, strict=True) if v is not None]
 
-    def _fill_density(self) -> Fill:
-        others = super()._fill_density()
-
-        def fill(window: Window, density: wp.array) -> None:
-            if others is not None:
-                others(window, density)
-            self.part.fill(density)
-
-        return fill
-
-    def _fill(self, *fields: wp.array) -> None:
-        self.part.fill(*fields)
-
     def _flights(self) -> Flights | None:
         return make_flights(self.scene, self.grid, self.boundary, partial(SharedFlights, self.part))
 
@@ -165,10 +151,6 @@ class SharedParticleSimulation(ParticleSimulation):
             self.restore_bodies()
             raise
 
-    def _launch_particles_to_grid(self, window: Window) -> None:
-        super()._launch_particles_to_grid(window)
-        self.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
-
     def extrapolate_velocity(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
         """Continue the velocity into air and walls, see the base class; it is then right in all ghost layers.
 
@@ -183,22 +165,8 @@ class SharedParticleSimulation(ParticleSimulation):
                 f"{self.part.layers - 1}"
             )
 
-    def _launch_extrapolation(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array) -> None:
-        super()._launch_extrapolation(window, known, kind, contact)
-        self.part.fill(*self.velocity)
-
     def _layer_filled(self) -> Join | None:
         return Refill(self.part)
-
-    def grid_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
-        """Give this rank's own particles the velocity of the faces."""
-        self.particles.drop_ghosts()
-        super().grid_to_particles(window, kind, dt)
-
-    def met(self) -> tuple[int, int, int]:
-        """Return how many of all met a wall, were pushed by a solid, and are stuck inside one."""
-        met, pushed, stuck = self.part.ranks.sum(np.array(super().met()))
-        return int(met), int(pushed), int(stuck)
 
     def _exchange(self, dt: float) -> dict[str, int]:
         """Exchange this rank's particles with sources and outlets; return what all ranks have."""

@@ -244,7 +244,6 @@ class SurfaceMesh:
 
 def faces_from_particles(
     grid: StaggeredGrid, position: wp.array, velocity: wp.array, fields: list[wp.array], weights: list[wp.array],
-    join: Callable[..., None] | None = None,
 ) -> None:  # fmt: skip
     """Transfer velocity from particles to the faces, and extrapolate.
 
@@ -256,11 +255,9 @@ def faces_from_particles(
         velocity: [m/s], shape (n,), vectors.
         fields: velocity of each component on the faces [m/s] (written).
         weights: a field a component (written), scratch memory.
-        join: halo exchange of fields; None if serial.
     """
     particles_to_faces(grid, position, velocity, [], fields, weights)
-    if join is not None:
-        join(*fields, *weights)
+    grid.part.fill(*fields, *weights)
     known = grid.field(wp.int8)
     for field, weight in zip(fields, weights, strict=True):
         grid.everywhere.launch(weighted_kernel, [0.0, weight, known])

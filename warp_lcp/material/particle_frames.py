@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, SurfaceMesh, faces_from_particles, sample
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.narrow_band import NarrowBand
@@ -55,7 +55,7 @@ class ParticleFrames(ABC):
         band = self.band
         mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
         if not self._faces_know:  # the next step overwrites what the faces are given here
-            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights, self._fill)
+            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
         velocity = sample(self.grid, self.velocity, mesh.points)
         return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
 
@@ -65,11 +65,16 @@ class ParticleFrames(ABC):
 
     def _fill_density(self) -> Fill | None:
         """Return what adds to the particles' density in a window what none of them stands for, as a surface sees it; None: nothing does."""
-        return self.band.fill if self.band is not None else None
+        own, part = self.band.fill if self.band is not None else None, self.grid.part
+        if not part.shared:
+            return own
 
-    def _fill(self, *fields: wp.array) -> None:
-        """Fill ghost cells of fields; a serial grid has none."""
-        assert not self.shared, "only on ranks"
+        def fill(window: Window, density: wp.array) -> None:
+            if own is not None:
+                own(window, density)
+            part.fill(density)
+
+        return fill
 
     def body_surfaces(self) -> list[Surface]:
         """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""

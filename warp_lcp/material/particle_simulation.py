@@ -294,6 +294,7 @@ class ParticleSimulation(ParticleCheckpoints):
         for field, saved in zip(self.velocity, self._saved or (), strict=False):
             copy(saved, field)
         accelerate(window, self.velocity, self.weights, self.kicks)
+        self.grid.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
 
     def extrapolate_velocity(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
         """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
@@ -311,6 +312,7 @@ class ParticleSimulation(ParticleCheckpoints):
         self._continue(window, known, kind, contact, self._layer_filled())
         if self.sources is not None:
             self.sources.hold(self.velocity, [])
+        self.grid.part.fill(*self.velocity)
 
     def _continue(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array, join: Join | None) -> None:
         """Continue the velocity among the boundary's walls; `join` is called after each layer."""
@@ -335,6 +337,7 @@ class ParticleSimulation(ParticleCheckpoints):
             dt: time step [s].
         """
         particles = self.particles
+        particles.drop_ghosts()
         if self.flights is not None:
             with self.watch.stage("bodies in flight", particles.position):
                 self.flights.begin(particles, window, self.weights, kind, dt, self.gravity * self.kick_dt)
@@ -403,8 +406,9 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.flights.end(self.particles, self.velocity)
 
     def met(self) -> tuple[int, int, int]:
-        """Return how many particles met a wall, were pushed by a solid, and are stuck inside one when `carry` moved them."""
-        return self.boundary.met()
+        """Return how many of all particles met a wall, were pushed by a solid, and are stuck inside one when `carry` moved them."""
+        met, pushed, stuck = self.grid.part.ranks.sum(np.array(self.boundary.met())).tolist()
+        return met, pushed, stuck
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
         """Return what the log says of a step's solve; nothing if there was none."""
