@@ -230,7 +230,12 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
     for _ in range(SKIPPED):
         step()
     samples: dict[str, list[float]] = defaultdict(lambda: [0.0] * rounds)
+    whole, unwatched = list[float](), simulation.watch
     for turn in range(rounds):
+        simulation.watch, since = unwatched, time.process_time()  # a stopwatch reads a clock at both ends of each stage
+        for _ in range(steps):
+            step()
+        whole.append(1e3 * (time.process_time() - since) / steps)
         simulation.watch = timer = StageTimer()
         with timer.stage(OUTSIDE):
             for _ in range(steps):
@@ -244,16 +249,15 @@ def scene_records(name: str, resolution: int, device: str, steps: int, rounds: i
     simulation.watch = timer = StageTimer()
     with StepRecorder(timer) as replayed, timer.stage(OUTSIDE):
         step()
-    return _records(f"{name}, {resolution} cells", samples, counted.counts, replayed.native, steps)
+    return _records(f"{name}, {resolution} cells", whole, samples, counted.counts, replayed.native, steps)
 
 
 def _records(
-    label: str, samples: dict[str, list[float]], counts: dict[str, Counter[str]], native: dict[str, float], steps: int
+    label: str, whole: list[float], samples: dict[str, list[float]], counts: dict[str, Counter[str]], native: dict[str, float], steps: int
 ) -> list[Record]:
     """Return a record of the step and one of each stage, the longest first."""
     for stage in counts.keys() | native.keys():
         samples[stage]  # a stage that the rounds had not
-    whole = [sum(parts) for parts in zip(*samples.values(), strict=True)]
     records = [(label, whole, sum(counts.values(), Counter()), sum(native.values()), "step")]
     for stage in sorted(samples, key=lambda stage: -min(samples[stage])):
         records.append((f"{label}: {stage}", samples[stage], counts[stage], native[stage], stage))
@@ -271,7 +275,8 @@ def _records(
 def results(found: dict[str, list[Record]], *machines: Record) -> Results:
     """Return records, a table and a chart of each scene."""
     remark = (
-        f"Processor's milliseconds of a step, {wl.get_threads()} thread(s): least of the rounds, in which stages do not overlap. "
+        f"Processor's milliseconds of a step, {wl.get_threads()} thread(s): least of the rounds. Stages do not overlap; a stopwatch "
+        "measures them in rounds of their own, and takes some of their time. Shares are of the sum of the stages. "
         f"Native: the native calls of one step alone, least of {REPLAYS + 1} each. The rest: means of a step."
     )
     records = [*machines, *(record for of_scene in found.values() for record in of_scene)]
@@ -281,12 +286,13 @@ def results(found: dict[str, list[Record]], *machines: Record) -> Results:
 
 
 def _rows(records: Sequence[Record]) -> list[list[str]]:
-    whole = records[0].figures["host"].value
+    whole = sum(record.figures["host"].value for record in records[1:])
     rows = []
     for r in records:
         host, native = r.figures["host"].value, r.figures["native"].value
         counts = [f"{r.figures[kind].value:.4g}" for kind in COUNTS]
-        rows.append([str(r.facts["stage"]), f"{host:.3f}", f"{100 * host / whole:.1f}", f"{native:.3f}", *counts])
+        share = "" if r is records[0] else f"{100 * host / whole:.1f}"
+        rows.append([str(r.facts["stage"]), f"{host:.3f}", share, f"{native:.3f}", *counts])
     return rows
 
 

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import INTS, POINTS, launch_list, list_kernel
 from warp_lcp.grid.particles import Particles
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, launch
 from warp_lcp.rows.readings import Reading
@@ -38,7 +39,7 @@ def count_kernel(i, position: POINTS, found: WORDS, counts: INTS, mask: wp.uint3
             wp.atomic_add(counts, axis * DIGITS + digit, 1)
 
 
-@wp.kernel(enable_backward=False, module="granular.front")
+@forward_kernel(module="granular.front")
 def select_kernel(counts: INTS, found: WORDS, rank: INTS, place: int, mask: wp.uint32, shift: wp.uint32, out: wp.array(dtype=wp.float32)):
     """Find the digit in which the number at a rank falls, and its rank among those; a thread an axis."""
     axis = wp.tid()

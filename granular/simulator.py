@@ -101,7 +101,8 @@ class SandSimulation(ParticleSimulation):
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress = Stress(self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried)
         self.outcome = SandReport(self.stress)
-        self._work: Any = self.method.init(self.stress)
+        self._work: Any = None  # of the method that made it
+        self._made_by: Any = None
         inner = (slice(1, -1),) * 3
         wp.copy(self.packing.kind[inner], self.solids.base[inner])
 
@@ -311,6 +312,8 @@ class SandSimulation(ParticleSimulation):
         """
         solver = self.scene.solver
         stopping = wl.StoppingCriteria(rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations)
+        if self._made_by is not self.method:  # the first solve on a grid, or another method since the last one
+            self._work, self._made_by = self.method.init(self.stress), self.method
         return wl.solve(self.stress, self.method, stopping=stopping, workspace=self._work)
 
     def _solve(self, window: Window, dt: float) -> Row:

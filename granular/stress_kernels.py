@@ -107,7 +107,7 @@ SAFELY = 1.0 + 1e-9  # the host computes the norm again
 f32s, f64s, i32s = wp.array(dtype=wp.float32), wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
 
-@wp.kernel(enable_backward=False, module="granular.momentum")
+@forward_kernel(module="granular.momentum")
 def numbers_kernel(
     numbers: f32s, k: float, cohesion: float, tension: float, x: float, y: float, z: float, step: float, gain: float, halfway: float
 ):
@@ -134,14 +134,14 @@ def limit(state: f64s, momentum: wp.float64):
     state[REST] = wp.float64(1.0) - momentum
 
 
-@wp.kernel(enable_backward=False, module="granular.momentum")
+@forward_kernel(module="granular.momentum")
 def keep_sums_kernel(sums: f64s, decisions: f64s, place: int):
     """Keep the sums of a residual: of pressure, of friction in cells and on walls."""
     decisions[place] = sums[0]
     decisions[place + 1] = sums[1] + sums[COLUMNS]
 
 
-@wp.kernel(enable_backward=False, module="granular.momentum")
+@forward_kernel(module="granular.momentum")
 def begin_steps_kernel(
     sums: f64s, counted: f64s, numbers: f32s, state: f64s, decisions: f64s, going: i32s, pressure_step: float, shear_step: float,
     lookahead: float, momentum: wp.float64, most_momentum: wp.float64, limit_: wp.float64, tolerance: wp.float64, least: wp.float64,
@@ -180,7 +180,7 @@ def begin_steps_kernel(
     going[0] = wp.where(steps and most > wp.float64(0.0) and wp.isfinite(norm), 1, 0)
 
 
-@wp.kernel(enable_backward=False, module="granular.momentum")
+@forward_kernel(module="granular.momentum")
 def resume_steps_kernel(decisions: f64s, going: i32s):
     """Go on after a residual that has missed the tolerance."""
     decisions[DUE] = wp.float64(0.0)
@@ -188,7 +188,7 @@ def resume_steps_kernel(decisions: f64s, going: i32s):
     going[0] = 1
 
 
-@wp.kernel(enable_backward=False, module="granular.momentum")
+@forward_kernel(module="granular.momentum")
 def decide_kernel(
     counted: f64s, numbers: f32s, state: f64s, decisions: f64s, limits: f64s, going: i32s, check: int, patience: int, wait: int
 ):

@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.solids import Walls, wall_faces
+from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -136,6 +137,18 @@ def test_wall_faces_lie_between_open_cells_and_solids(dimension: int) -> None:
     assert (np.diff(cells) >= 0).all()  # so that a cell's faces are one thread's, in one order
 
 
+class SomeCells(GridPart):
+    """A process that owns some of the cells."""
+
+    def __init__(self, grid: StaggeredGrid, cells: Window) -> None:
+        super().__init__(grid)
+        self._cells = cells
+
+    @property
+    def owned(self) -> Window:
+        return self._cells
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(dimension: int) -> None:
     random = np.random.default_rng(dimension)
@@ -144,7 +157,8 @@ def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(
     capacity = random.uniform(0.2, 1.0, grid.shape).astype(np.float32)
     arrays = [wp.array(host, dtype=kind, device=grid.device) for host, kind in ((base, wp.int8), (capacity, wp.float32))]
     counted = Window((1, 2, 2), (grid.shape[0] - 1, 5, 6), grid.device)
-    packing = Packing(grid, *arrays, counted=counted)
+    object.__setattr__(grid, "part", SomeCells(grid, counted))
+    packing = Packing(grid, *arrays)
     index = np.full(grid.shape, -1, dtype=np.int32)
     index[0], index[-1], index[:, 0], index[:, -1], index[..., 0], index[..., -1] = [0] * 6
     walls = Walls(grid, index, [0.5])

@@ -15,6 +15,7 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.density_correction import LONGEST, DensityCorrection
+from warp_lcp.rows import program
 from warp_lcp.rows.pass_form import Form
 
 BALL = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.23}
@@ -348,7 +349,7 @@ def test_liquid_that_lets_go_of_a_wall_is_not_drawn_back(lets_go: bool) -> None:
 @pytest.mark.parametrize("tables", [{"density_correction": {"every": 0}}, {"density_correction": {}, "particles": {"reseed": {}}}])
 def test_a_scene_without_it_launches_none_of_its_kernels(tables: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor does it allocate: fields are made when the simulation is."""
-    launched, launch, entry = set(), wp.launch, Form.entry
+    launched, launch, entry, prepared = set(), wp.launch, Form.entry, program.prepared
 
     def note(kernel: wp.Kernel, *arguments: Any, **named: Any) -> Any:
         launched.add(kernel.module.name)
@@ -358,8 +359,13 @@ def test_a_scene_without_it_launches_none_of_its_kernels(tables: dict[str, Any],
         launched.add(self.kernel.module.name)
         return entry(self, *arguments)
 
+    def note_prepared(kernel: wp.Kernel, *arguments: Any) -> Any:
+        launched.add(kernel.module.name)
+        return prepared(kernel, *arguments)
+
     monkeypatch.setattr(wp, "launch", note)
     monkeypatch.setattr(Form, "entry", note_entry)
+    monkeypatch.setattr(program, "prepared", note_prepared)
     simulation = dam(**tables)
     advance(simulation, 0.2)
     own = {name for name in launched if name.startswith(("warp_lcp.material.density_correction", "warp_lcp.material.reseeding"))}

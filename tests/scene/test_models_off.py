@@ -16,7 +16,7 @@ import warp as wp
 
 import small_liquids
 import small_sands
-from warp_lcp.rows import pass_form
+from warp_lcp.rows import pass_form, program
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
 ROOT = Path(__file__).parents[2]
@@ -35,7 +35,7 @@ class Traces:
 @contextmanager
 def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
     """Note each kernel module that a launch asks for and each allocation with the source files on the stack."""
-    traces = Traces()
+    traces, prepared = Traces(), program.prepared
     allocator = type(wp.get_device("cpu").default_allocator)
     load, allocate, entry, make_array = wp.Module.load, allocator.allocate, pass_form.Form.entry, wp.array.__init__
 
@@ -46,6 +46,10 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
     def noting_entry(self: Any, *arguments: Any) -> Any:
         traces.modules.add(self.kernel.module.name)
         return entry(self, *arguments)
+
+    def noting_prepared(kernel: Any, *arguments: Any) -> Any:
+        traces.modules.add(kernel.module.name)
+        return prepared(kernel, *arguments)
 
     def note(size: int) -> None:
         traces.total += size
@@ -69,6 +73,7 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
 
     with patch.context() as patched:
         patched.setattr(wp.Module, "load", noting_load)
+        patched.setattr(program, "prepared", noting_prepared)
         patched.setattr(pass_form.Form, "entry", noting_entry)
         patched.setattr(allocator, "allocate", noting_allocate)
         patched.setattr(wp.array, "__init__", noting_array)

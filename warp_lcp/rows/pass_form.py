@@ -4,6 +4,7 @@
 import ctypes
 import functools
 import struct
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -152,10 +153,16 @@ class Form:
             raise TypeError(f"{self.declared.label}: {', '.join(f'{n} = {v!r}' for n, v in named)}: {error}") from None
         return b"".join(parts).ljust(self._size, b"\0")
 
-    def struct_of(self, arguments: bytes, kept: Any) -> Any:
-        """Return the struct of arguments for Warp; `kept` must live as long."""
+    def struct_of(self, bound: "Bound") -> Any:
+        """Return the struct of arguments for Warp, which keeps them alive; a capture on the CPU looks for the arrays by name."""
+        stencil, bounds = bound.kept
+        members = {name: bound.given[name] for name in self.types}
+        if stencil is not None:
+            members["stencil"] = stencil.struct
+        if bounds is not None:
+            members["bounds"] = SimpleNamespace(lower=bounds[0], upper=bounds[2], code=bounds[4])
         made = object.__new__(self._struct)
-        made.__dict__.update(_kept=kept, _ctype=self.native.from_buffer_copy(arguments))
+        made.__dict__.update(members, _kept=bound, _ctype=self.native.from_buffer_copy(bound.arguments))
         return made
 
     @functools.cached_property

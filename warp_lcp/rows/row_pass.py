@@ -324,7 +324,7 @@ class Bound(NamedTuple):
     @property
     def fields(self) -> Any:
         """The struct of arguments for Warp, which keeps their memory."""
-        return self.form.struct_of(self.arguments, self)
+        return self.form.struct_of(self)
 
     @property
     def layout(self) -> Any:
