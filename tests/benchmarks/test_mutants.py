@@ -61,4 +61,4 @@ def test_headers_are_changed_between_operands_only():
 
 def test_headers_have_the_tests_of_who_names_them():
     assert "tests/multigrid/test_hierarchy.py" in chosen_for(ROOT, "warp_lcp/multigrid/headers/coarsen.h")[:4]
-    assert chosen_for(ROOT, "warp_lcp/rows/headers/piece.h")[0] == "tests/rows/test_row_pass.py"
+    assert "tests/rows/test_row_pass.py" in chosen_for(ROOT, "warp_lcp/rows/headers/piece.h")[:2]
