@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -24,6 +24,7 @@ from warp_lcp.distributed.particles import MpiPost
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.distributed import create
+from warp_lcp.rows.program import LaunchGraph, Program
 from warp_lcp.scene.scene_file import load_scene
 
 SKIPPED, STEPS = 10, 10  # liquid moves when it is measured
@@ -32,17 +33,19 @@ MEGA = 1 << 20
 
 
 class Traffic:
-    """What a rank receives: bytes and occasions, by their kind."""
+    """What a rank receives: bytes and occasions, by their kind; those of a recorded program at each of its runs."""
 
     def __init__(self) -> None:
         """Count from here on, in this process."""
         self.bytes, self.times = Counter[str](), Counter[str]()
+        self._recorded: list[tuple[str, int]] | None = None  # by the program that is being recorded
         self._listen(Subdomain, "fill", lambda part, *fields, width=None: _ghosts(part, width) * sum(map(_item, fields)))
         self._listen(Subdomain, "collect", lambda part, mine, whole: (whole[0].size - mine[0].size) * sum(map(_item, whole)))
         self._listen(Halo, "fill", lambda halo, field: _ghosts(halo) * _item(field))
         self._listen(Gathering, "collect", lambda gathering, mine, whole: (whole.size - mine.size) * _item(whole))
         self._listen(Ranks, "gather", lambda ranks, values: (ranks.size - 1) * np.asarray(values).nbytes)
         self._listen(MpiPost, "swap", lambda post, outgoing: sum(array.nbytes for array in outgoing.values()))  # sent; as much comes
+        self._listen_to_programs()
 
     def _listen(self, kind: type, name: str, size: Callable[..., int]) -> None:
         plain = getattr(kind, name)
@@ -53,7 +56,28 @@ class Traffic:
 
         setattr(kind, name, counted)
 
+    def _listen_to_programs(self) -> None:
+        """Count what is recorded when it runs, not when it is recorded."""
+        record, run, recorded = LaunchGraph._recorded, Program.run, dict[int, tuple[Program, list[tuple[str, int]]]]()
+
+        def recording(graph: LaunchGraph, arguments: tuple[Any, ...]) -> Any:
+            outer, self._recorded = self._recorded, []
+            program = record(graph, arguments)
+            assert program is not None
+            recorded[id(program)], self._recorded = (program, self._recorded), outer
+            return program
+
+        def running(program: Program) -> None:
+            for kind, size in recorded.get(id(program), (program, []))[1]:
+                self._count(kind, size)
+            run(program)
+
+        cast(Any, LaunchGraph)._recorded, cast(Any, Program).run = recording, running
+
     def _count(self, kind: str, size: int) -> None:
+        if self._recorded is not None:
+            self._recorded.append((kind, size))
+            return
         self.bytes[kind] += size
         self.times[kind] += 1
 
