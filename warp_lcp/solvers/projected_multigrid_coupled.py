@@ -123,6 +123,7 @@ class CoupledWorkspace(MultigridWorkspace):
         if not self.exact:
             super()._move_monotonely(safe, launch)
             return
+        assert self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle  # made now, not among recorded launches
         self._monotone.run(safe, variant=(self.residual.classify, *self.problem_key()))
 
     def _launch_monotone(self, safe: bool) -> None:
