@@ -62,6 +62,7 @@ class BodyCoupling:
         self._counts, self._offsets = (wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2))
         self._low: wl.LowRankOperator | None = None
         self._flat: wp.array | None = None  # of the last solution
+        self._pending: wp.array | None = None  # cells of a `take` whose entries have not been counted by the host
         self._beside, self._enclosing = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
         self._counting = LaunchGraph(grid.device, self._launch_count)
         self._entering = LaunchGraph(grid.device, self._launch_entries)
@@ -92,20 +93,38 @@ class BodyCoupling:
         else:
             self._beside.move_to(window)
             self._enter(kind)
+        self._pending = kind if window is not None and self.grid.device.is_cuda else None
         if self._low is not None:
             self._low.update(self._weights(), symmetric=True)
 
+    def makes_room(self) -> bool:
+        """Enter again what a GPU had no room for in the last `take`; return whether a solve that has read it is to be repeated."""
+        kind, self._pending = self._pending, None
+        if kind is None or self.columns.wanted() <= self.columns.capacity:
+            return False
+        self._enter_all(kind)
+        if self._low is not None:
+            self._low.update()
+        return True
+
     def _enter(self, kind: wp.array) -> None:
-        """Write the entries of U for the cells of the window."""
+        """Write the entries of U for the cells of the window; a GPU does not wait for their number, see `makes_room`."""
         columns = self.columns
-        self._counting.run(kind)
-        total = columns.counted()
+        self._counting.run(kind, variant=columns.capacity)
+        columns.counting()
+        if self.grid.device.is_cuda and columns.capacity > 1:
+            self._entering.run(kind, variant=columns.rows.ptr)
+        else:
+            self._enter_all(kind)
+
+    def _enter_all(self, kind: wp.array) -> None:
+        """Write the entries of U, as many as have been counted."""
+        columns, total = self.columns, self.columns.wanted()
         if total > columns.capacity:
             columns.reserve(round(SPARE * total))
             columns.count.fill_(total)
-            self._entering.forget()
         if total:
-            self._entering.run(kind)
+            self._entering.run(kind, variant=columns.rows.ptr)
 
     def _launch_count(self, kind: wp.array) -> None:
         """Count the entries of each row of cells, and add them up."""
@@ -115,7 +134,7 @@ class BodyCoupling:
         if device.is_cuda:
             call(partial(wp.utils.array_scan, self._counts, self._offsets, inclusive=False))
             first = len(self._counts) - 1
-        launch(kernels.offsets_kernel, 1, [first, self._counts, self._offsets, self.columns.count], device=device)
+        launch(kernels.offsets_kernel, 1, [first, self._counts, self._offsets, self.columns.capacity, self.columns.count], device=device)
 
     def _launch_entries(self, kind: wp.array) -> None:
         entries = [self.columns.rows, self.columns.blocks, self.columns.values]

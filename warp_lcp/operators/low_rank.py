@@ -39,7 +39,7 @@ class ColumnEntries:
         entry_rows: row of each entry, int32, ascending.
         blocks: block of columns of each entry, int32.
         values: the entry's values, `width` of them.
-        count: of the entries, int32, shape (1,).
+        count: of the entries, int32, its first number.
         width: columns of a block.
     """
 
@@ -74,7 +74,7 @@ class BlockColumns:
         rows: row of each entry, int32, shape (capacity,).
         blocks: block of each entry, int32, shape (capacity,).
         values: of type dtype, shape (capacity * width,), an entry's one after another.
-        count: number of entries, int32, shape (1,).
+        count: number of entries, and that of those that there were to write, int32, shape (2,).
         sums: what `gather` writes, float64, shape (rank,).
         across: who has other rows of U; None: nobody.
     """
@@ -83,7 +83,7 @@ class BlockColumns:
 
     def __init__(self, size: int, blocks: int, width: int, dtype: Any, device: wp.Device) -> None:
         self.size, self.width, self.rank, self.dtype, self.device = size, width, blocks * width, dtype, device
-        self._count, self._sums = Reading(device, 1, wp.int32), Reading(device, self.rank)
+        self._count, self._sums = Reading(device, 2, wp.int32), Reading(device, self.rank)
         self.count, self.sums = self._count.array, self._sums.array
         self.reserve(0)
 
@@ -117,8 +117,16 @@ class BlockColumns:
 
     def counted(self) -> int:
         """Return how many entries a kernel has written; waits for the device."""
-        self._count.changed()
+        self.counting()
         return int(self._count.numpy()[0])
+
+    def counting(self) -> None:
+        """Say that a kernel writes entries."""
+        self._count.changed()
+
+    def wanted(self) -> int:
+        """Return how many entries there were to write at the last `counting`, more than there is room for perhaps; waits for the device."""
+        return int(self._count.numpy()[1])
 
     def summed(self) -> np.ndarray:
         """Return what the last `gather` has written, not to be written to, shape (rank,); waits for the device."""
