@@ -142,10 +142,13 @@ class BodyCoupling:
 
     def push(self, x: wp.array) -> None:
         """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""
-        if self._flat is None or self._flat.ptr != x.ptr:
-            self._flat = x.flatten()
-        self._gathering.run(self._flat, variant=self.columns.rows.ptr)
-        self.bodies.bodies.apply_impulses(self._scale * self.columns.summed().reshape(-1, self.width))
+        products = self._low.products_at(x) if self._low is not None else None
+        if products is None:
+            if self._flat is None or self._flat.ptr != x.ptr:
+                self._flat = x.flatten()
+            self._gathering.run(self._flat, variant=self.columns.rows.ptr)
+            products = self.columns.summed()
+        self.bodies.bodies.apply_impulses(self._scale * products.reshape(-1, self.width))
 
     def _launch_gather(self, x: wp.array) -> None:
         self.columns.gather(x, launch=launch)

@@ -193,6 +193,7 @@ class LowRankOperator(Pickled):
         weights: W, float64, shape (k, k); `update` changes it.
         version: how often columns and weights have been taken.
         weighed: W U'x of the last product, float64, shape (k,).
+        products: where a solve keeps U'x of its iterate as last evaluated; `products_of` is that iterate, None: no solve does.
 
     Raises:
         ValueError: shapes do not match, there is no column, or a value is not finite.
@@ -341,6 +342,7 @@ class LowRankOperator(Pickled):
         self._weights.send()
         self._turned.send()
         self.weighed = wp.zeros(self.rank, dtype=wp.float64, device=self.device)
+        self.products, self.products_of = Reading(self.device, self.rank), None
 
     def _checked_weights(self, weights: Any) -> np.ndarray:
         """Return W as a host matrix."""
@@ -351,6 +353,10 @@ class LowRankOperator(Pickled):
         if not np.isfinite(W).all():
             raise ValueError("weights holds a value that is not finite")
         return W
+
+    def products_at(self, x: wp.array[Any]) -> np.ndarray | None:
+        """Return U'x of the solution of the last solve, not to be written to; None where no solve has kept it. Waits for the device."""
+        return self.products.numpy() if self.products_of is not None and self.products_of.ptr == x.ptr else None
 
     def _product(self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]) -> wp.array[Any]:
         if x.size != self.layout.size:

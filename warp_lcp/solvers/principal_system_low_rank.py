@@ -64,11 +64,12 @@ def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
 
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
-def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64):
-    """From u = U'x and W u: x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x."""
+def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64, products: F64):
+    """From u = U'x and W u: x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x; keep u as `products`."""
     beyond = wp.float64(0.0)
     for i in range(n):
         beyond += u[i] * weighed[i]
+        products[i] = u[i]
     scalars[ENERGY] -= beyond
 
 

@@ -284,7 +284,7 @@ class RunAhead:
 
     def _take_rows(self) -> None:
         """Take over the rows that a loop has left; waits for the device."""
-        for reading in (self._found, self._judged):
+        for reading in (self._found, self._judged, *self._work.readings):
             reading.changed()
         count = int(self._judged.numpy()[int(TAKEN)])
         self.rows.extend(self._found.numpy()[: count * int(ROW)].reshape(count, -1).copy())

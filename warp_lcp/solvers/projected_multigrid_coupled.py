@@ -56,8 +56,13 @@ class CoupledResidual(AssessedResidual):
         low = self._low
         low.add(x, self.problem.b, self._b, launch=launch)
         super().assess(x, launch=launch)
-        inputs = [low.columns.sums, low.weighed, low.rank, self.scalars]
+        inputs = [low.columns.sums, low.weighed, low.rank, self.scalars, low.products.array]
         launch(coupling.subtract_energy_kernel, 1, inputs, device=low.device)
+
+    def read(self) -> float:
+        """Read what the evaluation found, U'x too."""
+        self._low.products.changed()
+        return super().read()
 
     def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Launch the step and the evaluation where it ends; U'x is needed between them."""
@@ -79,6 +84,8 @@ class CoupledWorkspace(MultigridWorkspace):
         self._monotone = LaunchGraph(problem.device, self._launch_monotone, at_once=problem.layout.across is not None)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
+        self.readings = (low.products,)
+        low.products_of = self.x if problem.layout.across is None else None
         self._newton: Inner | None = None
         self._searches = False  # whether steps are Newton's
 

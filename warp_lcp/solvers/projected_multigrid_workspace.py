@@ -171,6 +171,7 @@ class MultigridWorkspace(IterateMemory):
     """
 
     residual: AssessedResidual
+    readings: tuple[Reading, ...] = ()  # that evaluations leave besides the residual's
 
     def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid, *, shifted: bool = False) -> None:
         precision = Precision(settings.precision)
