@@ -96,7 +96,16 @@ class BlockColumns:
         on_cuda = self.device.is_cuda
         self._each = Rows.flat(self.capacity, self.device, serial=not on_cuda)
         self._all = Rows.by_turns(self.capacity, self.device, min(self.capacity, CUDA_THREADS)) if on_cuda else self._each
-        self._reduction = Reduction(self.size, self.device, self.sums, columns=self.rank, threads=self._all.places) if on_cuda else None
+        self._reduction = self.reduction(self.sums, self.rank) if on_cuda else None
+
+    @property
+    def turns(self) -> Rows:
+        """The entries, by turns of threads, for sums on a GPU."""
+        return self._all
+
+    def reduction(self, found: wp.array[Any], columns: int) -> Reduction:
+        """Return what adds up columns of sums over `turns` to `found`."""
+        return Reduction(self.size, self.device, found, columns=columns, threads=self._all.places)
 
     def assign(self, rows: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
         """Take entries from the host.

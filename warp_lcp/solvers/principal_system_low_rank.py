@@ -19,6 +19,13 @@ from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers.projected_multigrid_kernels import ENERGY, ZAP, ZAZ
 
+STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
+SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
+FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts
+CHANGED = 2.0  # factor by which a column's square may change before its potential is renewed
+SKEW = 0.3  # the most that potentials may be unsymmetric
+SPREADING, STRONGEST = wp.constant(wp.float64(SPREAD)), wp.constant(wp.float64(STRONG))
+SAFELY = wp.constant(wp.float64(1.0 + 1e-9))  # what the host computes again must not come out the other way
 I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
 
@@ -73,15 +80,22 @@ def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64, products:
     scalars[ENERGY] -= beyond
 
 
+@no_type_check
+@forward_kernel(module="warp_lcp.low_rank_correction")
+def calm_kernel(W: wp.array2d(dtype=wp.float64), squares: F64, rank: int, width: int, power: wp.float64, calm: I32):
+    """Find whether no column is strong, with a margin; one thread."""
+    calm[0] = 1
+    for q in range(rank):
+        rows = squares[rank + q // width]
+        if not W[q, q] * SPREADING * wp.pow(rows, power) * squares[q] * SAFELY < STRONGEST:
+            calm[0] = 0
+
+
 KERNELS = KernelFile(Path(__file__).parent / "headers/low_rank_correction.h")
 SQUARES = KERNELS["low_rank_correction.squares"]
+BY_TURNS = KERNELS["low_rank_correction.squares_by_turns"]
 DOTS = KERNELS["low_rank_correction.dots"]
 SUBTRACT = KERNELS["low_rank_correction.subtract"]
-STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
-SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
-FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts
-CHANGED = 2.0  # factor by which a column's square may change before its potential is renewed
-SKEW = 0.3  # the most that potentials may be unsymmetric
 
 
 class LowRankCorrection:
@@ -106,6 +120,8 @@ class LowRankCorrection:
 
     Attributes:
         slots: columns corrected for.
+        noted: the sums that `renew` decides by.
+        calm: on a GPU, int32 of shape (1,): whether they ask for no column.
     """
 
     def __init__(self, low: LowRankOperator, hierarchy: Hierarchy) -> None:
@@ -114,7 +130,10 @@ class LowRankCorrection:
         self._inverses = HostArray((2, n * n), wp.float64, device)  # of S and E
         self._S, self._E = self._inverses.array[0], self._inverses.array[1]
         self._sums, self._kept, self._force, self._t = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4))
-        self._squares = Reading(device, n + n // low.columns.width)
+        self.noted = Reading(device, n + n // low.columns.width)
+        self.calm = wp.zeros(1, dtype=wp.int32, device=device) if device.is_cuda else None
+        self._power = wp.float64(1.0 / max(sum(n > 1 for n in hierarchy.finest.stencil.padding.counts) - 1, 1))
+        self._adding: tuple[Any, Reduction] | None = None  # of the sums on a GPU, and the entries that it is for
         self._of_slot = wp.zeros(n, dtype=wp.int32, device=device)
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
@@ -140,23 +159,45 @@ class LowRankCorrection:
         """What recorded launches depend on."""
         return self.slots, self._Z.ptr or 0
 
-    def renew(self, *, begins: bool) -> bool:
+    def prepare(self) -> None:
+        """Make what `note` launches, for the memory that the entries are in."""
+        found, key = self.noted.array, self._columns.rows.ptr
+        if self.calm is not None and (self._adding is None or self._adding[0] != key):
+            self._adding = key, self._columns.reduction(found, found.size)
+
+    def note(self, launch: Launch) -> None:
+        """Launch the sums U_q' U_q over the free set, the rows that each body touches there and, on a GPU, whether that is `calm`."""
+        columns, low, d = self._columns, self._low, self._hierarchy.finest.stencil.d
+        if self.calm is None:
+            one = Rows.flat(1, low.device)
+            SQUARES.bind(one, columns.entry_fields, rank=low.rank, d=d, squares=self.noted.array).launch(launch)
+            return
+        assert self._adding is not None, "prepare comes first"
+        found, adding = self.noted.array, self._adding[1]
+        BY_TURNS.bind(columns.turns, columns.entry_fields, rank=low.rank, d=d, out=adding.partials).launch(launch)
+        adding.add_up(0, columns=found.size, launch=launch)
+        inputs = [low.weights, found, low.rank, columns.width, self._power, self.calm]
+        launch(calm_kernel, 1, inputs, device=low.device)
+
+    def renew(self, *, begins: bool, noted: bool = False) -> bool:
         """Take the free set as it is now: choose the columns to correct for, and make potentials, a cycle each.
 
         Args:
             begins: whether a solve begins.
+            noted: whether `note` has been launched for this free set, and its readings have changed since.
 
         Returns:
             Whether the finest right-hand side was lost.
         """
         low, W = self._low, self._low.host_weights
-        self._squaring.run(variant=self._columns.rows.ptr)
-        self._squares.changed()
-        found, width, across = self._squares.numpy().copy(), self._columns.width, low.layout.across
+        if not noted:
+            self.prepare()
+            self._squaring.run(variant=self._columns.rows.ptr)
+            self.noted.changed()
+        found, width, across = self.noted.numpy().copy(), self._columns.width, low.layout.across
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
-        power = 1.0 / max(sum(n > 1 for n in self._hierarchy.finest.stencil.padding.counts) - 1, 1)
-        strong = np.flatnonzero(W.diagonal() * SPREAD * rows**power * squares >= STRONG).tolist()
+        strong = np.flatnonzero(W.diagonal() * SPREAD * rows ** float(self._power.value) * squares >= STRONG).tolist()
         if begins:
             self._seen[:] = 0.0
         if strong != self._slot_columns:
@@ -261,9 +302,8 @@ class LowRankCorrection:
         return bool(skew <= SKEW and ratios.min(initial=0.0) > -SKEW)
 
     def _launch_squares(self) -> None:
-        """Launch the sums U_q' U_q over the free set, and the rows that each body touches there."""
-        one, d = Rows.flat(1, self._low.device), self._hierarchy.finest.stencil.d
-        SQUARES.bind(one, self._columns.entry_fields, rank=self._low.rank, d=d, squares=self._squares.array).launch()
+        """Launch `note`."""
+        self.note(launch_recorded)
 
     def _launch_unit_force(self) -> None:
         """Make U f the finest right-hand side."""
