@@ -18,6 +18,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import LaunchGraph, call, clear, launch
 
+LEAST = 4096  # entries that a GPU has room for at least, which counts them while it solves
 SPARE = 1.5  # room for entries, times those there are when there is none left
 
 
@@ -49,6 +50,8 @@ class BodyCoupling:
         self.width = 3 if grid.dimension == 2 else 6
         low, high = np.array(self._solved.low) - 1, np.array(self._solved.high) + 1
         self.columns = BlockColumns(int(np.prod(high - low)), len(bodies.bodies), self.width, wp.float64, grid.device)
+        if grid.device.is_cuda:
+            self.columns.reserve(LEAST)
         body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
         body[bodies.numbers] = np.arange(len(bodies.bodies))
         S = kernels.Solids()
@@ -112,7 +115,7 @@ class BodyCoupling:
         columns = self.columns
         self._counting.run(kind, variant=columns.capacity)
         columns.counting()
-        if self.grid.device.is_cuda and columns.capacity > 1:
+        if self.grid.device.is_cuda:
             self._entering.run(kind, variant=columns.rows.ptr)
         else:
             self._enter_all(kind)

@@ -234,7 +234,7 @@ class RunAhead:
         """
         work, r = self._work, self._work.residual
         loop = self._loop(rebuilds=True) if self._may_rebuild() else None
-        if loop is None and self._rebuilds:
+        if loop is None and self._rebuilds and not work.A.device.is_cuda:
             return None
         p, hierarchy = work.problem, work.hierarchy
         renewed = r.has_new_operator()
