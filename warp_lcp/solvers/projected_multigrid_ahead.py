@@ -110,6 +110,8 @@ def begin_kernel(
     judged[NOISE] = noise
     ratio = norm / scalars[SIZE]
     go = norm > judged[TOLERANCE] * SAFELY and ratio > LEAST_RATIO and ratio < MOST_RATIO and most > 2
+    if counted:
+        go = go and counted[0] > wp.float64(0.0)
     if calm:
         go = go and calm[0] != 0
     going[0] = wp.where(go, 1, 0)
@@ -227,6 +229,8 @@ class RunAhead:
     def begin(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria, left: int) -> float | None:
         """Begin a solve from a guess, and take steps; return the residual at clip(0, l, u), None where the loop has to begin again.
 
+        Without unknowns that count, nothing is done, and the residual is 0.
+
         Args:
             guess: stored field that is not the iterate.
             criteria: when steps are done.
@@ -254,6 +258,10 @@ class RunAhead:
             if loop is not None:
                 loop.run_while(self._going)
         self._take_rows()
+        if isinstance(criteria, MeanCriteria) and criteria.count() == 0:  # no unknown counts: there is nothing to solve
+            self.rows.clear()
+            r.stale, r.norm = True, 0.0  # of the free set nobody knows
+            return 0.0
         reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
         usual = p.bounds.stays and self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf

@@ -220,6 +220,11 @@ class MultigridWorkspace(IterateMemory):
         self._begun = reference is not None
         return reference
 
+    @property
+    def begins_ahead(self) -> bool:
+        """Whether a GPU can begin a solve without the host."""
+        return self._ahead is not None and self.A.device.is_cuda
+
     def is_calm(self) -> bool:
         """Return whether a GPU may take steps that follow the free set as long as `calm` says so."""
         return False
