@@ -366,7 +366,7 @@ class Outlets:
         self.grid, self.drains, self.open_sides = grid, tuple(drains), open_sides
         self._store, self._slot = zeros(0, wp.float32, grid.device), Slot()
         self._distance = self._store  # of as many as there are particles
-        self._leaving = LaunchGraph(grid.device, self._launch, at_once=grid.device.is_cuda)  # a scan of Warp's
+        self._leaving = LaunchGraph(grid.device, self._launch)
 
     def apply(self, particles: Particles, before: float, now: float) -> tuple[int, int]:
         """Remove particles; the others keep their order.
@@ -397,6 +397,7 @@ class Outlets:
             self._slot.point_to(self._distance)
         marks = particles.marks
         self._leaving.run(particles, drains, marks, self._distance)
+        particles.launch_totals()
         departed, drained = particles.finish_removal(marks)
         return drained, departed
 
