@@ -143,12 +143,12 @@ def resume_kernel(
 @no_type_check
 def judge_kernel(
     scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), rebuilds: bool,
-    calm: wp.array(dtype=wp.int32),
+    bounded: bool, calm: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Keep what a truncated step has led to; go on if the host would take another one without a thought.
 
-    That is where the residual and the energy are the least yet, the tolerance is missed, and the free set does not creep; nor changes,
-    unless the device rebuilds what depends on it: `calm`, whether that is all.
+    That is where the residual and, with bounds, the energy are the least yet, the tolerance is missed, and the free set does not creep;
+    nor changes, unless the device rebuilds what depends on it: `calm`, whether that is all.
     """
     zero = wp.float64(0.0)
     n = int(judged[TAKEN])
@@ -158,7 +158,9 @@ def judge_kernel(
     fell = judged[LAST_ENERGY] - energy
     margin = judged[NOISE] * (wp.abs(judged[LAST_ENERGY]) + wp.abs(energy))
     go = n + 1 < int(judged[MOST]) and wp.isfinite(scalars[STEP])
-    go = go and norm > judged[TOLERANCE] * SAFELY and norm < judged[BEST] and judged[LOWEST] - energy > margin * SAFELY
+    go = go and norm > judged[TOLERANCE] * SAFELY and norm < judged[BEST]
+    if bounded:  # without bounds there is no energy
+        go = go and judged[LOWEST] - energy > margin * SAFELY
     if scalars[MOVED] > zero:
         go = go and rebuilds and fell * SAFELY < CREEPS * judged[FELL] and norm * SAFELY < STALLS * judged[LAST_NORM]
         if calm:
@@ -291,6 +293,7 @@ class RunAhead:
         if device.is_cuda:
             loop.run_while(self._going)
             self._work.note_free_set(launch)
+            self._work.note_correction()
 
     def _take_rows(self) -> None:
         """Take over the rows that a loop has left; waits for the device."""
@@ -318,7 +321,7 @@ class RunAhead:
             if calm is not None:
                 work.note_free_set(loop.launch)
             memory = [work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-            loop.launch(judge_kernel, 1, [*memory, rebuilds, calm], device=work.A.device)
+            loop.launch(judge_kernel, 1, [*memory, rebuilds, work.bounded, calm], device=work.A.device)
         return self._loops[key]
 
 
@@ -338,7 +341,7 @@ class Beginning:
         judge: Callable[[wp.array[Any] | None, Launch], None],
     ) -> None:  # fmt: skip
         self._work, self._guess, self._counted, self._found, device = work, guess, counted, found, work.A.device
-        self._key, self._finder = work.problem_key(), work.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
+        self._key, self._finder = work.program_key(), work.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
         self._judge, self._graph = judge, LaunchGraph(device, self._launch)  # on CUDA
         self._program = None if device.is_cuda else Program(device)
         if self._program is not None:
@@ -349,7 +352,7 @@ class Beginning:
 
     def fits(self, guess: wp.array[Any], counted: wp.array[Any] | None) -> bool:
         """Return whether the launches are of this guess and count, and of the bounds as they are."""
-        return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.problem_key()
+        return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.program_key()
 
     def run(self) -> None:
         """Launch everything, on the CPU."""
@@ -380,6 +383,8 @@ class Beginning:
         self._judge(self._counted, launch)
         if loop is not None:
             loop.run_while(going)
+        else:
+            self._work.prepare_correction()
 
     def is_plain(self) -> bool:
         """Return whether no component floats and the guess is finite; waits for the device."""

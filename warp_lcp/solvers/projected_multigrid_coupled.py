@@ -85,7 +85,8 @@ class CoupledWorkspace(MultigridWorkspace):
         self._monotone = LaunchGraph(problem.device, self._launch_monotone, at_once=problem.layout.across is not None)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
-        self.readings = (low.products, self.correction.noted)
+        self.readings = (low.products, *self.correction.readings)
+        self._prepared = False  # whether potentials have been made as the solve began
         if problem.device.is_cuda and self._ahead is not None:
             self.calm = self.correction.calm
         low.products_of = self.x if problem.layout.across is None else None
@@ -103,7 +104,9 @@ class CoupledWorkspace(MultigridWorkspace):
     def begin_ahead(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria) -> float | None:
         """Begin a solve, and take steps, without the host, see `MultigridWorkspace`."""
         self.correction.prepare()
-        return super().begin_ahead(guess, criteria)
+        reference = super().begin_ahead(guess, criteria)
+        self._prepared = reference is not None and self.calm is not None and self.correction.slots > 0
+        return reference
 
     def is_calm(self) -> bool:
         """Return whether there is no correction, which a GPU may go on without."""
@@ -112,6 +115,17 @@ class CoupledWorkspace(MultigridWorkspace):
     def note_free_set(self, launch: Launch) -> None:
         """Launch what `LowRankCorrection.renew` reads."""
         self.correction.note(launch)
+
+    def note_correction(self) -> None:
+        """Launch the products that the correction is made of, for the free set as it is."""
+        if self.correction.slots:
+            self.correction.note_products()
+
+    def prepare_correction(self) -> None:
+        """Launch the potentials of the last solve's columns for the free set as it is, and their products."""
+        if self.calm is not None and self.correction.slots:
+            self.hierarchy.rebuild_changed()
+            self.correction.make_potentials()
 
     def crawls(self) -> bool:
         """Take note of the pace; bodies have no part in the grid's matrix, so it is Newton's steps that take over."""
@@ -180,7 +194,7 @@ class CoupledWorkspace(MultigridWorkspace):
             return
         begins, self._fresh = self._fresh, False
         noted, self.free_set_noted = self.free_set_noted, False
-        if self.correction.renew(begins=begins, noted=noted):  # its right-hand side was overwritten
+        if self.correction.renew(begins=begins, noted=noted, made=noted and self._prepared):  # its right-hand side was overwritten
             self._evaluation.run(self.x, variant=(self.residual.classify, *self.problem_key()))
             if self.floating is not None:
                 self._project()

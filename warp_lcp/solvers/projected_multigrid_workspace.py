@@ -232,6 +232,12 @@ class MultigridWorkspace(IterateMemory):
     def note_free_set(self, launch: Launch) -> None:
         """Launch on a GPU what the host has to know of the free set before the next step."""
 
+    def note_correction(self) -> None:
+        """Launch on a GPU what the host has to know of a correction of the cycle."""
+
+    def prepare_correction(self) -> None:
+        """Launch on a GPU what the first step of a solve needs if the host finds what it did in the last one."""
+
     @property
     def exact(self) -> bool:
         """Whether x is no more than a step from where it was before one."""
