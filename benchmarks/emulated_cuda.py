@@ -229,19 +229,24 @@ if COMPARE:
 
 def replayed():
     """Keep what a graph would record, to launch it; once the package can be imported. Loops of graphs read their conditions in place."""
-    from warp_lcp.rigid import contact_problem
-    from warp_lcp.rows import device_graph, joined
+    from warp_lcp.rows import device_graph, host_kernel, joined
     from warp_lcp.rows.program import LaunchGraph, Loop, Program
 
     class HostGraph(LaunchGraph):
-        """Launches of contacts, which are in the host's memory on every machine: nothing of them waits."""
+        """Kernels on the host's memory, which run at once on every machine: what waits for the device waits on."""
 
         def run(self, *arguments, **options):
             """Launch everything, so that the host can read it."""
-            super().run(*arguments, **options)
-            joined.settle()
+            waiting, state, counts = joined.WAITING, vars(joined.WAITING).copy(), meter.copy()
+            waiting.depth, waiting.programs = 0, []
+            try:
+                super().run(*arguments, **options)
+            finally:
+                vars(waiting).update(state)
+                meter.clear()
+                meter.update(counts)
 
-    contact_problem.LaunchGraph = HostGraph
+    host_kernel.LaunchGraph = HostGraph
     device_graph.noted = lambda device, event: None
     wp.is_conditional_graph_supported = lambda: True
     Program._captured = lambda self, commands: list(commands)

@@ -18,6 +18,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import LaunchGraph, call, clear, launch
 
+LEAST = 4096  # entries that a GPU has room for at least, which counts them while it solves
 SPARE = 1.5  # room for entries, times those there are when there is none left
 
 
@@ -49,6 +50,8 @@ class BodyCoupling:
         self.width = 3 if grid.dimension == 2 else 6
         low, high = np.array(self._solved.low) - 1, np.array(self._solved.high) + 1
         self.columns = BlockColumns(int(np.prod(high - low)), len(bodies.bodies), self.width, wp.float64, grid.device)
+        if grid.device.is_cuda:
+            self.columns.reserve(LEAST)
         body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
         body[bodies.numbers] = np.arange(len(bodies.bodies))
         S = kernels.Solids()
@@ -62,6 +65,7 @@ class BodyCoupling:
         self._counts, self._offsets = (wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2))
         self._low: wl.LowRankOperator | None = None
         self._flat: wp.array | None = None  # of the last solution
+        self._pending: wp.array | None = None  # cells of a `take` whose entries have not been counted by the host
         self._beside, self._enclosing = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
         self._counting = LaunchGraph(grid.device, self._launch_count)
         self._entering = LaunchGraph(grid.device, self._launch_entries)
@@ -92,20 +96,38 @@ class BodyCoupling:
         else:
             self._beside.move_to(window)
             self._enter(kind)
+        self._pending = kind if window is not None and self.grid.device.is_cuda else None
         if self._low is not None:
             self._low.update(self._weights(), symmetric=True)
 
+    def makes_room(self) -> bool:
+        """Enter again what a GPU had no room for in the last `take`; return whether a solve that has read it is to be repeated."""
+        kind, self._pending = self._pending, None
+        if kind is None or self.columns.wanted() <= self.columns.capacity:
+            return False
+        self._enter_all(kind)
+        if self._low is not None:
+            self._low.update()
+        return True
+
     def _enter(self, kind: wp.array) -> None:
-        """Write the entries of U for the cells of the window."""
+        """Write the entries of U for the cells of the window; a GPU does not wait for their number, see `makes_room`."""
         columns = self.columns
-        self._counting.run(kind)
-        total = columns.counted()
+        self._counting.run(kind, variant=columns.capacity)
+        columns.counting()
+        if self.grid.device.is_cuda:
+            self._entering.run(kind, variant=columns.rows.ptr)
+        else:
+            self._enter_all(kind)
+
+    def _enter_all(self, kind: wp.array) -> None:
+        """Write the entries of U, as many as have been counted."""
+        columns, total = self.columns, self.columns.wanted()
         if total > columns.capacity:
             columns.reserve(round(SPARE * total))
             columns.count.fill_(total)
-            self._entering.forget()
         if total:
-            self._entering.run(kind)
+            self._entering.run(kind, variant=columns.rows.ptr)
 
     def _launch_count(self, kind: wp.array) -> None:
         """Count the entries of each row of cells, and add them up."""
@@ -115,7 +137,7 @@ class BodyCoupling:
         if device.is_cuda:
             call(partial(wp.utils.array_scan, self._counts, self._offsets, inclusive=False))
             first = len(self._counts) - 1
-        launch(kernels.offsets_kernel, 1, [first, self._counts, self._offsets, self.columns.count], device=device)
+        launch(kernels.offsets_kernel, 1, [first, self._counts, self._offsets, self.columns.capacity, self.columns.count], device=device)
 
     def _launch_entries(self, kind: wp.array) -> None:
         entries = [self.columns.rows, self.columns.blocks, self.columns.values]
@@ -123,10 +145,13 @@ class BodyCoupling:
 
     def push(self, x: wp.array) -> None:
         """Apply to the bodies the impulses of x = kick_dt p / (rho dx) [m/s]."""
-        if self._flat is None or self._flat.ptr != x.ptr:
-            self._flat = x.flatten()
-        self._gathering.run(self._flat, variant=self.columns.rows.ptr)
-        self.bodies.bodies.apply_impulses(self._scale * self.columns.summed().reshape(-1, self.width))
+        products = self._low.products_at(x) if self._low is not None else None
+        if products is None:
+            if self._flat is None or self._flat.ptr != x.ptr:
+                self._flat = x.flatten()
+            self._gathering.run(self._flat, variant=self.columns.rows.ptr)
+            products = self.columns.summed()
+        self.bodies.bodies.apply_impulses(self._scale * products.reshape(-1, self.width))
 
     def _launch_gather(self, x: wp.array) -> None:
         self.columns.gather(x, launch=launch)

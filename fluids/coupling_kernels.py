@@ -85,7 +85,7 @@ def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _
                     if least == S.bodies:
                         break
                     last = least
-                    if values:
+                    if values and e < index.shape[0]:
                         move = wp.vec3d()
                         turn = wp.vec3d()
                         for n in range(2 * (S.walls.planes + 1)):
@@ -120,13 +120,14 @@ def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _
 
 
 @forward_kernel(module="fluids.coupling")
-def offsets_kernel(first: int, counts: _I32, offsets: _I32, total: _I32):
-    """Add up counts exclusively from row `first` on, whose offset is known, and their total; one thread."""
+def offsets_kernel(first: int, counts: _I32, offsets: _I32, capacity: int, total: _I32):
+    """Add up counts exclusively from row `first` on, whose offset is known; `total`: what there is room for, and all; one thread."""
     before = offsets[first]
     for row in range(first, counts.shape[0]):
         offsets[row] = before
         before += counts[row]
-    total[0] = before
+    total[0] = wp.min(before, capacity)
+    total[1] = before
 
 
 @cell_kernel("fluids.coupling")

@@ -305,6 +305,8 @@ class PressureProjection:
         mean = self._criteria(speed)
         assert self._problem is not None, "prepare comes first"
         result = wl.solve(self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work)
+        if self.coupling is not None and self.coupling.makes_room():
+            result = wl.solve(self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work)
         criteria = mean.known()
         if self.automatic is not None and result:
             self.automatic.measure(self._problem.A, result, criteria, [self._guess, self._rhs], self.counted())

@@ -169,6 +169,8 @@ class LiquidSimulation(ParticleSimulation):
         self.particles_to_grid(window)
         speed = self.top_speed(before)
         self._find_surface(window)
+        if self.grid.device.is_cuda and self.known_density() is not None:
+            self.monitor_density(window)  # so that it is read with the solve
         viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
         projected = self._project(window, dt, speed)
         if self.scene.output.diagnostics:

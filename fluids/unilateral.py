@@ -20,6 +20,7 @@ from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import clear
+from warp_lcp.rows.readings import Reading
 
 
 class UnilateralPressure(PressureProjection):
@@ -79,6 +80,7 @@ class UnilateralPressure(PressureProjection):
         super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, coupling=coupling, gravity=gravity)
         self._weights = list(weights)
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
+        self._totals = Reading(grid.device, 2) if grid.device.is_cuda else None  # of `_sums`
         self._unknown, self._least = grid.field(wp.int8), 0.0
         wp.copy(self._unknown, boundary.base)  # the ring stays as it is
         if boundary.open and self._shift is None:  # pockets between solids that are too full
@@ -100,12 +102,12 @@ class UnilateralPressure(PressureProjection):
         self._everyone = None
         self._preparation.run(velocity)
         self._count.changed()
-        unknowns = self.counted()
-        if unknowns and self._problem is None:
+        if self._problem is None and self.counted() > 0:
             self._make_problem()
-        if unknowns:
-            self._update()
-        return unknowns > 0
+        if self._problem is None:
+            return False
+        self._update()
+        return True
 
     def _launch_preparation(self, velocity: Sequence[wp.array]) -> None:
         """Launch the set-up of the problem, and count its unknowns."""
@@ -121,6 +123,8 @@ class UnilateralPressure(PressureProjection):
         """
         self._last = self._kick
         self._projection.run(velocity, window, result.x, variant=(result.x.ptr, window.near is None))
+        if self._totals is not None:
+            self._totals.changed()
         return Projection(result, self.counted(), self._found)
 
     def _launch_projection(self, velocity: Sequence[wp.array], window: Window, x: wp.array) -> None:
@@ -132,10 +136,16 @@ class UnilateralPressure(PressureProjection):
             inputs = [self._setting, axis, self.pressure, open_, self._weights[axis], field, self.known[axis]]
             window.launch(kernels.push_kernel, inputs)
         inputs = [self._at(velocity), self._rate, self._settling, self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
+        inputs.append(None if self._totals is None else self._totals.array)
+        if self._totals is not None:
+            clear(self._totals.array)
         self._cells.launch_rows(kernels.contact_kernel, inputs)
         self.grid.part.fill(*velocity, *self.known, self.contact)
 
     def _found_here(self) -> tuple[float, float]:
+        if self._totals is not None:
+            released, worst = self._totals.numpy()
+            return float(released), float(worst)
         rows = self._cells.rows_of(self._sums)
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 

@@ -164,9 +164,13 @@ def push_kernel(k, j, i, s: UnilateralSetting, axis: int, x: F64, open: F32, wei
 
 @cell_kernel("fluids.unilateral")
 def contact_kernel(
-    k, j, first, end, s: UnilateralSetting, rate: wp.float64, settling: float, kind: I8, touch: U8, x: F64, contact: U8, sums: F64
-):
-    """Find the wall cells that hold liquid and those that let go, [0] their number in a row, and [1] the largest |y| of full cells."""
+    k, j, first, end, s: UnilateralSetting, rate: wp.float64, settling: float, kind: I8, touch: U8, x: F64, contact: U8, sums: F64,
+    found: wp.array(dtype=wp.float64),
+):  # fmt: skip
+    """Find the wall cells that hold liquid and those that let go, [0] their number in a row, and [1] the largest |y| of full cells.
+
+    `found`, if there is one, has the sum of the first and the largest of the second of all rows.
+    """
     released = int(0)
     worst = wp.float64(0.0)
     for i in range(first, end):
@@ -185,3 +189,6 @@ def contact_kernel(
             worst = wp.max(worst, wp.abs(y))
     sums[k, j, 0] = wp.float64(released)
     sums[k, j, 1] = worst
+    if found:
+        wp.atomic_add(found, 0, wp.float64(released))
+        wp.atomic_max(found, 1, worst)

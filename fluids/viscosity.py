@@ -195,10 +195,10 @@ class Viscosity:
                 if tau * self._thickest > STIFF and not iterations
                 else {"tolerance": 0.7 * least}
             )
-            done, _ = self._solver.solve(max_iterations=self.max_iterations - iterations, **goal)
-            iterations += done
+            self._solver.start(max_iterations=self.max_iterations - iterations, **goal)
             self._graphs["_take_solution"].run(velocity, self._solver.x, variant=self._solver.x.ptr)
             norm, lost, driven, _ = self._force(given, changed=True)
+            iterations += self._solver.found()[0]  # read with the force
             if not norm < 0.5 * before:  # what float32 can tell
                 break
         if last:
@@ -397,6 +397,7 @@ class Viscosity:
         found = np.zeros(4)
         for sums in self._sums:
             sums.changed()
+        for sums in self._sums:
             found += sums.read()
         if self._bodies is not None:
             self._bodies.answer(self.multigrid.r, self._change)

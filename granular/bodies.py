@@ -27,7 +27,9 @@ from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.yield_set import F64, I32, U8
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import Rows
-from warp_lcp.rows.program import Launch, launch, perform
+from warp_lcp.rows.host_array import HostArray
+from warp_lcp.rows.program import Launch, LaunchGraph, copy, launch, perform
+from warp_lcp.rows.readings import Reading
 
 if typing.TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity, Walls
@@ -70,11 +72,15 @@ class SandBodies:
         self._own: Window | None = part.faces(grid.everywhere) if part.shared else None
         self.grid, self.numbers, self.freedoms = grid, tuple(numbers), NUMBERS[grid.dimension]
         count, k, device = len(self.numbers), self.freedoms, grid.device
-        self.velocity, self._force, self._start, self._error = (wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4))
-        self._response, self._correction = (wp.zeros((count, k, k), dtype=wp.float64, device=device) for _ in range(2))
+        self._left = [Reading(device, count * k) for _ in range(2)]  # velocity and force, as the stresses leave them
+        self.velocity, self._force = (reading.array.reshape((count, k)) for reading in self._left)
+        self._error = wp.zeros((count, k), dtype=wp.float64, device=device)
+        self._start = HostArray((count, k), wp.float64, device)
+        self._response, self._correction = (HostArray((count, k, k), wp.float64, device) for _ in range(2))
         _, rows, columns = grid.shape
         self._shape = FieldShape()
         self._shape.dimension, self._shape.layer, self._shape.strides = grid.dimension, grid.size, wp.vec3i(1, columns, columns * rows)
+        self._beginning = LaunchGraph(device, lambda: copy(self.velocity, self._start.array))
         self._total = wp.zeros_like(self._force)  # of all ranks
         self._each = wp.array(np.arange(count)[:, None] + [0, 1], dtype=wp.int32, device=device)  # its entries, as `_owned` has runs
         self._met = False  # whether sand is beside a body on some rank; else no force is asked for in the step
@@ -98,8 +104,9 @@ class SandBodies:
                 places.row.assign(rows)  # type: ignore[attr-defined]  # an array of the struct
             return
         self.faces = found
-        self._walls = walls
-        self._entries, cells = entries_near(grid, found, walls.cells.numpy(), walls.sides.numpy())
+        self._walls, wall_cells = walls, walls.host_cells
+        self._entries, cells = entries_near(grid, found, wall_cells, walls.host_sides)
+        self._entry_cells = wall_cells[self._entries].copy()
 
         def put(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
@@ -145,10 +152,11 @@ class SandBodies:
         heavier = np.linalg.inv(np.eye(self.freedoms) + alone @ self._layer_mass)
         self._host_response = heavier @ alone
         start = np.einsum("bqr,br->bq", heavier, velocity + np.einsum("bqr,br->bq", alone, self._layer_momentum))
-        self._start.assign(start)
-        self.velocity.assign(start)
-        self._response.assign(self._host_response)
-        held = self._entries[packing.flags.numpy().ravel()[self._walls.cells.numpy()[self._entries]] != 0]
+        self._start.host[:], self._response.host[:] = start, self._host_response
+        self._start.send()
+        self._response.send()
+        self._beginning.run()
+        held = self._entries[packing.flags.numpy().ravel()[self._entry_cells] != 0]
         active = np.zeros(1 + len(self._entries), dtype=np.int32)
         active[0], active[1 : 1 + len(held)] = len(held), held
         self._active.assign(active)
@@ -175,13 +183,16 @@ class SandBodies:
         found, device, dimension = self.faces, self.grid.device, self.grid.dimension
         assert found is not None
         inverse, cell, edge = flat_vector(packing.inverse), found.cell, found.edge
-        cells = wp.zeros(len(cell.at), dtype=wp.vec2d, device=device)
+        room = 2 * len(cell.at)  # both in one memory, which is read by one copy
+        memory = wp.zeros(room + len(edge.at), dtype=wp.float64, device=device)
+        cells = wp.array(ptr=memory.ptr, dtype=wp.vec2d, shape=len(cell.at), device=device)
         inputs = [self._shape, self._cells, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
         wp.launch(stiffness_kernel, len(cell.at), [*inputs, flat_vector(packing.mass), inverse, numbers, cells], device=device)
-        edges = wp.zeros(len(edge.at), dtype=wp.float64, device=device)
+        edges = memory[room:]
         inputs = [self._shape, self._edges, flat_vector(packing.share), inverse, edges]
         wp.launch(lightness_kernel, len(edge.at), inputs, device=device)
-        pressure, shear = (cells.numpy() * cell.share[:, None]).T
+        found_cells, found_edges = np.split(memory.numpy(), [room])
+        pressure, shear = (found_cells.reshape(-1, 2) * cell.share[:, None]).T
         along = cell.row.sum(axis=1)
         if dimension == 2:
             deviator, factor = (cell.row[:, 0] - cell.row[:, 1])[:, None], 1.0
@@ -191,10 +202,11 @@ class SandBodies:
         steepest = _products(pressure_step * pressure, along[:, None], cell.body, count)
         steepest += _products(factor * shear_step * shear, deviator, cell.body, count)
         own = within(self.grid, edge.at, self._own)
-        steepest += _products(shear_step * edges.numpy() * edge.share * own, edge.row, edge.body, count)
+        steepest += _products(shear_step * found_edges * edge.share * own, edge.row, edge.body, count)
         steepest = self._sum(steepest)
         identity = np.eye(self.freedoms)
-        self._correction.assign(np.linalg.inv(identity + self._host_response @ steepest))
+        self._correction.host[:] = np.linalg.inv(identity + self._host_response @ steepest)
+        self._correction.send()
 
     def impulses(self) -> np.ndarray:
         """Return the impulse of the sand on each body since V*, shape (bodies, k).
@@ -203,8 +215,14 @@ class SandBodies:
 
         That is of the stresses of the last `Stress.residual`, and of the layer of sand that moves with the body.
         """
-        layer = self._layer_momentum - np.einsum("bqr,br->bq", self._layer_mass, self.velocity.numpy())
-        return np.asarray((self._force.numpy() + layer) * self._scale)
+        velocity, force = (reading.numpy().reshape(self.velocity.shape) for reading in self._left)
+        layer = self._layer_momentum - np.einsum("bqr,br->bq", self._layer_mass, velocity)
+        return np.asarray((force + layer) * self._scale)
+
+    def changed(self) -> None:
+        """Say that a solve has been launched, whose `impulses` are read with what else it leaves."""
+        for reading in self._left:
+            reading.changed()
 
     def move(self, velocity: Velocity, launch: Launch) -> None:
         """Set the velocity of the bodies' faces."""
@@ -218,7 +236,7 @@ class SandBodies:
         inputs = [self._shape, self._spans, stress.flatten(), self._cells, self._edges, flat_vector(packing.share), self._partial]
         if self._spans.shape[0]:
             launch(force_kernel, self._spans.shape[0], inputs, device=device)
-        inputs = [int(implicit), *self._forces(launch), self._start, self._response, self._correction]
+        inputs = [int(implicit), *self._forces(launch), self._start.array, self._response.array, self._correction.array]
         launch(respond_kernel, len(self.numbers), [*inputs, self._force, self._error, self.velocity], device=device)
 
     def search(self, packing: Packing, velocity: Velocity, stress: StressFields, launch: Launch) -> None:

@@ -286,7 +286,7 @@ class SandSimulation(ParticleSimulation):
                 self.stress.set_walls(self.solids.walls)
             if self.carried is not None and self.bodies is not None:
                 centers = np.array([body.position for body in self.bodies.bodies])
-                self.carried.place(self.solids.index.numpy(), centers, self.solids.walls)
+                self.carried.place(self.solids.host_index, centers, self.solids.walls)
 
     def _gains(self, scale: float) -> bool:
         """Return whether the stresses leave sand faster than it, solids, sources and bodies were and gravity makes it (`scale`, m/s).

@@ -58,7 +58,7 @@ class Walls:
         if rubbing_only:
             rubs = np.asarray(friction)[walls] > 0.0
             cells, sides, walls = cells[rubs], sides[rubs], walls[rubs]
-        self.count = len(cells)
+        self.count, self.host_cells, self.host_sides = len(cells), cells, sides
         self.cells = wp.array(cells, dtype=wp.int32, device=device)
         self.sides = wp.array(sides, dtype=wp.uint8, device=device)
         self.walls = wp.array(walls, dtype=wp.int32, device=device)
@@ -159,6 +159,12 @@ class SandSolids:
         self.notes = (*self._thin_notes(), *((self._whole_note(cuts),) if whole else ()))
 
     @property
+    def host_index(self) -> np.ndarray:
+        """`index` on the host, not to be written to, if solids move."""
+        assert self._cells is not None
+        return self._cells
+
+    @property
     def moves(self) -> bool:
         """Return whether a solid moves."""
         return self._boundary.moves
@@ -172,8 +178,10 @@ class SandSolids:
             )
             for solid in self._placed
         ]  # fmt: skip
-        found = voxelize(grid, now, wall_separating=True, open_sides=self._boundary.open_sides, remarks=False)
-        self._covered = found.covered
+        starts = self._cells is None
+        found = voxelize(grid, now, wall_separating=True, open_sides=self._boundary.open_sides, remarks=False, counts=starts)
+        if starts:
+            self._covered = found.covered
         wp.copy(self.index, found.index)
         if self._boundary.sides is not None:
             self._boundary.sides.wrap(self.index)

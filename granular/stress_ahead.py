@@ -77,6 +77,8 @@ class StressAhead:
         if not self._stress.packing.grid.device.is_cuda:
             self._loop.run_while(self._going)
         self._decisions.changed()
+        if self._stress.bodies is not None:
+            self._stress.bodies.changed()
 
     def _make_loop(self) -> None:
         """Make the loop of the walls as they are: a period of steps, and what decides whether another one follows."""

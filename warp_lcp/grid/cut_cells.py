@@ -17,8 +17,9 @@ from warp_lcp.grid import cut_cells_kernels as kernels
 from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motions, Pose
 from warp_lcp.grid.node_distance import NodeBox, NodeDistances, NodeSampler, ShapeTable, box_near, node_window
+from warp_lcp.grid.placed_mesh import FlatCells, PlacedMesh, tables_of
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.solids import Geometry, TriangleMesh
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
 from warp_lcp.operators.grid_poisson import SOLID
@@ -106,9 +107,10 @@ class CutCells:
             self._runs = list(_runs(grid, [(number, solid.geometry) for number, solid in moving]))
             self._standing = NodeDistances(grid, second=len(solids) > 1)
             self._standing.copy_from(self._nodes)
+            self._flat = self._flat_cells(standing)
             self._near, self._swept = ActiveWindow(grid.domain), ActiveWindow(grid.domain)
             # a mesh is measured in parts, and the host decides about each
-            measured = any(not isinstance(run, ShapeTable) for run in self._runs)
+            measured = any(isinstance(run, int) for run in self._runs)
             self._entering = LaunchGraph(grid.device, self._launch_entering, at_once=measured)
             self._refreshing = LaunchGraph(grid.device, self._launch_refreshing)
             self._before = self._after = lambda: None
@@ -213,13 +215,13 @@ class CutCells:
         rotations, translations = self.motions.poses([time])
         self._poses = rotations[0], translations[0]
         for run in self._runs:
-            if isinstance(run, ShapeTable):
+            if not isinstance(run, int):
                 run.place(rotations[0, run.places], translations[0, run.places])
-        boxes = [run.box if isinstance(run, ShapeTable) else box_near(self.grid, self._placed(run)) for run in self._runs]
+        boxes = [box_near(self.grid, self._placed(run)) if isinstance(run, int) else run.box for run in self._runs]
         self._moved_to = _around([box for box in boxes if box is not None])
         self._near.move_to(node_window(self.grid, *self._sampler.inner(*(self._moved_to or NOWHERE))))
         self._entering.run()
-        if self._moved_to is not None:
+        if self._moved_to is not None and self._flat is None:
             self._sampler.look_at_centers(self._nodes, self._all_placed, *self._moved_to, self.base, listed=True)
 
     def _launch_refreshing(self) -> None:
@@ -232,7 +234,18 @@ class CutCells:
         self._nodes.copy_from(self._standing)
         copy(self.base, self._marks)
         self._enter()
-        self._sampler.list_flat_cells(self._nodes, self._near)
+        if self._flat is None:
+            self._sampler.list_flat_cells(self._nodes, self._near)
+        else:
+            self._flat.mark(self._nodes, self._near, self.base)
+
+    def _flat_cells(self, standing: Sequence[tuple[int, Geometry]]) -> FlatCells | None:
+        """Return what marks gaps of one cell without the host; None on the CPU, and where a solid is none of tables or meshes."""
+        moving = [run for run in self._runs if not isinstance(run, int)]
+        grid = self.grid
+        suits = grid.device.is_cuda and not grid.part.shared and len(moving) == len(self._runs)
+        still = tables_of(grid, standing) if suits else None
+        return None if still is None else FlatCells(self.grid, [*still, *moving])
 
     def _placed(self, place: int) -> Geometry:
         """Return a solid that moves where it is, by its place among those."""
@@ -247,10 +260,10 @@ class CutCells:
     def _enter(self) -> None:
         """Enter the distances of the solids that move where they are."""
         for run in self._runs:
-            if isinstance(run, ShapeTable):
-                run.enter(self._nodes, self._sampler.snap)
-            else:
+            if isinstance(run, int):
                 self._sampler.enter(self._nodes, self._moving[run], self._placed(run))
+            else:
+                run.enter(self._nodes, self._sampler.snap)
 
     def _join(self) -> None:
         """Bring distances, and the marks in `base`, to where they are told by other nodes."""
@@ -334,11 +347,14 @@ def _around(boxes: Sequence[NodeBox]) -> NodeBox | None:
     return (tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True)))) if boxes else None
 
 
-def _runs(grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]) -> Iterator[ShapeTable | int]:
-    """Cut solids, in order, into tables of those next to each other that tables hold, and the places of others."""
+def _runs(grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]) -> Iterator[ShapeTable | PlacedMesh | int]:
+    """Cut solids, in order, into tables of those next to each other that tables hold, on a GPU meshes, and the places of others."""
     for held, of in groupby(range(len(solids)), key=lambda place: ShapeTable.holds(solids[place][1])):
         if held:
             places = list(of)
             yield ShapeTable(grid, [solids[place] for place in places], places)
-        else:
-            yield from of
+            continue
+        for place in of:
+            number, geometry = solids[place]
+            mesh = grid.device.is_cuda and not grid.part.shared and isinstance(geometry, TriangleMesh)
+            yield PlacedMesh(grid, number, geometry, [place]) if mesh else place

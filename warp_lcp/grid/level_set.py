@@ -61,6 +61,7 @@ class LevelSet:
         self._scratch = [grid.field() for _ in range(3)] if smoothing else []
         self._volume: WindowTally | None = None  # made when it is first asked for
         self._box, self._measuring = ActiveWindow(grid.domain), LaunchGraph(grid.device, self._launch_volume)
+        self._left, self._leaving = ActiveWindow(grid.domain), LaunchGraph(grid.device, self._launch_leaving)
         self._measured = False
         self._filled: Window | None = None
 
@@ -83,7 +84,11 @@ class LevelSet:
         """Clear what the last update has left in another window."""
         before, self._filled = self._filled, window.now
         if before is not None and (before.low, before.high) != (window.low, window.high):
-            before.launch(kernels.clear_kernel, [self.limit, self.phi, self._known])
+            self._left.move_to(before)
+            self._leaving.run(variant=before.near is None)
+
+    def _launch_leaving(self) -> None:
+        self._left.launch(kernels.clear_kernel, [self.limit, self.phi, self._known])
 
     def compute(self, particles: Particles, window: Window, capacity: wp.array | None, base: wp.array, *, fill: Fill | None = None) -> None:
         """Launch what `update` does after `leave`."""

@@ -174,6 +174,11 @@ class ShapeTable:
         self.box = (tuple(low), tuple(high)) if near[0] else None
         self._window.move_to(node_window(self.grid, *(self.box or ((0, 0, 0), (0, 0, 0)))))
 
+    @property
+    def placed(self) -> wp.array:
+        """The shapes where they stand."""
+        return self._shapes.array
+
     def enter(self, nodes: NodeDistances, snap: float) -> None:
         """Enter the solids' distances; those within `snap` [cells] of a surface are 0."""
         self._window.launch(kernels.enter_solids, [self._block, self._solids.array, self._shapes.array, snap, nodes.struct])

@@ -16,7 +16,7 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import RowsMemory, Scalar, Slot, rows_memory
-from warp_lcp.rows.program import LaunchGraph, call
+from warp_lcp.rows.program import LaunchGraph, call, clear
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Tally
@@ -182,9 +182,10 @@ class Particles:
         self._tally, columns, device = None, len(kernels.TOTAL.found), grid.device
         launches = self._launch_totals, self._launch_numbers, self._launch_sort
         self._totals, self._numbering, self._sorting = (LaunchGraph(device, launch) for launch in launches)
-        self._removal = LaunchGraph(device, self._launch_removal, at_once=device.is_cuda)  # a scan of Warp's
+        self._removal = LaunchGraph(device, self._launch_removal)
         self._removed = Reading(device, 2, wp.int32)
         self._marks: tuple[tuple[typing.Any, int], wp.array | None] = (None, 0), None  # of the memory and the count that they are for
+        self._stays: wp.array | None = None  # beside them
         self._total_rows = rows_memory(device, LIST_ROOM)
         if device.is_cuda:
             self._tally = Tally(kernels.TOTAL, device, CUDA_THREADS)
@@ -194,6 +195,7 @@ class Particles:
             self._sort_rows, self._sort_pieces = RowsMemory(), Scalar()
             self._counts = wp.zeros(0, dtype=wp.int32, device=device)
         self._last: ParticleTotals | None = None
+        self._totals_launched = False  # of the particles as they are, on a GPU
         self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
         self._memory = ListMemory(grid.device)
@@ -277,7 +279,8 @@ class Particles:
         memory = self._order.ptr, self.count
         if self._marks[0] != memory:
             self._marks = memory, self._order[self._capacity : self._capacity + self.count]
-            self._memory.take(self.count, {"marks": self._marks[1]})
+            self._stays = self._order[: self.count]
+            self._memory.take(self.count, {"marks": self._marks[1], "stays": self._stays})
         return self._marks[1]
 
     def remove(self, marks: wp.array) -> int:
@@ -301,15 +304,15 @@ class Particles:
 
         It may be recorded; `finish_removal` then ends it.
         """
-        self._removal.run(marks)
+        mine = marks is self._marks[1] and self._stays is not None
+        self._removal.run(marks, self._stays if mine else self._order[: self.count])
 
-    def _launch_removal(self, marks: wp.array) -> None:
+    def _launch_removal(self, marks: wp.array, stay: wp.array) -> None:
+        """Launch the removal; on a GPU only the count of those that go and, in `stay`, 1 for those that stay."""
         device = self.grid.device
         if device.is_cuda:
-            stay = self._order[: self.count]
-            self._removed.array.zero_()
-            wp.launch(kernels.stays_kernel, self.count, [marks, stay, self._removed.array], device=device)
-            wp.utils.array_scan(stay, stay, inclusive=True)
+            clear(self._removed.array)
+            launch_list(kernels.stays_kernel, self.count, [marks, stay, self._removed.array], device=device)
             return
         columns = dict.fromkeys(("affine_0", "affine_1", "affine_2", "kept")) | self.arrays()
         counted: dict[str, typing.Any] = {"removed": self._removed.array, "marks": marks, "count": self._memory.count}
@@ -329,6 +332,7 @@ class Particles:
         if first + others:
             if self.grid.device.is_cuda:
                 stay = self._order[: self.count]
+                wp.utils.array_scan(stay, stay, inclusive=True)
                 for name, column in self._columns.items():
                     inputs = [marks, stay, column.view, self._spare.view]
                     wp.launch(kernels.close_ranks_kernel, self.count, inputs, device=self.grid.device)
@@ -356,7 +360,7 @@ class Particles:
 
     def _resize(self, count: int) -> None:
         """Use `count` places; those beyond the particles there were hold anything."""
-        before, self.count, self._known = self.count, count, None
+        before, self.count, self._known, self._totals_launched = self.count, count, None, False
         if count > self._capacity:
             self._grow(before)
         for column in (*self._columns.values(), self._spare):
@@ -480,8 +484,9 @@ class Particles:
         if self.count == 0:
             return ParticleTotals()
         if self._tally is not None:
-            self._totals.run()
-            self._tally.changed()
+            if not self._totals_launched:
+                self.launch_totals()
+            self._totals_launched = False
             total = self._tally.read()
         else:
             self._totals.run()
@@ -514,6 +519,13 @@ class Particles:
         kernels.ADD_IN_ORDER.bind(
             columns, partials=self._partials, results=self._found.array, places_of_sums=self._places, sums_=len(kernels.TOTAL.sums)
         ).launch()
+
+    def launch_totals(self) -> None:
+        """Launch on a GPU what the next `totals` returns, unless particles come or go before, so that others are read with it."""
+        if self._tally is not None and self._known is None and self.count:
+            self._totals.run()
+            self._tally.changed()
+            self._totals_launched = True
 
     def totals_stay(self, stay: bool) -> None:
         """Declare that positions and velocities are unchanged since `totals`.

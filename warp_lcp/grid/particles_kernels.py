@@ -53,12 +53,11 @@ def put_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec
     target[order[i]] = source[i]
 
 
-@forward_kernel(module="warp_lcp.grid.particles")
-def stays_kernel(marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32), removed: wp.array(dtype=wp.int32)):
+@list_kernel("warp_lcp.grid.particles_removal")
+def stays_kernel(i, marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32), removed: wp.array(dtype=wp.int32)):
     """Write 1 for a particle without a mark, 0 for others; count those with the mark 1, and those with another."""
-    p = wp.tid()
-    mark = marks[p]
-    stays[p] = wp.where(mark == 0, 1, 0)
+    mark = marks[i]
+    stays[i] = wp.where(mark == 0, 1, 0)
     if mark != 0:
         wp.atomic_add(removed, wp.where(mark == 1, 0, 1), 1)
 

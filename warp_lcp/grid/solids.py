@@ -158,12 +158,16 @@ class _Shape(ABC):
         self._measure(self.kernel, points, out)
 
     def _measure(self, kernel: Any, points: wp.array, out: wp.array) -> None:
-        placement, frame, device = self.placement, ShapeFrame(), points.device
+        inputs = [points, self.frame(), *self.parameters(points.device), out]
+        launch_list(kernel, points.shape[0], inputs, device=points.device, cost=self.cost)
+
+    def frame(self) -> ShapeFrame:
+        """Return where the shape stands, as kernels take it."""
+        placement, frame = self.placement, ShapeFrame()
         translation = placement.translation + placement.scale * placement.rotation @ self.origin()
         frame.inverse_rotation, frame.translation = wp.mat33(placement.rotation.T), wp.vec3(*translation)
         frame.scale, frame.sign = placement.scale * self.unit_length(), -1.0 if self.invert else 1.0
-        inputs = [points, frame, *self.parameters(device), out]
-        launch_list(kernel, points.shape[0], inputs, device=device, cost=self.cost)
+        return frame
 
     def bounds(self) -> np.ndarray | None:
         """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""

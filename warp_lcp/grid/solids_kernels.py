@@ -60,6 +60,29 @@ def to_plane(p: wp.vec3, frame: ShapeFrame, normal: wp.vec3) -> float:
     return frame.sign * frame.scale * wp.dot(to_shape(p, frame), normal)
 
 
+@wp.func
+def to_mesh(p: wp.vec3, frame: ShapeFrame, mesh: wp.uint64) -> float:
+    """Return the distance of the inside of a closed mesh: that to the closest triangle, with the sign from the winding number."""
+    q = to_shape(p, frame)
+    # 2: groups of triangles farther than twice their radius count as one dipole; a closed surface has whole numbers, so 0.5 has room.
+    query = wp.mesh_query_point_sign_winding_number(mesh, q, FAR, 2.0, 0.5)
+    distance = FAR
+    if query.result:
+        distance = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - q)
+    return frame.sign * frame.scale * query.sign * distance
+
+
+@wp.func
+def to_mesh_surface(p: wp.vec3, frame: ShapeFrame, mesh: wp.uint64) -> float:
+    """Return the distance to the closest triangle, without the sign, which takes most of the time."""
+    q = to_shape(p, frame)
+    query = wp.mesh_query_point_no_sign(mesh, q, FAR)
+    distance = FAR
+    if query.result:
+        distance = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - q)
+    return frame.scale * distance
+
+
 @list_kernel(MODULE)
 def box_distance(i, points: Points, frame: ShapeFrame, half: wp.vec3, out: Distances):
     """Measure a box."""
@@ -93,24 +116,13 @@ def plane_distance(i, points: Points, frame: ShapeFrame, normal: wp.vec3, out: D
 @list_kernel(MODULE)
 def mesh_distance(i, points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
     """Measure the inside of a closed mesh: distance to the closest triangle, sign from the winding number."""
-    q = to_shape(points[i], frame)
-    # 2: groups of triangles farther than twice their radius count as one dipole; a closed surface has whole numbers, so 0.5 has room.
-    query = wp.mesh_query_point_sign_winding_number(mesh, q, FAR, 2.0, 0.5)
-    distance = FAR
-    if query.result:
-        distance = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - q)
-    out[i] = frame.sign * frame.scale * query.sign * distance
+    out[i] = to_mesh(points[i], frame, mesh)
 
 
 @list_kernel(MODULE)
 def mesh_surface_distance(i, points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
     """Measure the distance to the closest triangle, without the sign, which takes most of the time."""
-    q = to_shape(points[i], frame)
-    query = wp.mesh_query_point_no_sign(mesh, q, FAR)
-    distance = FAR
-    if query.result:
-        distance = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - q)
-    out[i] = frame.scale * distance
+    out[i] = to_mesh_surface(points[i], frame, mesh)
 
 
 @forward_kernel(module=MODULE)

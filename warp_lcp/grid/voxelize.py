@@ -65,8 +65,8 @@ class VoxelSolids:
 
 
 def voxelize(
-    grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, open_sides: int = 0, remarks: bool = True
-) -> VoxelSolids:
+    grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, open_sides: int = 0, remarks: bool = True, counts: bool = True,
+) -> VoxelSolids:  # fmt: skip
     """Assign every cell whose center lies inside a solid to the first such solid.
 
     Args:
@@ -75,6 +75,7 @@ def voxelize(
         wall_separating: whether liquid may leave the domain's wall.
         open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
         remarks: make notes and refuse errors at the start of a run; False: solids have moved since.
+        counts: fill `covered`, which waits for the device; needed for remarks.
 
     Raises:
         ValueError: with `remarks`, a solid lies wholly outside the domain, or the solids leave no open cell.
@@ -91,7 +92,7 @@ def voxelize(
         low, high = (end, end) if near is None else (np.maximum(near[0], 1), np.minimum(near[1], end))
         for block, distances in sampler.measured(solid.geometry, low, high, offset=0.5) if (low < high).all() else ():
             wp.launch(claim_cells, len(distances), [block, distances, number, index, covered], device=grid.device)
-    claimed = covered.numpy()[1:]
+    claimed = covered.numpy()[1:] if counts else np.zeros(len(solids), dtype=np.int32)
     if remarks:
         notes += small_notes((solid.name for solid in solids), claimed, grid.spacing)
         check_open(not solids or bool((grid.interior(index.numpy()) == OPEN).any()))

@@ -12,7 +12,10 @@ from warp_lcp.deadline import check_time
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.memory import Scalar
+from warp_lcp.rows.program import Launch, LaunchGraph, Program, clear
+from warp_lcp.rows.program import launch as launch_recorded
+from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Across, Reduction, rows_of
 
 RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
@@ -113,14 +116,16 @@ class ConjugateGradient:
     ) -> None:  # fmt: skip
         self._product, self._preconditioner, self._rows, r = product, preconditioner, rows, preconditioner.r
         self.device, self.x, self._p, self._q = r.device, zeros_like(r), zeros_like(r), zeros_like(r)
-        self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=r.device)
+        self._scalars, self._shared = Reading(r.device, SLOTS), across is not None
+        self._goal = [Scalar() for _ in range(3)]  # tolerance, iterations at most, whether the error decides
+        self._beginning = LaunchGraph(r.device, self._launch_beginning)
         self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
-        self._reduction = Reduction(r.size, r.device, self._scalars, threads=None if rows is None else rows.places, across=across)
+        self._reduction = Reduction(r.size, r.device, self._scalars.array, threads=None if rows is None else rows.places, across=across)
         self._program: Program | None = None
         rows = rows or rows_of(r)
-        self._direction = DIRECTION.bind(rows, z=preconditioner.z, direction=self._p, scalars=self._scalars)
+        self._direction = DIRECTION.bind(rows, z=preconditioner.z, direction=self._p, scalars=self._scalars.array)
         self._update = UPDATE.bind(
-            rows, direction=self._p, q=self._q, w=weight, x=self.x, r=r, scalars=self._scalars, out=self._reduction.partials
+            rows, direction=self._p, q=self._q, w=weight, x=self.x, r=r, scalars=self._scalars.array, out=self._reduction.partials
         )
 
     def solve(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> tuple[int, float]:
@@ -137,21 +142,42 @@ class ConjugateGradient:
         Returns:
             The iterations done and the norm of the carried residual, an estimate that rounding bounds from below.
         """
-        self.x.zero_()
-        self._p.zero_()
-        self._q.zero_()  # A writes its own rows only
-        wp.launch(begin_kernel, 1, [self._scalars, self._going, tolerance, max_iterations, int(by_error)], device=self.device)
+        self.start(tolerance, max_iterations, by_error=by_error)
+        return self.found()
+
+    def start(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> None:
+        """Launch what `solve` does, with its arguments; `found` then returns the result."""
+        for number, value in zip(self._goal, (tolerance, max_iterations, int(by_error)), strict=True):
+            number.value = value
         cycle = getattr(self._preconditioner, "program", None)
+        if cycle is not None and self._program is None:
+            self._program = Program(self.device)
+            self._program.extend(cycle)
+            self._advance(self._program.launch)
+        self._beginning.run()
         if cycle is None:
             wp.capture_while(self._going, self._iterate)
-        else:
-            if self._program is None:
-                self._program = Program(self.device)
-                self._program.extend(cycle)
-                self._advance(self._program.launch)
+        elif self._program is not None and not self._loops_with_beginning:
             self._program.run_while(self._going)
+        self._scalars.changed()
+
+    def found(self) -> tuple[int, float]:
+        """Return iterations and norm of what `start` has launched, as `solve`; waits for the device."""
         scalars = self._scalars.numpy()
         return int(scalars[ITERATIONS]), float(np.sqrt(scalars[RR]))
+
+    @property
+    def _loops_with_beginning(self) -> bool:
+        """Whether the iterations are launched with the start, in one graph."""
+        return self.device.is_cuda and self._program is not None and not self._shared
+
+    def _launch_beginning(self) -> None:
+        """Launch the start: x = 0, and the decision whether to iterate; on a GPU the iterations, too."""
+        clear(self.x, self._p, self._q)  # A writes its own rows only
+        inputs = [self._scalars.array, self._going, *self._goal]
+        launch_recorded(begin_kernel, 1, inputs, device=self.device)
+        if self._loops_with_beginning and self._program is not None:
+            self._program.run_while(self._going)
 
     def _iterate(self) -> None:
         """Launch an iteration whose preconditioner is no program."""
@@ -167,4 +193,4 @@ class ConjugateGradient:
         self._reduction.dot(self._p, self._q, int(PQ), rows=self._rows, launch=launch)
         self._update.launch(launch)
         self._reduction.add_up(int(RR), launch=launch)
-        launch(end_kernel, 1, [self._scalars, self._going], device=self.device)
+        launch(end_kernel, 1, [self._scalars.array, self._going], device=self.device)

@@ -21,9 +21,11 @@ from warp_lcp.grid.tally import WindowTally
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.rows import KernelFile, RowPass
+from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import LaunchGraph
+from warp_lcp.rows.program import LaunchGraph, launch
 from warp_lcp.settings import renamed_names
 
 CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} | {
@@ -44,6 +46,12 @@ def displacement_pass(cut: bool) -> RowPass:
     """Return the kernel of the displacement; `cut`: faces have open fractions."""
     name = "warp_lcp.material.density_correction"
     return KERNELS.kernel(f"{name}.displace", module=name + "_cut" * cut, constants={"CUT": cut})
+
+
+@forward_kernel(module="warp_lcp.material.density_correction.count")
+def add_kernel(a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), sum: wp.array(dtype=wp.float64)):
+    """Add up two numbers."""
+    sum[0] = a[0] + b[0]
 
 
 LONGEST = 0.5  # cells that a correction moves a particle at most
@@ -207,6 +215,7 @@ class DensityCorrection:
         self._displace = displacement_pass(bool(boundary.open))
         self._over, self._lacking = WindowTally(PREPARE, grid), WindowTally(EVEN, grid)
         self._inside = self._lower = None
+        self._counted = wp.zeros(1, dtype=wp.float64, device=grid.device) if even and grid.device.is_cuda else None
         if even:  # the ring stays as it is
             self._inside = wp.array(boundary.base.numpy() == SOLID, dtype=wp.uint8, device=grid.device)
             self._lower = grid.field(wp.float64)
@@ -239,11 +248,14 @@ class DensityCorrection:
         self._preparation.run(particles, window, fill, contact, variant=variant)
         particles.drop_ghosts()
         self._over.changed()
+        if self._inside is not None:
+            self._lacking.changed()
+        result = self._solve_counting() if self._begins_ahead() else None
         over_full, most = self._found()
         if over_full == 0:
             self.x.zero_()
             return Correction(None, 0, most)
-        result = self._solve(over_full)
+        result = self._solve(over_full) if result is None else result
         if result.status in (wl.SolveStatus.INFEASIBLE, wl.SolveStatus.NON_FINITE):  # a closed room is too full: there is no way out
             self.x.zero_()
             return Correction(result, over_full, most)
@@ -289,12 +301,13 @@ class DensityCorrection:
             self.grid.part.fill(self._inside)  # before those deep inside are told by them
             least, planes = min(most, 2.0 - most), self.grid.planes - 1
             self._lacking.take(self._solved, fields, least=least, planes=planes, lower=self._lower)
+            if self._counted is not None:
+                launch(add_kernel, 1, [self._over.on_device(), self._lacking.on_device(), self._counted], device=self.grid.device)
 
     def _found(self) -> tuple[int, float]:
         """Return how many cells are over-full or lack material deep inside, and the largest density; collective."""
         lacking = 0.0
         if self._inside is not None:
-            self._lacking.changed()
             (lacking,) = self._lacking.read()
         full, densest = self._over.read()
         ranks = self.grid.part.ranks
@@ -304,12 +317,33 @@ class DensityCorrection:
         if self._problem is None:
             self._problem = self._make_problem()
             self._work = self.solver.init(self._problem)
+        self._take_cells()
+        criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations)
+        return self._solved_to(criteria)
+
+    def _begins_ahead(self) -> bool:
+        """Return whether a GPU begins the solve before the host knows of over-full cells."""
+        return self._problem is not None and not self.grid.part.shared and bool(getattr(self._work, "begins_ahead", False))
+
+    def _solve_counting(self) -> wl.SolveResult:
+        """Solve while the cells are counted: one readback has the count, too; without such cells nothing is solved."""
+        self._take_cells()
+        counted = self._over.on_device() if self._inside is None else self._counted
+        criteria = MeanCriteria(
+            rtol=self.tolerance, atol=EXCESS, max_iterations=self.max_iterations, count=lambda: self._found()[0], counted=counted
+        )
+        return self._solved_to(criteria)
+
+    def _solved_to(self, criteria: wl.StoppingCriteria | MeanCriteria) -> wl.SolveResult:
+        assert self._problem is not None
+        return wl.solve(self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work)
+
+    def _take_cells(self) -> None:
+        """Give the problem the cells, and where solids meet them."""
         self._copying.run()
         if self.boundary.moves:
             self._copy_faces()
         self._operator.update(self._cells)
-        criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations)
-        return wl.solve(self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work)
 
     def _make_problem(self) -> wl.LCP:
         part, opened = self.grid.part, self.boundary.open

@@ -56,7 +56,7 @@ class Rearrangement:
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
         self.moved = False
-        self._looked = False  # whether this step has measured the density_monitor
+        self._looked, self._step = False, -1  # whether a step has measured the density_monitor, and which one has been looked at
 
     def look(self, step: int, density: wp.array | None, particles: Particles, window: Window) -> None:
         """Measure the density_monitor at the start of a step, before anything moves, if that is what decides.
@@ -67,9 +67,16 @@ class Rearrangement:
             particles: the material.
             window: cells that hold all of it, with two to spare on each side.
         """
+        if self._step == step:
+            return
+        self._step = step
         self._looked = self.density_monitor is not None and step % self._every == 0
         if self.density_monitor is not None and self._looked:
             self.density_monitor.measure(density, particles, window)
+
+    def has_looked(self, step: int) -> bool:
+        """Return whether `look` has been called in a step."""
+        return self._step == step
 
     @property
     def max_density(self) -> float | None:
@@ -79,6 +86,10 @@ class Rearrangement:
     def due(self, step: int) -> bool:
         """Return whether a step moves anything."""
         return self._evens(step) or self._parts(step)
+
+    def corrects_alone(self, step: int) -> bool:
+        """Return whether a step's only rearrangement is a density correction."""
+        return not self._evens(step) and self._parts(step)
 
     def apply(
         self, particles: Particles, window: Window, step: int, dt: float, watch: Stopwatch, fill: Fill | None, contact: wp.array | None

@@ -362,25 +362,28 @@ class ParticleSimulation(ParticleCheckpoints):
         Raises:
             SimulationFailed: something is not finite, or a particle has left the domain.
         """
-        with self.watch.stage("density monitor", self.particles.position):
-            self.rearrangement.look(self.step_count, self.known_density(), self.particles, window)
+        early = self._monitored and self.rearrangement.corrects_alone(self.step_count)
+        self.monitor_density(window)
         with self.watch.stage("advection", self.particles.position, *self.velocity):
             self.carry(dt)
         if self.band is not None:
             with self.watch.stage("narrow band", self.band.depth, *self.velocity):
                 self.band.carry(self.velocity, dt)
         exchanged = self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
-        self.measure_particles()
-        after = self.checked_totals("after")
-        stopped, pushed, stuck = self.met()
+        if not early:
+            self.measure_particles()
+            after = self.checked_totals("after")
+            stopped, pushed, stuck = self.met()
         rearranged: Row = {"max_density": self.rearrangement.max_density}
         if self.rearrangement.due(self.step_count):
             fill = self.band.fill_interior if self.band is not None else None
-            window, contact = self.window(after), self.known_contact()
+            window, contact = self._everywhere() if early else self.window(after), self.known_contact()
             rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, dt, self.watch, fill, contact)
             if self.outlets is not None:  # the density correction may push particles out through open sides
                 exchanged["departed"] += self._remove_departed(self.outlets)
-            if self.rearrangement.moved or self.outlets is not None or self.shared:
+            if early:
+                stopped, pushed, stuck = self.met()  # as read with the solve, before particles have been displaced
+            if early or self.rearrangement.moved or self.outlets is not None or self.shared:
                 self.measure_particles()
                 after = self.checked_totals("after the density correction of")
         self.particles.totals_stay(True)
@@ -388,6 +391,22 @@ class ParticleSimulation(ParticleCheckpoints):
         self.step_count += 1
         self.last_dt = dt
         return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
+
+    def monitor_density(self, window: Window) -> None:
+        """Measure the density at the start of a step, before anything moves, if that has not been done."""
+        with self.watch.stage("density monitor", self.particles.position):
+            self.rearrangement.look(self.step_count, self.known_density(), self.particles, window)
+
+    @property
+    def _monitored(self) -> bool:
+        """Whether a GPU knows what a density correction is decided by before particles move, and need not measure them in between."""
+        kept = self.shared or self.band is not None or self.outlets is not None or self.sources is not None or self.spray.active
+        return self.grid.device.is_cuda and not kept and self.rearrangement.has_looked(self.step_count)
+
+    def _everywhere(self) -> Window:
+        """Return all cells, as the step's `active` window."""
+        self.active.move_to(self.grid.everywhere)
+        return self.active
 
     def measure_particles(self) -> None:
         """Launch what the log wants to know of the particles besides their totals, with which it is read."""

@@ -18,6 +18,7 @@ from warp_lcp.material import sources_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows.fields import zeros
+from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.memory import Slot
 from warp_lcp.rows.program import LaunchGraph, clear
 
@@ -109,9 +110,8 @@ class Sources:
         self._imposing, self._counting = (LaunchGraph(device, record) for record in (self._impose, self._count))
         self._entering = LaunchGraph(device, self._enter)
         self._nothing = *(np.zeros(0, dtype=np.int32) for _ in range(3)), np.zeros((0, 3), dtype=np.float32)
-        self._span_on_host = np.zeros(14)  # see `sources.h`
-        self._span = wp.array(self._span_on_host, dtype=wp.float64, device=device, copy=device.is_cuda)
-        self._lattice = ListMemory(device)
+        self._span = HostArray(14, wp.float64, device)  # see `sources.h`
+        self._lattice, self._memory = ListMemory(device), zeros(0, wp.int32, device)
         self._points, self._found = dict.fromkeys(("entries", "slot", "filled", "point"), zeros(0, wp.int32, device)), list[np.ndarray]()
 
     def top_speed(self, time: float, span: float) -> float:
@@ -234,12 +234,11 @@ class Sources:
             low[axis] = math.floor((box[0][axis] - max(begin, end)) / distance) - 1.0
             counts[axis] = int(math.ceil((box[1][axis] - min(begin, end)) / distance) + 1.0 - low[axis])
         self._reserve(math.prod(counts))
-        self._span_on_host[:] = (*ways[0], *ways[1], *ways[2], *low, *counts[:2])
-        if self.grid.device.is_cuda:
-            self._span.assign(self._span_on_host)
+        self._span.host[:] = (*ways[0], *ways[1], *ways[2], *low, *counts[:2])
+        self._span.send()
         self._entering.run(number)
         if self.grid.device.is_cuda:
-            self._found = [array.numpy() for array in self._points.values()]
+            self._found = self._split(self._memory.numpy())
         entries, slot, filled, points = (array[: int(self._lattice.count.value)] for array in self._found)
         which = np.flatnonzero(entries | filled if starts else entries)
         if not len(which):
@@ -252,19 +251,27 @@ class Sources:
         size = dict(zip(("size_x", "size_y", "size_z"), map(float, grid.extent), strict=True))
         numbers = {"number": number, "nx": grid.shape[2], "ny": grid.shape[1], "nz": grid.shape[0], "seed": (seed + 2**63) % 2**64 - 2**63}
         lengths = {"distance": grid.spacing / self.per_axis, "jitter": self.jitter, "grazed": GRAZED, "margin": 1.1 * MARGIN * grid.spacing}
-        given = {"slots": self._fields[0].flatten(), "owner": self._fields[1], "span": self._span, **self._points}
+        given = {"slots": self._fields[0].flatten(), "owner": self._fields[1], "span": self._span.array, **self._points}
         launch(kernels.ENTER, int(self._lattice.count.value), grid, **given, **numbers, **lengths, **size)
 
     def _reserve(self, count: int) -> None:
         """Have room for so many points of a lattice."""
         if count > len(self._points["entries"]):
-            for name in self._points:
+            size, memory = int(GROWTH * count), zeros(6 * int(GROWTH * count), wp.int32, self.grid.device)
+            for place, name in enumerate(self._points):  # in one memory, which is read by one copy
                 kind = wp.vec3 if name == "point" else wp.int32
-                self._points[name] = wp.zeros(int(GROWTH * count), dtype=kind, device=self.grid.device)
+                self._points[name] = wp.array(ptr=memory.ptr + 4 * place * size, dtype=kind, shape=size, device=self.grid.device)
+            self._memory = memory
             self._lattice.take(count, self._points)
             if self.grid.device.is_cpu:
                 self._found = [array.numpy() for array in self._points.values()]  # the same memory
         self._lattice.resize(count)
+
+    @staticmethod
+    def _split(memory: np.ndarray) -> list[np.ndarray]:
+        """Return entries, slots, filled and points, shape (n, 3), as they lie in one memory."""
+        size = len(memory) // 6
+        return [*memory[: 3 * size].reshape(3, size), memory[3 * size :].view(np.float32).reshape(size, 3)]
 
     def _new(self, held: np.ndarray, slot: np.ndarray, entries: np.ndarray, filled: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return where particles come in [m], of the points of `_entered`: if the source starts, those that fill cells are among them.
@@ -366,7 +373,7 @@ class Outlets:
         self.grid, self.drains, self.open_sides = grid, tuple(drains), open_sides
         self._store, self._slot = zeros(0, wp.float32, grid.device), Slot()
         self._distance = self._store  # of as many as there are particles
-        self._leaving = LaunchGraph(grid.device, self._launch, at_once=grid.device.is_cuda)  # a scan of Warp's
+        self._leaving = LaunchGraph(grid.device, self._launch)
 
     def apply(self, particles: Particles, before: float, now: float) -> tuple[int, int]:
         """Remove particles; the others keep their order.
@@ -397,6 +404,7 @@ class Outlets:
             self._slot.point_to(self._distance)
         marks = particles.marks
         self._leaving.run(particles, drains, marks, self._distance)
+        particles.launch_totals()
         departed, drained = particles.finish_removal(marks)
         return drained, departed
 

@@ -39,7 +39,7 @@ class ColumnEntries:
         entry_rows: row of each entry, int32, ascending.
         blocks: block of columns of each entry, int32.
         values: the entry's values, `width` of them.
-        count: of the entries, int32, shape (1,).
+        count: of the entries, int32, its first number.
         width: columns of a block.
     """
 
@@ -74,7 +74,7 @@ class BlockColumns:
         rows: row of each entry, int32, shape (capacity,).
         blocks: block of each entry, int32, shape (capacity,).
         values: of type dtype, shape (capacity * width,), an entry's one after another.
-        count: number of entries, int32, shape (1,).
+        count: number of entries, and that of those that there were to write, int32, shape (2,).
         sums: what `gather` writes, float64, shape (rank,).
         across: who has other rows of U; None: nobody.
     """
@@ -83,7 +83,7 @@ class BlockColumns:
 
     def __init__(self, size: int, blocks: int, width: int, dtype: Any, device: wp.Device) -> None:
         self.size, self.width, self.rank, self.dtype, self.device = size, width, blocks * width, dtype, device
-        self._count, self._sums = Reading(device, 1, wp.int32), Reading(device, self.rank)
+        self._count, self._sums = Reading(device, 2, wp.int32), Reading(device, self.rank)
         self.count, self.sums = self._count.array, self._sums.array
         self.reserve(0)
 
@@ -96,7 +96,16 @@ class BlockColumns:
         on_cuda = self.device.is_cuda
         self._each = Rows.flat(self.capacity, self.device, serial=not on_cuda)
         self._all = Rows.by_turns(self.capacity, self.device, min(self.capacity, CUDA_THREADS)) if on_cuda else self._each
-        self._reduction = Reduction(self.size, self.device, self.sums, columns=self.rank, threads=self._all.places) if on_cuda else None
+        self._reduction = self.reduction(self.sums, self.rank) if on_cuda else None
+
+    @property
+    def turns(self) -> Rows:
+        """The entries, by turns of threads, for sums on a GPU."""
+        return self._all
+
+    def reduction(self, found: wp.array[Any], columns: int) -> Reduction:
+        """Return what adds up columns of sums over `turns` to `found`."""
+        return Reduction(self.size, self.device, found, columns=columns, threads=self._all.places)
 
     def assign(self, rows: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
         """Take entries from the host.
@@ -117,8 +126,16 @@ class BlockColumns:
 
     def counted(self) -> int:
         """Return how many entries a kernel has written; waits for the device."""
-        self._count.changed()
+        self.counting()
         return int(self._count.numpy()[0])
+
+    def counting(self) -> None:
+        """Say that a kernel writes entries."""
+        self._count.changed()
+
+    def wanted(self) -> int:
+        """Return how many entries there were to write at the last `counting`, more than there is room for perhaps; waits for the device."""
+        return int(self._count.numpy()[1])
 
     def summed(self) -> np.ndarray:
         """Return what the last `gather` has written, not to be written to, shape (rank,); waits for the device."""
@@ -185,6 +202,7 @@ class LowRankOperator(Pickled):
         weights: W, float64, shape (k, k); `update` changes it.
         version: how often columns and weights have been taken.
         weighed: W U'x of the last product, float64, shape (k,).
+        products: where a solve keeps U'x of its iterate as last evaluated; `products_of` is that iterate, None: no solve does.
 
     Raises:
         ValueError: shapes do not match, there is no column, or a value is not finite.
@@ -333,6 +351,7 @@ class LowRankOperator(Pickled):
         self._weights.send()
         self._turned.send()
         self.weighed = wp.zeros(self.rank, dtype=wp.float64, device=self.device)
+        self.products, self.products_of = Reading(self.device, self.rank), None
 
     def _checked_weights(self, weights: Any) -> np.ndarray:
         """Return W as a host matrix."""
@@ -343,6 +362,10 @@ class LowRankOperator(Pickled):
         if not np.isfinite(W).all():
             raise ValueError("weights holds a value that is not finite")
         return W
+
+    def products_at(self, x: wp.array[Any]) -> np.ndarray | None:
+        """Return U'x of the solution of the last solve, not to be written to; None where no solve has kept it. Waits for the device."""
+        return self.products.numpy() if self.products_of is not None and self.products_of.ptr == x.ptr else None
 
     def _product(self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]) -> wp.array[Any]:
         if x.size != self.layout.size:

@@ -19,6 +19,14 @@ from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers.projected_multigrid_kernels import ENERGY, ZAP, ZAZ
 
+STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
+SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
+FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts
+CHANGED = 2.0  # factor by which a column's square may change before its potential is renewed
+MOST_READ = 1024  # products that are read with other numbers
+SKEW = 0.3  # the most that potentials may be unsymmetric
+SPREADING, STRONGEST = wp.constant(wp.float64(SPREAD)), wp.constant(wp.float64(STRONG))
+SAFELY = wp.constant(wp.float64(1.0 + 1e-9))  # what the host computes again must not come out the other way
 I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
 
@@ -64,23 +72,39 @@ def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
 
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
-def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64):
-    """From u = U'x and W u: x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x."""
+def subtract_energy_kernel(u: F64, weighed: F64, n: int, scalars: F64, products: F64):
+    """From u = U'x and W u: x'(y + b + U W U' x) exceeds twice the energy by x'U W U' x; keep u as `products`."""
     beyond = wp.float64(0.0)
     for i in range(n):
         beyond += u[i] * weighed[i]
+        products[i] = u[i]
     scalars[ENERGY] -= beyond
+
+
+@no_type_check
+@forward_kernel(module="warp_lcp.low_rank_correction")
+def unit_kernel(columns: I32, slot: int, force: F64):
+    """Write the unit force of a slot's column."""
+    q = wp.tid()
+    force[q] = wp.where(q == columns[slot], wp.float64(1.0), wp.float64(0.0))
+
+
+@no_type_check
+@forward_kernel(module="warp_lcp.low_rank_correction")
+def calm_kernel(W: wp.array2d(dtype=wp.float64), squares: F64, rank: int, width: int, power: wp.float64, calm: I32):
+    """Find whether no column is strong, with a margin; one thread."""
+    calm[0] = 1
+    for q in range(rank):
+        rows = squares[rank + q // width]
+        if not W[q, q] * SPREADING * wp.pow(rows, power) * squares[q] * SAFELY < STRONGEST:
+            calm[0] = 0
 
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/low_rank_correction.h")
 SQUARES = KERNELS["low_rank_correction.squares"]
+BY_TURNS = KERNELS["low_rank_correction.squares_by_turns"]
 DOTS = KERNELS["low_rank_correction.dots"]
 SUBTRACT = KERNELS["low_rank_correction.subtract"]
-STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
-SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
-FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts
-CHANGED = 2.0  # factor by which a column's square may change before its potential is renewed
-SKEW = 0.3  # the most that potentials may be unsymmetric
 
 
 class LowRankCorrection:
@@ -105,6 +129,8 @@ class LowRankCorrection:
 
     Attributes:
         slots: columns corrected for.
+        noted: the sums that `renew` decides by.
+        calm: on a GPU, int32 of shape (1,): whether they ask for no column.
     """
 
     def __init__(self, low: LowRankOperator, hierarchy: Hierarchy) -> None:
@@ -113,8 +139,12 @@ class LowRankCorrection:
         self._inverses = HostArray((2, n * n), wp.float64, device)  # of S and E
         self._S, self._E = self._inverses.array[0], self._inverses.array[1]
         self._sums, self._kept, self._force, self._t = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4))
-        self._squares = Reading(device, n + n // low.columns.width)
-        self._of_slot = wp.zeros(n, dtype=wp.int32, device=device)
+        self.noted = Reading(device, n + n // low.columns.width)
+        self.calm = wp.zeros(1, dtype=wp.int32, device=device) if device.is_cuda else None
+        self._power = wp.float64(1.0 / max(sum(n > 1 for n in hierarchy.finest.stencil.padding.counts) - 1, 1))
+        self._adding: tuple[Any, Reduction] | None = None  # of the sums on a GPU, and the entries that it is for
+        self._columns_of_slots = HostArray(n, wp.int32, device)
+        self._of_slot = self._columns_of_slots.array
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
         self._spare = self._Z  # in which potentials lie that get other slots
@@ -122,11 +152,13 @@ class LowRankCorrection:
         self._dots: Reduction | None = None
         self._slot_columns = list[int]()
         self._seen = np.zeros(n)  # U_q' U_q when a potential was made
-        self._products = wp.zeros(0, dtype=wp.float64, device=device)  # U'Z, a slot after another
+        few = n * n <= MOST_READ  # U'Z, a slot after another
+        self._read_products = Reading(device, n * n) if few else None
+        self._products = self._read_products.array if self._read_products is not None else wp.zeros(0, dtype=wp.float64, device=device)
         at_once = low.layout.across is not None
-        self._squaring, self._exciting, self._multiplying = (
+        self._squaring, self._exciting, self._multiplying, self._filling = (
             LaunchGraph(device, record, at_once=at_once)
-            for record in (self._launch_squares, self._launch_unit_force, self._launch_products)
+            for record in (self._launch_squares, self._launch_unit_force, self._launch_products, self._launch_potential)
         )
 
     @property
@@ -135,36 +167,69 @@ class LowRankCorrection:
         return len(self._slot_columns)
 
     @property
+    def readings(self) -> tuple[Reading, ...]:
+        """What `note`, `note_products` and `make_potentials` write."""
+        return (self.noted,) if self._read_products is None else (self.noted, self._read_products)
+
+    @property
     def key(self) -> tuple[int, ...]:
         """What recorded launches depend on."""
         return self.slots, self._Z.ptr or 0
 
-    def renew(self, *, begins: bool) -> bool:
+    def prepare(self) -> None:
+        """Make what `note` launches, for the memory that the entries are in."""
+        found, key = self.noted.array, self._columns.rows.ptr
+        if self.calm is not None and (self._adding is None or self._adding[0] != key):
+            self._adding = key, self._columns.reduction(found, found.size)
+
+    def note(self, launch: Launch) -> None:
+        """Launch the sums U_q' U_q over the free set, the rows that each body touches there and, on a GPU, whether that is `calm`."""
+        columns, low, d = self._columns, self._low, self._hierarchy.finest.stencil.d
+        if self.calm is None:
+            one = Rows.flat(1, low.device)
+            SQUARES.bind(one, columns.entry_fields, rank=low.rank, d=d, squares=self.noted.array).launch(launch)
+            return
+        assert self._adding is not None, "prepare comes first"
+        found, adding = self.noted.array, self._adding[1]
+        BY_TURNS.bind(columns.turns, columns.entry_fields, rank=low.rank, d=d, out=adding.partials).launch(launch)
+        adding.add_up(0, columns=found.size, launch=launch)
+        inputs = [low.weights, found, low.rank, columns.width, self._power, self.calm]
+        launch(calm_kernel, 1, inputs, device=low.device)
+
+    def renew(self, *, begins: bool, noted: bool = False, made: bool = False) -> bool:
         """Take the free set as it is now: choose the columns to correct for, and make potentials, a cycle each.
 
         Args:
             begins: whether a solve begins.
+            noted: whether `note` has been launched for this free set, `note_products` too, and their readings have changed since.
+            made: whether `make_potentials` has.
 
         Returns:
             Whether the finest right-hand side was lost.
         """
         low, W = self._low, self._low.host_weights
-        self._squaring.run(variant=self._columns.rows.ptr)
-        self._squares.changed()
-        found, width, across = self._squares.numpy().copy(), self._columns.width, low.layout.across
+        if not noted:
+            self.prepare()
+            self._squaring.run(variant=self._columns.rows.ptr)
+            self.noted.changed()
+        found, width, across = self.noted.numpy().copy(), self._columns.width, low.layout.across
         found = found if across is None else across.sum(found)
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
-        power = 1.0 / max(sum(n > 1 for n in self._hierarchy.finest.stencil.padding.counts) - 1, 1)
-        strong = np.flatnonzero(W.diagonal() * SPREAD * rows**power * squares >= STRONG).tolist()
+        strong = np.flatnonzero(W.diagonal() * SPREAD * rows ** float(self._power.value) * squares >= STRONG).tolist()
         if begins:
             self._seen[:] = 0.0
-        if strong != self._slot_columns:
+        chosen = strong != self._slot_columns
+        if chosen:
             self._choose(strong)
         seen, now = self._seen.tolist(), squares.tolist()
         stale = [q for q in strong if not seen[q] / CHANGED <= now[q] <= seen[q] * CHANGED]
-        self._fill(stale, squares)
-        lost = bool(stale)
-        if strong and not self._invert(W) and len(stale) < len(strong):
+        made = made and begins and not chosen
+        if made:
+            self._seen[stale] = squares[stale]
+        else:
+            self._fill(stale, squares)
+        lost, known = bool(stale), self._read_products is not None and (made or (noted and not begins and not chosen and not stale))
+        if strong and not self._invert(W, known=known) and len(stale) < len(strong):
             self._fill([q for q in strong if q not in stale], squares)
             self._invert(W)
             lost = True
@@ -206,7 +271,8 @@ class LowRankCorrection:
             self._bound = {}
         order = np.zeros(low.rank, dtype=np.int32)
         order[: len(strong)] = strong
-        self._of_slot.assign(order)
+        self._columns_of_slots.host[:] = order
+        self._columns_of_slots.send()
         self._slot_columns = strong
         self._dots = None
         if strong:
@@ -227,6 +293,12 @@ class LowRankCorrection:
     def _fill(self, columns: list[int], squares: np.ndarray) -> None:
         """Make the potentials B U_q of columns."""
         finest, n = self._hierarchy.finest, self._size
+        if self.calm is not None and self._low.layout.across is None:
+            for q in columns:
+                slot = self._slot_columns.index(q)
+                self._filling.run(slot, variant=(*self.key, self._columns.rows.ptr))
+            self._seen[columns] = squares[columns]
+            return
         for q in columns:
             unit = np.zeros(self._low.rank)
             unit[q] = 1.0
@@ -236,13 +308,31 @@ class LowRankCorrection:
             wp.copy(self._Z, finest.x, dest_offset=self._slot_columns.index(q) * n, count=n)
             self._seen[q] = squares[q]
 
-    def _invert(self, W: np.ndarray) -> bool:
-        """Write the inverses of S and E on the modes that are felt; return whether S is as symmetric as it should be."""
+    def make_potentials(self) -> None:
+        """Launch the potentials of all slots, and their products."""
+        for slot in range(self.slots):
+            self._launch_potential(slot)
+        self.note_products()
+
+    def note_products(self) -> None:
+        """Launch the products of the potentials on the free set, if `renew` can read them with others."""
+        if self._read_products is not None:
+            self._launch_products(self._products)
+
+    def _invert(self, W: np.ndarray, *, known: bool = False) -> bool:
+        """Write the inverses of S and E on the modes that are felt; return whether S is as symmetric as it should be.
+
+        `known`: the products have been read.
+        """
         m = self.slots
         if self._products.size < m * self._low.rank:
             self._products = wp.zeros(m * self._low.rank, dtype=wp.float64, device=self._low.device)
-        self._multiplying.run(self._products, variant=(*self.key, self._columns.rows.ptr))
-        G = np.ascontiguousarray(self._products.numpy()[: m * self._low.rank].reshape(m, -1).T)
+        if not known:
+            self._multiplying.run(self._products, variant=(*self.key, self._columns.rows.ptr))
+            if self._read_products is not None:
+                self._read_products.changed()
+        products = self._products if self._read_products is None else self._read_products
+        G = np.ascontiguousarray(products.numpy()[: m * self._low.rank].reshape(m, -1).T)
         S = G[self._slot_columns]
         even, odd = 0.5 * (S + S.T), 0.5 * (S - S.T)
         values, vectors = np.linalg.eigh(W[np.ix_(self._slot_columns, self._slot_columns)])
@@ -256,21 +346,27 @@ class LowRankCorrection:
         for target, matrix in zip(self._inverses.host, (S, E), strict=True):
             target[: m * m] = (V @ np.linalg.solve(V.T @ matrix @ V, V.T)).ravel()
         self._inverses.send()
-        self._force.zero_()
         return bool(skew <= SKEW and ratios.min(initial=0.0) > -SKEW)
 
     def _launch_squares(self) -> None:
-        """Launch the sums U_q' U_q over the free set, and the rows that each body touches there."""
-        one, d = Rows.flat(1, self._low.device), self._hierarchy.finest.stencil.d
-        SQUARES.bind(one, self._columns.entry_fields, rank=self._low.rank, d=d, squares=self._squares.array).launch()
+        """Launch `note`."""
+        self.note(launch_recorded)
 
     def _launch_unit_force(self) -> None:
         """Make U f the finest right-hand side."""
         clear(self._hierarchy.finest.b)
         self._spread(1.0, launch_recorded)
 
+    def _launch_potential(self, slot: int) -> None:
+        """Launch on a GPU the potential of a slot's column, a cycle."""
+        launch_recorded(unit_kernel, self._low.rank, [self._of_slot, slot, self._force], device=self._low.device)
+        self._launch_unit_force()
+        self._hierarchy.cycle.run()
+        copy(self._Z[slot * self._size : (slot + 1) * self._size], self._hierarchy.finest.x)
+
     def _launch_products(self, products: wp.array[Any]) -> None:
-        """Launch U'Z, a slot after another."""
+        """Launch U'Z, a slot after another; no force is left."""
+        clear(self._force)
         d, rank, n = self._hierarchy.finest.stencil.d, self._low.rank, self._size
         for s in range(self.slots):
             along = self._columns.gather(self._Z[s * n : (s + 1) * n], mask=d, fused=False, launch=launch_recorded)

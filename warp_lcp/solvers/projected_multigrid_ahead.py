@@ -87,11 +87,11 @@ def keep_row_kernel(scalars: f64, rows: f64, n: int):
 @no_type_check
 def begin_kernel(
     scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), was_stale: int, most: int,
-    rtol: wp.float64, atol: wp.float64, counted: f64, noise: wp.float64,
+    rtol: wp.float64, atol: wp.float64, counted: f64, noise: wp.float64, calm: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Begin with the guess that has been evaluated, if it misses the tolerance and is as large as b; row 0 has the reference.
 
-    The tolerance is absolute, or of the root mean square if unknowns are counted.
+    The tolerance is absolute, or of the root mean square if unknowns are counted. `calm`: whether the host need not prepare the steps.
     """
     keep_row(scalars, rows, 1)
     norm = wp.sqrt(scalars[NORM])
@@ -110,6 +110,10 @@ def begin_kernel(
     judged[NOISE] = noise
     ratio = norm / scalars[SIZE]
     go = norm > judged[TOLERANCE] * SAFELY and ratio > LEAST_RATIO and ratio < MOST_RATIO and most > 2
+    if counted:
+        go = go and counted[0] > wp.float64(0.0)
+    if calm:
+        go = go and calm[0] != 0
     going[0] = wp.where(go, 1, 0)
     stale[0] = wp.where(scalars[MOVED] + rows[MOVED] > wp.float64(0.0), 1, was_stale)
     scalars[CARRY] = wp.float64(0.0)
@@ -139,11 +143,12 @@ def resume_kernel(
 @no_type_check
 def judge_kernel(
     scalars: f64, rows: f64, judged: f64, going: wp.array(dtype=wp.int32), stale: wp.array(dtype=wp.int32), rebuilds: bool,
+    bounded: bool, calm: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Keep what a truncated step has led to; go on if the host would take another one without a thought.
 
-    That is where the residual and the energy are the least yet, the tolerance is missed, and the free set does not creep; nor changes,
-    unless the device rebuilds what depends on it.
+    That is where the residual and, with bounds, the energy are the least yet, the tolerance is missed, and the free set does not creep;
+    nor changes, unless the device rebuilds what depends on it: `calm`, whether that is all.
     """
     zero = wp.float64(0.0)
     n = int(judged[TAKEN])
@@ -153,9 +158,13 @@ def judge_kernel(
     fell = judged[LAST_ENERGY] - energy
     margin = judged[NOISE] * (wp.abs(judged[LAST_ENERGY]) + wp.abs(energy))
     go = n + 1 < int(judged[MOST]) and wp.isfinite(scalars[STEP])
-    go = go and norm > judged[TOLERANCE] * SAFELY and norm < judged[BEST] and judged[LOWEST] - energy > margin * SAFELY
+    go = go and norm > judged[TOLERANCE] * SAFELY and norm < judged[BEST]
+    if bounded:  # without bounds there is no energy
+        go = go and judged[LOWEST] - energy > margin * SAFELY
     if scalars[MOVED] > zero:
         go = go and rebuilds and fell * SAFELY < CREEPS * judged[FELL] and norm * SAFELY < STALLS * judged[LAST_NORM]
+        if calm:
+            go = go and calm[0] != 0
     judged[TAKEN] = wp.float64(n + 1)
     judged[BEST] = wp.min(judged[BEST], norm)
     judged[LAST_NORM] = norm
@@ -187,8 +196,9 @@ class RunAhead:
         self._found, self._judged = Reading(device, ROWS * int(ROW)), Reading(device, JUDGED)
         self._going, self._stale = (zeros(1, wp.int32, device) for _ in range(2))
         self._numbers = [Scalar() for _ in range(5)]  # of the kernel that begins: stale, most, both tolerances, noise
-        self._loops: dict[int, Program] = {}  # by the step's program
-        self._launches: dict[Any, Any] = {}  # recorded, by their kernel
+        self._standing = [Scalar() for _ in range(9)]  # of the kernel that resumes
+        self._loops: dict[tuple[int, bool], Program] = {}  # by the step's program, and whether the device rebuilds
+        self._resuming = LaunchGraph(device, self._launch_resumption)
         self._beginning: Beginning | None = None
 
     @staticmethod
@@ -202,17 +212,26 @@ class RunAhead:
         work, r = self._work, self._work.residual
         if not self._rebuilds:
             work.rebuild()
-        loop = self._loop()
+        loop = self._loop(rebuilds=self._may_rebuild())
         if loop is None:
             return False
         given = [int(r.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
-        self._launch(resume_kernel, [self._judged.array, self._going, self._stale], given)
-        loop.run_while(self._going)
+        for number, value in zip(self._standing, given, strict=True):
+            number.value = value
+        self._resuming.run(loop, variant=work.program_key())
+        if not work.A.device.is_cuda:
+            loop.run_while(self._going)
         self._take_rows()
         return True
 
+    def _may_rebuild(self) -> bool:
+        """Return whether the device follows the free set now."""
+        return self._rebuilds or self._work.is_calm()
+
     def begin(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria, left: int) -> float | None:
         """Begin a solve from a guess, and take steps; return the residual at clip(0, l, u), None where the loop has to begin again.
+
+        Without unknowns that count, nothing is done, and the residual is 0.
 
         Args:
             guess: stored field that is not the iterate.
@@ -220,8 +239,8 @@ class RunAhead:
             left: steps at most.
         """
         work, r = self._work, self._work.residual
-        loop = self._loop() if self._rebuilds else None
-        if loop is None and self._rebuilds:
+        loop = self._loop(rebuilds=True) if self._may_rebuild() else None
+        if loop is None and self._rebuilds and not work.A.device.is_cuda:
             return None
         p, hierarchy = work.problem, work.hierarchy
         renewed = r.has_new_operator()
@@ -241,6 +260,10 @@ class RunAhead:
             if loop is not None:
                 loop.run_while(self._going)
         self._take_rows()
+        if isinstance(criteria, MeanCriteria) and criteria.count() == 0:  # no unknown counts: there is nothing to solve
+            self.rows.clear()
+            r.stale, r.norm = True, 0.0  # of the free set nobody knows
+            return 0.0
         reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
         usual = p.bounds.stays and self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
@@ -261,50 +284,45 @@ class RunAhead:
         """Record the kernel that decides whether the guess is good enough."""
         *given, noise = self._numbers
         memory = [self._work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-        launch(begin_kernel, 1, [*memory, *given, counted, noise], device=self._work.A.device)
+        launch(begin_kernel, 1, [*memory, *given, counted, noise, self._work.calm], device=self._work.A.device)
 
-    def _launch(self, kernel: Any, memory: list[Any], given: list[Any]) -> None:
-        """Launch a kernel of one thread whose last arguments differ from launch to launch."""
-        made, device = self._launches.get(kernel), self._work.A.device
-        if not device.is_cuda:
-            if made is None:
-                made = self._launches[kernel] = Program(device), [Scalar() for _ in given]
-                made[0].launch(kernel, 1, [*memory, *made[1]], device=device)
-            for number, value in zip(made[1], given, strict=True):
-                number.value = value
-            made[0].run()
-            return
-        if made is None:
-            inputs = [*memory, *given]
-            made = self._launches[kernel] = wp.launch(kernel, 1, inputs, device=device, record_cmd=True)
-        else:
-            for place, value in enumerate(given, len(memory)):
-                made.set_param_at_index(place, value)
-        made.launch()
+    def _launch_resumption(self, loop: Program) -> None:
+        """Launch the kernel that resumes, and on CUDA the steps."""
+        memory, device = [self._judged.array, self._going, self._stale], self._work.A.device
+        launch(resume_kernel, 1, [*memory, *self._standing], device=device)
+        if device.is_cuda:
+            loop.run_while(self._going)
+            self._work.note_free_set(launch)
+            self._work.note_correction()
 
     def _take_rows(self) -> None:
         """Take over the rows that a loop has left; waits for the device."""
-        for reading in (self._found, self._judged):
+        for reading in (self._found, self._judged, *self._work.readings):
             reading.changed()
         count = int(self._judged.numpy()[int(TAKEN)])
+        self._work.free_set_noted = self._work.A.device.is_cuda
         self.rows.extend(self._found.numpy()[: count * int(ROW)].reshape(count, -1).copy())
 
-    def _loop(self) -> Program | None:
+    def _loop(self, *, rebuilds: bool) -> Program | None:
         """Return the program of a step among others, None while parts of it have not run."""
         work = self._work
         step, rebuild = work.step_program(), work.hierarchy.rebuilding
         if not (step.has_run and rebuild.has_run):
             return None
-        if id(step) not in self._loops:
-            loop = self._loops[id(step)] = Program(work.A.device)
-            if self._rebuilds:
+        key = id(step), rebuilds
+        if key not in self._loops:
+            loop = self._loops[key] = Program(work.A.device)
+            if rebuilds:
                 loop.record(Conditional(self._stale, rebuild))
             if work.precision is Precision.SINGLE:  # rounding cannot be taken back: x, the best iterate, is stored before each step
                 CONVERT.bind(Rows.of_fields(work.problem.layout), a=work.x, b=work.best()).launch(loop.launch)
             loop.extend(step)
+            calm = work.calm if rebuilds else None
+            if calm is not None:
+                work.note_free_set(loop.launch)
             memory = [work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-            loop.launch(judge_kernel, 1, [*memory, self._rebuilds], device=work.A.device)
-        return self._loops[id(step)]
+            loop.launch(judge_kernel, 1, [*memory, rebuilds, work.bounded, calm], device=work.A.device)
+        return self._loops[key]
 
 
 class Beginning:
@@ -323,7 +341,7 @@ class Beginning:
         judge: Callable[[wp.array[Any] | None, Launch], None],
     ) -> None:  # fmt: skip
         self._work, self._guess, self._counted, self._found, device = work, guess, counted, found, work.A.device
-        self._key, self._finder = work.problem_key(), work.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
+        self._key, self._finder = work.program_key(), work.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
         self._judge, self._graph = judge, LaunchGraph(device, self._launch)  # on CUDA
         self._program = None if device.is_cuda else Program(device)
         if self._program is not None:
@@ -334,7 +352,7 @@ class Beginning:
 
     def fits(self, guess: wp.array[Any], counted: wp.array[Any] | None) -> bool:
         """Return whether the launches are of this guess and count, and of the bounds as they are."""
-        return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.problem_key()
+        return self._guess.ptr == guess.ptr and self._counted is counted and self._key == self._work.program_key()
 
     def run(self) -> None:
         """Launch everything, on the CPU."""
@@ -365,6 +383,8 @@ class Beginning:
         self._judge(self._counted, launch)
         if loop is not None:
             loop.run_while(going)
+        else:
+            self._work.prepare_correction()
 
     def is_plain(self) -> bool:
         """Return whether no component floats and the guess is finite; waits for the device."""
@@ -401,5 +421,7 @@ class Beginning:
         work.round_iterate(launch=launch)
         r.classify = True
         r.assess(x, launch=launch)
+        if device.is_cuda:
+            work.note_free_set(launch)
         if work.scratch is not None:
             CLEAR.bind(work.flat, x=work.scratch[1]).launch(launch)

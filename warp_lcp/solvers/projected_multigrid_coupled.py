@@ -11,6 +11,7 @@ from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Step
+from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.rows.program import Launch, LaunchGraph, Program, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import CONVERT, rows_of
@@ -56,8 +57,13 @@ class CoupledResidual(AssessedResidual):
         low = self._low
         low.add(x, self.problem.b, self._b, launch=launch)
         super().assess(x, launch=launch)
-        inputs = [low.columns.sums, low.weighed, low.rank, self.scalars]
+        inputs = [low.columns.sums, low.weighed, low.rank, self.scalars, low.products.array]
         launch(coupling.subtract_energy_kernel, 1, inputs, device=low.device)
+
+    def read(self) -> float:
+        """Read what the evaluation found, U'x too."""
+        self._low.products.changed()
+        return super().read()
 
     def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Launch the step and the evaluation where it ends; U'x is needed between them."""
@@ -79,6 +85,11 @@ class CoupledWorkspace(MultigridWorkspace):
         self._monotone = LaunchGraph(problem.device, self._launch_monotone, at_once=problem.layout.across is not None)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
+        self.readings = (low.products, *self.correction.readings)
+        self._prepared = False  # whether potentials have been made as the solve began
+        if problem.device.is_cuda and self._ahead is not None:
+            self.calm = self.correction.calm
+        low.products_of = self.x if problem.layout.across is None else None
         self._newton: Inner | None = None
         self._searches = False  # whether steps are Newton's
 
@@ -89,6 +100,32 @@ class CoupledWorkspace(MultigridWorkspace):
         """Forget the search direction; operator and bodies may have changed."""
         super().start(warm=warm, tolerance=tolerance)
         self._fresh, self._searches = True, False
+
+    def begin_ahead(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria) -> float | None:
+        """Begin a solve, and take steps, without the host, see `MultigridWorkspace`."""
+        self.correction.prepare()
+        reference = super().begin_ahead(guess, criteria)
+        self._prepared = reference is not None and self.calm is not None and self.correction.slots > 0
+        return reference
+
+    def is_calm(self) -> bool:
+        """Return whether there is no correction, which a GPU may go on without."""
+        return self.calm is not None and self.correction.slots == 0
+
+    def note_free_set(self, launch: Launch) -> None:
+        """Launch what `LowRankCorrection.renew` reads."""
+        self.correction.note(launch)
+
+    def note_correction(self) -> None:
+        """Launch the products that the correction is made of, for the free set as it is."""
+        if self.correction.slots:
+            self.correction.note_products()
+
+    def prepare_correction(self) -> None:
+        """Launch the potentials of the last solve's columns for the free set as it is, and their products."""
+        if self.calm is not None and self.correction.slots:
+            self.hierarchy.rebuild_changed()
+            self.correction.make_potentials()
 
     def crawls(self) -> bool:
         """Take note of the pace; bodies have no part in the grid's matrix, so it is Newton's steps that take over."""
@@ -115,7 +152,7 @@ class CoupledWorkspace(MultigridWorkspace):
     def _begin_cycles(self, count: int) -> None:
         self._cycles_left = count
         self._forget()
-        self.residual.classify = False
+        self.residual.classify = self.free_set_noted = False
         self._evaluation.run(self.x, variant=(False, *self.problem_key()))
         self.residual.read()
 
@@ -123,6 +160,7 @@ class CoupledWorkspace(MultigridWorkspace):
         if not self.exact:
             super()._move_monotonely(safe, launch)
             return
+        assert self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle  # made now, not among recorded launches
         self._monotone.run(safe, variant=(self.residual.classify, *self.problem_key()))
 
     def _launch_monotone(self, safe: bool) -> None:
@@ -142,6 +180,7 @@ class CoupledWorkspace(MultigridWorkspace):
             newton.begin(self.x, self._tolerance)
         self._store()
         self._past += 1
+        self.free_set_noted = False
         done = newton.step()
         wp.copy(self.x, newton.work.x)
         self.residual.evaluate(self.x)
@@ -154,7 +193,8 @@ class CoupledWorkspace(MultigridWorkspace):
         if not (stale or self._fresh) or self._cycles_left > 0:
             return
         begins, self._fresh = self._fresh, False
-        if self.correction.renew(begins=begins):  # its right-hand side was overwritten
+        noted, self.free_set_noted = self.free_set_noted, False
+        if self.correction.renew(begins=begins, noted=noted, made=noted and self._prepared):  # its right-hand side was overwritten
             self._evaluation.run(self.x, variant=(self.residual.classify, *self.problem_key()))
             if self.floating is not None:
                 self._project()

@@ -171,6 +171,9 @@ class MultigridWorkspace(IterateMemory):
     """
 
     residual: AssessedResidual
+    readings: tuple[Reading, ...] = ()  # that evaluations leave besides the residual's
+    calm: wp.array[Any] | None = None  # int32 on a GPU, whether it may follow the free set alone; None: it always may
+    free_set_noted = False  # whether `note_free_set` has been launched for the free set as it is
 
     def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid, *, shifted: bool = False) -> None:
         precision = Precision(settings.precision)
@@ -216,6 +219,24 @@ class MultigridWorkspace(IterateMemory):
         reference = self._ahead.begin(guess, criteria, min(self._allowed, FIRST))
         self._begun = reference is not None
         return reference
+
+    @property
+    def begins_ahead(self) -> bool:
+        """Whether a GPU can begin a solve without the host."""
+        return self._ahead is not None and self.A.device.is_cuda
+
+    def is_calm(self) -> bool:
+        """Return whether a GPU may take steps that follow the free set as long as `calm` says so."""
+        return False
+
+    def note_free_set(self, launch: Launch) -> None:
+        """Launch on a GPU what the host has to know of the free set before the next step."""
+
+    def note_correction(self) -> None:
+        """Launch on a GPU what the host has to know of a correction of the cycle."""
+
+    def prepare_correction(self) -> None:
+        """Launch on a GPU what the first step of a solve needs if the host finds what it did in the last one."""
 
     @property
     def exact(self) -> bool:

@@ -11,6 +11,19 @@ for (int e = 0; e < count[0]; ++e) {
     squares[rank + blocks[e]] += 1;
     for (int q = 0; q < width; ++q) { EXACT_MATH const double u = (double)values[(long long)e*width + q]; squares[blocks[e]*width + q] += u*u; } }
 
+// kernel low_rank_correction.squares_by_turns: The same, a column of sums each, by many threads
+//   compute    float64
+//   whole      int32 entry_rows, blocks; V values; int32 count; D d
+//   numbers    int width, rank
+//   sums       first
+double* sums = given.out.data + P.t; const int last = count[0], all = rank + rank/width;
+if (!P.more) for (int q = 0; q < all; ++q) sums[q*places] = 0;
+for (int k = 0; k < n && p + k < last; ++k) {
+    const long long e = p + k; if (d[entry_rows[e]] == 0) continue;
+    sums[(rank + blocks[e])*places] += 1;
+    for (int q = 0; q < width; ++q) { EXACT_MATH const double u = (double)values[e*width + q]; sums[((long long)blocks[e]*width + q)*places] += u*u; } }
+const double first = P.more ? 0 : sums[0];
+
 // kernel low_rank_correction.dots: Products of the fields in slots with r, a column of sums each
 //   compute    S
 //   reads      S r
