@@ -11,10 +11,11 @@ from typing import Any, no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import CellBox, Decomposition, Triple
+from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import exchange, exchanging
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, Task, launch_now
 

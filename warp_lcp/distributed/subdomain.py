@@ -9,11 +9,12 @@ from typing import Any, no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import CellBox, Decomposition
+from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import StarForest, star_forest
 from warp_lcp.distributed.messages import exchange_all, exchanging_all
 from warp_lcp.distributed.waiting import waiting
+from warp_lcp.grid.cell_box import CellBox
 from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows.compiler import forward_kernel
