@@ -6,7 +6,8 @@ import itertools
 import math
 import sys
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
 from typing import Any
 
@@ -36,6 +37,13 @@ class Decomposition:
 
     Raises:
         ValueError: there are more ranks than the grid can be cut for; the same on all ranks.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> from warp_lcp.distributed import Decomposition, Ranks
+        >>> def operator(n):
+        ...     boxes = Decomposition((n, n, n), Ranks.world())
+        ...     return wl.GridPoisson(np.full(boxes.box.counts[::-1], wl.FLUID), decomposition=boxes)
     """
 
     def __init__(
@@ -125,6 +133,44 @@ class Decomposition:
             new.append([-(-m // factor) for m in part])
         nx, ny, nz = (-(-n // f) for n, f in zip(self.counts, factors, strict=True))
         return Decomposition((nx, ny, nz), self.ranks, processes=self.processes, cuts=new, periodic=self.periodic)
+
+    @property
+    def ghosts(self) -> Any:
+        """Halo exchange of operators; None: there is one rank."""
+        return self.halo if self.ranks.size > 1 else None
+
+    @property
+    def across(self) -> Ranks | None:
+        """The ranks, as sums take them; None: there is one."""
+        return self.ranks if self.ranks.size > 1 else None
+
+    def together(self) -> AbstractContextManager[Any]:
+        """Return a block in which an exception of one rank is raised on all."""
+        return self.collective.together()
+
+    def check_operator(self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]) -> None:
+        """Refuse a grid operator that does not fit the boxes; collective.
+
+        Args:
+            shape: of its cells.
+            periodic: its periodic axes.
+            coefficients: numbers, arrays or None, by name.
+
+        Raises:
+            ValueError: the shape is not that of the box, an axis is periodic, a box is one cell thin at a cut, or the kinds of coefficients
+                differ; on all ranks.
+        """
+        with self.together():
+            expected = tuple(reversed(self.box.counts))
+            if any(periodic):
+                raise ValueError("periodic: periodic axes are not supported on several ranks; use one rank")
+            if shape != expected and not (shape == expected[1:] and self.counts[2] == 1):
+                raise ValueError(f"cells has shape {shape}: expected {expected}, the cells of rank {self.ranks.rank}")
+            for axis in self.cut_axes:
+                if min(self.parts[axis]) < 2:
+                    raise ValueError(f"a rank has one cell along {'xyz'[axis]}: boxes of shared operators have at least two")
+        kinds = [(name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items())]
+        self.ranks.agree("the kind of coefficients", kinds)
 
     @cached_property
     def halo(self) -> Any:

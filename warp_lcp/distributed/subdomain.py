@@ -10,7 +10,6 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import StarForest, star_forest
 from warp_lcp.distributed.messages import exchange_all, exchanging_all
 from warp_lcp.distributed.waiting import waiting
@@ -273,10 +272,6 @@ class Subdomain(GridPart):
         nx, ny, nz = self.box.counts
         copy_cells(self.box_of(field), x.reshape((nz + 2, ny + 2, nx + 2))[1:-1, 1:-1, 1:-1])
         self.fill(field)
-
-    def poisson(self, cells: np.ndarray, **coefficients: Any) -> DistributedGridPoisson:
-        """Return the operator of all ranks' problem, of which this one has its box."""
-        return DistributedGridPoisson(self.decomposition, cells, device=self.grid.device, **coefficients)
 
     def gathered(self, box: np.ndarray) -> np.ndarray | None:
         """Return what all ranks have of their boxes, shape (nz, ny, nx), as an array of the whole grid on the root rank; None elsewhere.
