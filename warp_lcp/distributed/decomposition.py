@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.distributed.collective import Collective
+from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
@@ -135,7 +136,7 @@ class Decomposition:
         return Decomposition((nx, ny, nz), self.ranks, processes=self.processes, cuts=new, periodic=self.periodic)
 
     @property
-    def ghosts(self) -> Any:
+    def ghosts(self) -> Halo | None:
         """Halo exchange of operators; None: there is one rank."""
         return self.halo if self.ranks.size > 1 else None
 
@@ -173,10 +174,8 @@ class Decomposition:
         self.ranks.agree("the kind of coefficients", kinds)
 
     @cached_property
-    def halo(self) -> Any:
+    def halo(self) -> Halo:
         """Halo exchange of one ghost layer, shared by all operators on these boxes."""
-        from warp_lcp.distributed.halo import Halo
-
         return Halo(self, 1)
 
     @cached_property

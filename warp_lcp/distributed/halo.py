@@ -6,19 +6,21 @@ import itertools
 import weakref
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import Any, no_type_check
+from typing import TYPE_CHECKING, Any, no_type_check
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.components import GROUND, joined, nodes_of
-from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import exchange, exchanging
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, Task, launch_now
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.decomposition import Decomposition
 
 
 class Halo:
