@@ -199,13 +199,13 @@ class RunAhead:
 
     def steps(self, tolerance: float, left: int) -> bool:
         """Take a step and what follows it, at most `left`; return False, with nothing done, where kernels have yet to be loaded."""
-        work, r = self._work, self._work.residual
+        work = self._work
         if not self._rebuilds:
-            work.rebuild()
+            work.rebuild(classify=True)
         loop = self._loop()
         if loop is None:
             return False
-        given = [int(r.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
+        given = [int(work.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
         self._launch(resume_kernel, [self._judged.array, self._going, self._stale], given)
         loop.run_while(self._going)
         self._take_rows()
@@ -229,7 +229,7 @@ class RunAhead:
             hierarchy.refresh()
             renewed = False
         counted = criteria.counted if isinstance(criteria, MeanCriteria) else None
-        numbers = int(r.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, work.descent.noise
+        numbers = int(work.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, work.descent.noise
         if self._beginning is None or not self._beginning.fits(guess, counted):
             self._beginning = Beginning(work, guess, counted, self._found, self._judge_first)
         for number, value in zip(self._numbers, numbers, strict=True):
@@ -246,10 +246,10 @@ class RunAhead:
         usual = p.bounds.stays and self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
         if not (usual and reference > ORDINARY and RATIOS[0] * size < first < RATIOS[1] * size):
             self.rows.clear()
-            r.stale = True  # nobody knows what the hierarchy is of
+            work.distrust_hierarchy()  # it may be of any free set now
             return None
-        for _ in range(2):
-            r.take(self.rows.popleft(), size)
+        for classified in (False, True):
+            r.take(self.rows.popleft(), size, classified=classified)
         return reference
 
     def forget_guess(self) -> None:
@@ -341,7 +341,6 @@ class Beginning:
         assert self._program is not None
         self._searches.numpy()[0] = self._finder.wanted()
         self._program.run()
-        self._work.residual.classify = True
 
     def run_with(self, loop: Program | None, going: wp.array[Any], *, renewed: bool) -> None:
         """Launch everything on CUDA, and the steps that follow: one graph.
@@ -355,7 +354,6 @@ class Beginning:
         r, p = self._work.residual, self._work.problem
         for changed in (p.bounds, r.square_of_b, self._finder, self._faults):
             changed.changed()
-        r.classify = True
 
     def _launch(self, loop: Program | None, going: wp.array[Any], renewed: bool, searches: bool) -> None:
         """Launch or record everything, with arguments as of `run_with`; `searches`: for floating components."""
@@ -384,8 +382,7 @@ class Beginning:
         work.round_iterate(launch=launch)
         r.launch_square_of_b(launch)
         launch(take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
-        r.classify = False
-        r.assess(x, launch=launch)
+        r.assess(x, classify=False, launch=launch)
         launch(keep_row_kernel, 1, [r.scalars, self._found.array, 0], device=device)
         if isinstance(search, Conditional):
             assert self._program is not None
@@ -399,7 +396,6 @@ class Beginning:
             CONVERT.bind(Rows.of_fields(p.layout), a=self._guess, b=x).launch(launch)
         r.project(x, keep=True, launch=launch)
         work.round_iterate(launch=launch)
-        r.classify = True
-        r.assess(x, launch=launch)
+        r.assess(x, classify=True, launch=launch)
         if work.scratch is not None:
             CLEAR.bind(work.flat, x=work.scratch[1]).launch(launch)
