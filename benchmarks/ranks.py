@@ -31,7 +31,6 @@ from warp_lcp.benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growi
 from warp_lcp.distributed import launch
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.rows.team import VARIABLE
@@ -78,7 +77,7 @@ class Shared:
     def build(self) -> tuple[wl.LCP, wl.ProjectedMultigrid, Any]:
         """Return the problem, the method and its workspace."""
         cells, solver = np.ascontiguousarray(self.part.cells[1:-1, 1:-1, 1:-1]), wl.ProjectedMultigrid()
-        problem = wl.LCP(DistributedGridPoisson(self.decomposition, cells, device=self.device), self.part.b, self.lower)
+        problem = wl.LCP(wl.GridPoisson(cells, decomposition=self.decomposition, device=self.device), self.part.b, self.lower)
         return problem, solver, solver.init(problem)
 
     def sample(self, *, keep: bool) -> None:

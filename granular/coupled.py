@@ -140,13 +140,8 @@ class MomentumWorkspace(StressWorkspace):
         self._leads = False  # whether the device has begun the solve, and takes its steps
         self._news: int | None = None  # where the decisions have the residual of the stresses as they are; None: it is not known
         self._taken = 0  # of the steps done, those that the outer loop knows of
-        self._allowed = 0
 
-    def allow(self, steps: int) -> None:
-        """Limit the steps of the next solve without the host; 0: none."""
-        self._allowed, self._leads, self._news = steps, False, None
-
-    def begin_ahead(self, guess: None, criteria: wl.StoppingCriteria) -> float | None:
+    def begin_ahead(self, guess: None, criteria: wl.StoppingCriteria, steps: int) -> float | None:
         """Begin a solve on the device; return the residual at its start.
 
         None: the host leads.
@@ -154,11 +149,12 @@ class MomentumWorkspace(StressWorkspace):
         Args:
             guess: None: the solve begins with the stresses as they are.
             criteria: when steps are done; the device leads where the tolerance is absolute.
+            steps: of this solve that may be taken without the host.
         """
-        self._leads = self._ahead is not None and self._allowed > 0 and criteria.rtol == 0.0
+        self._leads, self._news = self._ahead is not None and steps > 0 and criteria.rtol == 0.0, None
         if self._ahead is None or not self._leads:
             return None
-        self._ahead.begin(criteria.atol, self._allowed)
+        self._ahead.begin(criteria.atol, steps)
         self._taken = 0
         reference = self._take(kernels.FIRST)
         self._news = kernels.LAST if self.problem.packing.grid.device.is_cuda else None

@@ -10,7 +10,6 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.distributed import hierarchy as shared_hierarchy
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
-from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.hierarchy import DistributedHierarchy
 from warp_lcp.distributed.ranks import Ranks
@@ -81,7 +80,7 @@ def compare(
     boxes = decomposition or Decomposition(counts, ranks)
     axes = {"face_x": 0, "face_y": 1, "face_z": 2}
     mine = {key: part(value, boxes.box, shape, axes.get(key)) for key, value in faces.items()}
-    A = DistributedGridPoisson(boxes, part(cells, boxes.box, shape), device="cpu", **mine)
+    A = wl.GridPoisson(part(cells, boxes.box, shape), decomposition=boxes, device="cpu", **mine)
     own = (part(field, boxes.box, shape) for field in (b, lower, upper))
     problem = wl.LCP(joined(A, columns, boxes.box), *own)
     stopping = wl.StoppingCriteria(rtol=rtol)
@@ -196,7 +195,7 @@ def memory_in_place(ranks):
     full = [scene(shape) for _ in range(4)]
     nz, ny, nx = reversed(boxes.box.counts)
     stored = wp.zeros((nz + 2, ny + 2, nx + 2), dtype=wp.float64, device="cpu")
-    A = DistributedGridPoisson(boxes, part(full[0], boxes.box, shape), device="cpu")
+    A = wl.GridPoisson(part(full[0], boxes.box, shape), decomposition=boxes, device="cpu")
     problem = wl.LCP(A, stored, 0.0)
     work = PM.init(problem)
     for cells in full:
@@ -239,7 +238,7 @@ def legs(ranks):
         boxes, found = Decomposition(shape[::-1], ranks, processes=processes), []
         axes = {"face_x": 0, "face_y": 1, "face_z": 2}
         mine = {key: part(value, boxes.box, shape, axes.get(key)) for key, value in given.items()}
-        A = DistributedGridPoisson(boxes, part(cells, boxes.box, shape), device="cpu", **mine)
+        A = wl.GridPoisson(part(cells, boxes.box, shape), decomposition=boxes, device="cpu", **mine)
         for streams, threads in ((True, 1), (False, 1), (True, 2)):
             wl.set_threads(threads)
             made = make_hierarchy(A.stencil, wp.float64, bounded=True)
@@ -263,16 +262,16 @@ def wrong_input(ranks):
     shape = (32, 18, 18)
     boxes = Decomposition((18, 18, 32), ranks)
     cells, b = (part(field, boxes.box, shape) for field in (scene(shape), rng.standard_normal(shape)))
-    problem = wl.LCP(DistributedGridPoisson(boxes, cells, device="cpu"), b)
+    problem = wl.LCP(wl.GridPoisson(cells, decomposition=boxes, device="cpu"), b)
     for arguments, word in (({"periodic": (True, False, False)}, "periodic"), ({"face_x": np.ones((3, 3, 3))}, "face_x")):
         try:
-            DistributedGridPoisson(boxes, cells, device="cpu", **arguments)
+            wl.GridPoisson(cells, decomposition=boxes, device="cpu", **arguments)
             raise AssertionError(word)
         except ValueError as error:
             assert word in str(error), error
     if ranks.size > 1:
         try:  # on one rank alone
-            DistributedGridPoisson(boxes, cells if ranks.rank else cells[:, :-1], device="cpu")
+            wl.GridPoisson(cells if ranks.rank else cells[:, :-1], decomposition=boxes, device="cpu")
             raise AssertionError("cells")
         except ValueError as error:
             assert "rank 0: cells has shape" in str(error), error

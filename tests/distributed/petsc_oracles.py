@@ -13,7 +13,6 @@ from oracle_problems import BOUNDS, small
 
 import warp_lcp as wl
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.petsc_active_set import PetscActiveSet
 from warp_lcp.distributed.ranks import Ranks
@@ -129,7 +128,7 @@ def shared_problem(problem, ranks, dtype=wp.float64):
             given[name] = mine(given[name], tuple(int(a == axis) for a in range(3)))
     if "shift" in given:
         given["shift"] = mine(given["shift"])
-    A = DistributedGridPoisson(boxes, mine(problem.cells), device="cpu", dtype=dtype, **given)
+    A = wl.GridPoisson(mine(problem.cells), decomposition=boxes, device="cpu", dtype=dtype, **given)
     return boxes, wl.LCP(A, mine(problem.b), mine(problem.lower), mine(problem.upper))
 
 

@@ -136,7 +136,7 @@ def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(d
     work.residual.start(x, keep=False)
     work.residual.evaluate(x)
     work.start(warm=False, tolerance=0.0)
-    work.rebuild()
+    work.rebuild(classify=work.residual.classified)
     correction: LowRankCorrection = work.correction
     finest = work.hierarchy.finest
     rng = np.random.default_rng(59)

@@ -183,8 +183,7 @@ def test_what_the_minimum_map_holds_goes_to_its_bound(precision, periodic):
     residual = work.residual
     residual.start(work.x, keep=False)
     work.x.assign(problem.layout.load(start, wp.float64))
-    residual.classify = True
-    norm = residual.evaluate(work.x)
+    norm = residual.evaluate(work.x, classify=True)
     x, y, d = start.ravel(), A @ start.ravel() + b, np.where(np.diag(A) > 0, np.diag(A), 1.0)
     l, u = lower.ravel(), upper.ravel()
     r = d * (x - np.clip(x - y / d, l, u))

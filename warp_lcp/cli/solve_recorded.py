@@ -153,11 +153,7 @@ def _problem(path: Path, shape: tuple[int, ...], decomposition: Decomposition | 
     cells, b, lower, upper = (kept.pop(name) for name in ("cells", "b", "lower", "upper"))
     kind = wp.float64 if tolerance < FLOAT32_ROUNDING else wp.float32  # less than float32 tells asks for the file's own numbers
     coefficients: dict[str, Any] = {**kept, "device": device, "dtype": kind}
-    if decomposition is None:
-        return LCP(GridPoisson(cells, **coefficients), b, _bound(lower), _bound(upper))
-    from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
-
-    return LCP(DistributedGridPoisson(decomposition, cells, **coefficients), b, _bound(lower), _bound(upper))
+    return LCP(GridPoisson(cells, decomposition=decomposition, **coefficients), b, _bound(lower), _bound(upper))
 
 
 def _bound(values: np.ndarray) -> float | np.ndarray:

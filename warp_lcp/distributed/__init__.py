@@ -1,10 +1,10 @@
 """Grids that are shared by the ranks of MPI: PETSc cuts and exchanges them, the solvers are those of one process."""
 
-from warp_lcp.distributed.decomposition import CellBox, Decomposition
-from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
+from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.petsc_active_set import PetscActiveSet
 from warp_lcp.distributed.petsc_matrix import PetscGrid
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.grid.cell_box import CellBox
 
-__all__ = ["CellBox", "Decomposition", "DistributedGridPoisson", "Halo", "PetscActiveSet", "PetscGrid", "Ranks"]
+__all__ = ["CellBox", "Decomposition", "Halo", "PetscActiveSet", "PetscGrid", "Ranks"]

@@ -6,64 +6,21 @@ import itertools
 import math
 import sys
 import weakref
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from warp_lcp.distributed.collective import Collective
+from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.settings import renamed_method
 
 UNEVEN = 1.125  # the largest part may exceed an even share by this factor, so that cuts lie at multiples of large powers of two
-
-Triple = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class CellBox:
-    """Box of cells from `low` to `high` (exclusive) along x, y, z."""
-
-    low: Triple
-    high: Triple
-
-    @classmethod
-    def of(cls, low: Iterable[int], high: Iterable[int]) -> CellBox:
-        """Return the box between two corners given as any sequences."""
-        (a, b, c), (d, e, f) = low, high
-        return cls((int(a), int(b), int(c)), (int(d), int(e), int(f)))
-
-    @property
-    def counts(self) -> Triple:
-        """Number of cells along x, y, z; 0 if the box is empty."""
-        nx, ny, nz = (max(h - l, 0) for l, h in zip(self.low, self.high, strict=True))
-        return nx, ny, nz
-
-    @property
-    def cells(self) -> int:
-        """Number of cells."""
-        return math.prod(self.counts)
-
-    @property
-    def slices(self) -> tuple[slice, slice, slice]:
-        """Slices of the box in an array (nz, ny, nx) of all cells."""
-        x, y, z = (slice(l, h) for l, h in zip(self.low, self.high, strict=True))
-        return z, y, x
-
-    def grown(self, width: int) -> CellBox:
-        """Return the box enlarged by a number of cells on all sides."""
-        return CellBox.of((l - width for l in self.low), (h + width for h in self.high))
-
-    def common(self, other: CellBox) -> CellBox:
-        """Return the intersection with another box."""
-        return CellBox.of(map(max, self.low, other.low), map(min, self.high, other.high))
-
-    def moved(self, by: Sequence[int], sign: int = 1) -> CellBox:
-        """Return the box shifted by a number of cells along x, y, z, or back."""
-        return CellBox.of(*([a + sign * b for a, b in zip(corner, by, strict=True)] for corner in (self.low, self.high)))
 
 
 class Decomposition:
@@ -81,6 +38,13 @@ class Decomposition:
 
     Raises:
         ValueError: there are more ranks than the grid can be cut for; the same on all ranks.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> from warp_lcp.distributed import Decomposition, Ranks
+        >>> def operator(n):
+        ...     boxes = Decomposition((n, n, n), Ranks.world())
+        ...     return wl.GridPoisson(np.full(boxes.box.counts[::-1], wl.FLUID), decomposition=boxes)
     """
 
     def __init__(
@@ -171,11 +135,47 @@ class Decomposition:
         nx, ny, nz = (-(-n // f) for n, f in zip(self.counts, factors, strict=True))
         return Decomposition((nx, ny, nz), self.ranks, processes=self.processes, cuts=new, periodic=self.periodic)
 
-    @cached_property
-    def halo(self) -> Any:
-        """Halo exchange of one ghost layer, shared by all operators on these boxes."""
-        from warp_lcp.distributed.halo import Halo
+    @property
+    def ghosts(self) -> Halo | None:
+        """Halo exchange of operators; None: there is one rank."""
+        return self.halo if self.ranks.size > 1 else None
 
+    @property
+    def across(self) -> Ranks | None:
+        """The ranks, as sums take them; None: there is one."""
+        return self.ranks if self.ranks.size > 1 else None
+
+    def together(self) -> AbstractContextManager[Any]:
+        """Return a block in which an exception of one rank is raised on all."""
+        return self.collective.together()
+
+    def check_operator(self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]) -> None:
+        """Refuse a grid operator that does not fit the boxes; collective.
+
+        Args:
+            shape: of its cells.
+            periodic: its periodic axes.
+            coefficients: numbers, arrays or None, by name.
+
+        Raises:
+            ValueError: the shape is not that of the box, an axis is periodic, a box is one cell thin at a cut, or the kinds of coefficients
+                differ; on all ranks.
+        """
+        with self.together():
+            expected = tuple(reversed(self.box.counts))
+            if any(periodic):
+                raise ValueError("periodic: periodic axes are not supported on several ranks; use one rank")
+            if shape != expected and not (shape == expected[1:] and self.counts[2] == 1):
+                raise ValueError(f"cells has shape {shape}: expected {expected}, the cells of rank {self.ranks.rank}")
+            for axis in self.cut_axes:
+                if min(self.parts[axis]) < 2:
+                    raise ValueError(f"a rank has one cell along {'xyz'[axis]}: boxes of shared operators have at least two")
+        kinds = [(name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items())]
+        self.ranks.agree("the kind of coefficients", kinds)
+
+    @cached_property
+    def halo(self) -> Halo:
+        """Halo exchange of one ghost layer, shared by all operators on these boxes."""
         return Halo(self, 1)
 
     @cached_property

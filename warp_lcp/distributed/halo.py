@@ -6,17 +6,21 @@ import itertools
 import weakref
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import Any, no_type_check
+from typing import TYPE_CHECKING, Any, no_type_check
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import CellBox, Decomposition, Triple
+from warp_lcp.distributed.components import GROUND, joined, nodes_of
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import exchange, exchanging
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.grid.cell_box import CellBox, Triple
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, Task, launch_now
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.decomposition import Decomposition
 
 
 class Halo:
@@ -77,6 +81,48 @@ class Halo:
             decomposition = self.decomposition.coarser(factors)
             self._coarser[factors] = None if decomposition is None else Halo(decomposition, self.width)
         return self._coarser[factors]
+
+    def join_components(self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray | None:
+        """Join connected components of this rank's cells with those of other ranks; collective.
+
+        Components of boxes that nothing holds are nodes of a graph, whose edges are open faces at cuts; one more node is all that is held.
+
+        Args:
+            number: of the component of each stored cell, flat, from 0; -1: none, or something holds it.
+            held: which stored cells belong to components that something holds, bool.
+            faces: coefficients of the lower faces along x, y, z, stored or one number; 0: closed.
+
+        Returns:
+            The numbers of the joined components that nothing holds on any rank, int32, flat, from 0, -1 elsewhere; None: there are none.
+        """
+        ranks = self.decomposition.ranks
+        first, nodes = nodes_of(ranks, ranks.gather(int(number.max(initial=-1)) + 1))
+        node = np.where(number >= 0, number + first, np.where(held, GROUND, -1)).astype(np.int32)
+        component = joined(ranks, nodes, self._edges(node, faces))
+        floating = component != component[GROUND]
+        if not floating.any():
+            return None
+        names = np.full(nodes, -1, dtype=np.int32)
+        names[floating] = np.unique(component[floating], return_inverse=True)[1]
+        return np.where(number >= 0, names[np.maximum(node, 0)], -1).astype(np.int32)
+
+    def _edges(self, node: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray:
+        """Return the pairs of nodes of this rank and its neighbors between which a face at a cut is open, shape (n, 2)."""
+        found, grid = [], node.reshape(self.shape).copy()
+        for axis in self.decomposition.cut_axes:  # ghost cells at the domain's sides are not written
+            for end in (0, -1):
+                grid[(*[slice(None)] * (2 - axis), end, ...)] = -1
+        self.fill(grid)
+        for axis in self.decomposition.cut_axes:
+            lower = [slice(1, -1)] * 3
+            lower[2 - axis] = slice(0, 1)
+            upper = list(lower)
+            upper[2 - axis] = slice(1, 2)
+            a, b = grid[tuple(lower)].ravel(), grid[tuple(upper)].ravel()
+            face = np.broadcast_to(faces[axis], self.shape)[tuple(upper)].ravel()
+            open_faces = (a >= 0) & (b >= 0) & (face > 0)
+            found.append(np.stack([a[open_faces], b[open_faces]], axis=1))
+        return np.unique(np.concatenate(found), axis=0) if found else np.empty((0, 2), dtype=np.int32)
 
     @cached_property
     def gathering(self) -> Gathering:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
@@ -259,4 +258,5 @@ def _let_go(kept: list[Any]) -> None:
 
 def communicator(A: HasStencil) -> Any:
     """Return PETSc's or mpi4py's communicator of the ranks that share an operator."""
-    return A.decomposition.ranks.comm if isinstance(A, DistributedGridPoisson) else petsc().COMM_SELF
+    decomposition: Any = getattr(A, "decomposition", None)
+    return petsc().COMM_SELF if decomposition is None else decomposition.ranks.comm

@@ -9,11 +9,11 @@ from typing import Any, no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import CellBox, Decomposition
-from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
+from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.halo import StarForest, star_forest
 from warp_lcp.distributed.messages import exchange_all, exchanging_all
 from warp_lcp.distributed.waiting import waiting
+from warp_lcp.grid.cell_box import CellBox
 from warp_lcp.grid.part import GridPart
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows.compiler import forward_kernel
@@ -272,10 +272,6 @@ class Subdomain(GridPart):
         nx, ny, nz = self.box.counts
         copy_cells(self.box_of(field), x.reshape((nz + 2, ny + 2, nx + 2))[1:-1, 1:-1, 1:-1])
         self.fill(field)
-
-    def poisson(self, cells: np.ndarray, **coefficients: Any) -> DistributedGridPoisson:
-        """Return the operator of all ranks' problem, of which this one has its box."""
-        return DistributedGridPoisson(self.decomposition, cells, device=self.grid.device, **coefficients)
 
     def gathered(self, box: np.ndarray) -> np.ndarray | None:
         """Return what all ranks have of their boxes, shape (nz, ny, nx), as an array of the whole grid on the root rank; None elsewhere.

@@ -18,6 +18,7 @@ from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motions, Pose
 from warp_lcp.grid.node_distance import NodeBox, NodeDistances, NodeSampler, ShapeTable, box_near, node_window
 from warp_lcp.grid.placed_mesh import FlatCells, PlacedMesh, tables_of
+from warp_lcp.grid.shared_distance import enter_layers, measure_together
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.solids import Geometry, TriangleMesh
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid
@@ -26,6 +27,7 @@ from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.program import LaunchGraph, clear, copy
 
+CLOSE = 1.0  # cells from a solid within which the sides of a periodic axis must be alike
 NOWHERE: NodeBox = (0, 0, 0), (0, 0, 0)  # a box without nodes
 
 DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
@@ -35,6 +37,7 @@ class CutCells:
     """Cut cells: open fractions of faces and cells beside solids at a time.
 
     Node (k, j, i) is the low corner of stored cell (k, j, i), face (k, j, i) of a component the cell's lower face; 2-D uses plane k = 1.
+    On a rank's part of a grid making it, and `place`, are collective where solids move or periodic axes are cut.
 
     Args:
         grid: the grid.
@@ -73,6 +76,7 @@ class CutCells:
     ) -> None:  # fmt: skip
         self.grid, self.solids, self.open_sides = grid, tuple(solids), open_sides
         self.moves = any(solid.motion is not None for solid in solids)
+        self._differences: dict[int, float] = {}  # between the sides of each periodic axis that is cut [cells]
         self.names = ("domain", *(solid.name for solid in solids))
         self.separating = wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=grid.device)
         self.open, self.wall = grid.faces(), grid.faces(wp.int16)
@@ -258,15 +262,41 @@ class CutCells:
         return [*standing, *(self._placed(place) for place in range(len(self._moving)))]
 
     def _enter(self) -> None:
-        """Enter the distances of the solids that move where they are."""
+        """Enter the distances of the solids that move where they are.
+
+        A mesh takes microseconds a node, so that several processes share its nodes; then it is collective.
+        """
+        placed = {run: self._placed(run) for run in self._runs if isinstance(run, int)}
+        meshes = {run: solid for run, solid in placed.items() if isinstance(solid, TriangleMesh)}
+        layers = measure_together(self._sampler, meshes) if self.grid.part.ranks.size > 1 else {}
         for run in self._runs:
-            if isinstance(run, int):
-                self._sampler.enter(self._nodes, self._moving[run], self._placed(run))
-            else:
+            if not isinstance(run, int):
                 run.enter(self._nodes, self._sampler.snap)
+            elif run in layers:
+                enter_layers(self._nodes, self._moving[run], layers[run])
+            else:
+                self._sampler.enter(self._nodes, self._moving[run], placed[run])
 
     def _join(self) -> None:
-        """Bring distances, and the marks in `base`, to where they are told by other nodes."""
+        """Take distances, and the marks in `base`, beyond the sides of periodic axes that are cut from the ranks there."""
+        part, near = self.grid.part, self._nodes.near
+        if not part.joined:
+            return
+        measured = np.clip(near.numpy(), -CLOSE, CLOSE)
+        part.fill(*self._nodes.arrays, self.base)
+        apart = np.abs(measured - np.clip(near.numpy(), -CLOSE, CLOSE))
+        for axis in part.joined:
+            end = self.grid.domain_counts[axis] + 1 - self.grid.origin[axis]  # the domain's upper side, where the part reaches it
+            self._differences[axis] = float(np.moveaxis(apart, 2 - axis, 0)[end : end + 1].max(initial=0.0))
+
+    def difference(self, axis: int) -> float:
+        """Return by how much the distances at the two sides of a periodic axis differ, as far as solids are near [cells]; collective."""
+        if axis in self._differences:
+            mine = self._differences[axis]
+        else:
+            lines = np.moveaxis(np.clip(self.distance.numpy(), -CLOSE, CLOSE), 2 - axis, 0)
+            mine = float(np.abs(lines[1] - lines[-1]).max())
+        return float(self.grid.part.ranks.max(mine))
 
     def _refresh(self) -> None:
         """Fill everything that follows from the distances."""
@@ -356,5 +386,7 @@ def _runs(grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]) -> Iterat
             continue
         for place in of:
             number, geometry = solids[place]
-            mesh = grid.device.is_cuda and not grid.part.shared and isinstance(geometry, TriangleMesh)
-            yield PlacedMesh(grid, number, geometry, [place]) if mesh else place
+            if grid.device.is_cuda and not grid.part.shared and isinstance(geometry, TriangleMesh):
+                yield PlacedMesh(grid, number, geometry, [place])
+            else:
+                yield place

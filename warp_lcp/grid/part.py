@@ -62,6 +62,7 @@ class GridPart:
     Attributes:
         grid: as given.
         ranks: the processes that work on the grid.
+        decomposition: their boxes of cells; None: there is one process.
         shared: whether there may be others.
         joined: axes without an end that are cut, along which another process goes on beyond the domain's sides.
         cuts: has bit n set if beyond side n of the part, see `warp_lcp.grid.sides`, another process goes on.
@@ -71,6 +72,7 @@ class GridPart:
     cuts = 0
     joined: tuple[int, ...] = ()
     ranks: Any = ONE_PROCESS
+    decomposition: Any = None
 
     def __init__(self, grid: StaggeredGrid) -> None:
         self.grid = grid
@@ -158,5 +160,5 @@ class GridPart:
         convert(x.flatten(), field.flatten())
 
     def poisson(self, cells: np.ndarray, **coefficients: Any) -> GridPoisson:
-        """Return the operator of a problem on the owned cells, whose coefficients are fields of `box_like`, see `GridPoisson`."""
-        return GridPoisson(cells, device=self.grid.device, **coefficients)
+        """Return the operator of all processes' problem on the owned cells; coefficients are fields of `box_like`, see `GridPoisson`."""
+        return GridPoisson(cells, device=self.grid.device, decomposition=self.decomposition, **coefficients)

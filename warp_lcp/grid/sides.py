@@ -138,21 +138,20 @@ class PeriodicSides:
     """Join the sides of axes that have no end.
 
     Of n cells along such an axis, stored with a ring, 0 is cell n again and n + 1 is cell 1; so it is with faces. What particles add up
-    in the ring belongs to the cells and faces that it repeats.
+    in the ring belongs to the cells and faces that it repeats. Along axes that `grid.part` has cut, other ranks fill what lies beyond.
 
     Args:
         grid: the grid.
         endless: axes without an end, of 0 and 2.
-        cut: those of them along which the grid is a part: what lies beyond its sides others bring there.
 
     Attributes:
         axes: those that the grid has from side to side.
         bits: bit n is set if axis n is one of them.
     """
 
-    def __init__(self, grid: StaggeredGrid, endless: Sequence[int], cut: Sequence[int] = ()) -> None:
+    def __init__(self, grid: StaggeredGrid, endless: Sequence[int]) -> None:
         self.grid, self.endless = grid, tuple(endless)
-        self.axes = tuple(axis for axis in endless if axis not in cut)
+        self.axes = tuple(axis for axis in endless if axis not in grid.part.joined)
         self.bits = sum(1 << axis for axis in self.axes)
 
     def wrap(self, *fields: wp.array, launch: Launch = launch) -> None:

@@ -15,7 +15,7 @@ import warp as wp
 from warp_lcp.grid.advection import MARGIN, advect, advect_with_distance, clearance, push_out
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.level_set import whole_cell_capacity
-from warp_lcp.grid.motion import boxes_of, kinks
+from warp_lcp.grid.motion import Motions, boxes_of, kinks
 from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -211,8 +211,7 @@ class WholeCells:
         return self._shapes
 
 
-CLOSE = 1.0  # cells from a solid within which the sides of an axis without an end must be alike
-ALIKE = 1e-2  # cells
+ALIKE = 1e-2  # cells by which solids may differ at the two sides of a periodic axis
 
 
 class CutBoundary:
@@ -221,6 +220,7 @@ class CutBoundary:
     In a step that starts at time t the pressure meets the solids where they are at t, moving as they will until t + dt. Then they move,
     and the particles with them: a particle may go where it is open before or after, and what is then inside a solid is pushed out. So a
     wall that advances pushes what its own velocity has not carried away, and one that retreats can be followed.
+    On ranks making it is collective, and so are `place` and `top_speed` where solids move.
 
     Args:
         grid: the grid.
@@ -243,22 +243,26 @@ class CutBoundary:
         self._counts, self._dt = Reading(grid.device, 3, wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
-        self._motions = cut.motions
-        self._bounds = boxes_of([solid.geometry.bounds() for solid in cut.solids if solid.motion is not None])
+        ranks = grid.part.ranks
+        share = slice(ranks.rank, None, ranks.size)  # of the solids, whose speeds this process looks at
+        self._motions = Motions(cut.motions.motions[share])
+        self._bounds = boxes_of([solid.geometry.bounds() for solid in cut.solids if solid.motion is not None])[share]
         self._size = grid.extent
         self._size[grid.dimension :] = 0.0
-        self.kinks = tuple(time for motion in self._motions.motions for time in kinks(motion))
+        self.kinks = tuple(time for motion in cut.motions.motions for time in kinks(motion))
         if cut.moves:
             cut.accompany(self._keep_distance, self._find_walls)
         self._find_walls()
         self._join_sides()
+        grid.part.fill(*self.placed())
 
     def top_speed(self, time: float, span: float) -> float:
         """Return the largest speed of the solids [m/s] in a time span.
 
         From `time` to `time` + `span` [s].
         """
-        return self._motions.top_speed(self._bounds, self._size, time, span)
+        mine = self._motions.top_speed(self._bounds, self._size, time, span)
+        return float(self.grid.part.ranks.max(mine)) if self.moves else mine
 
     def begin_step(self, time: float, dt: float) -> None:
         """Compute the velocity of the solids from `time` on [s]."""
@@ -315,6 +319,7 @@ class CutBoundary:
             self._time = time
             self.cut.place(time)
             self._join_sides()
+            self.grid.part.fill(*self.placed())
 
     def shapes(self) -> Sequence[Geometry]:
         """Return the solids' shapes where they are."""
@@ -350,15 +355,10 @@ class CutBoundary:
         if self.capacity is not None:
             self.sides.add(self.capacity)
         for axis in self.sides.endless:
-            if self._unlikeness(axis) > ALIKE:
+            if self.cut.difference(axis) > ALIKE:
                 raise ValueError(
                     f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: a solid at one side must continue at the other"
                 )
-
-    def _unlikeness(self, axis: int) -> float:
-        """Return by how much the distances at the two sides of an axis differ, as far as solids are near [cells]."""
-        lines = np.moveaxis(np.clip(self.distance.numpy(), -CLOSE, CLOSE), 2 - axis, 0)
-        return float(np.abs(lines[1] - lines[-1]).max())
 
     def _keep_distance(self) -> None:
         """Launch the copy of the distance before the solids move: particles may go where it is open before or after."""

@@ -268,6 +268,16 @@ class ComponentFinder:
 
     def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the floating components, or None if there are none; `scratch` as in GridPoisson.floating_components."""
+        A, across = self._A, self._A.layout.across
+        if A._ghosts is not None and across is not None:
+            parent, grounded = self._grow(scratch, A.cells)
+            if not across.any(bool(self._count.numpy()[0])):
+                return None
+            number = self._numbers(parent.numpy(), grounded.numpy())
+            held = (A.cells.numpy() == FLUID).ravel() & (number < 0)
+            faces = [face.numpy() if face.size else one for face, one in zip(A.faces, A.uniform, strict=True)]
+            label = A._ghosts.join_components(number, held, faces)
+            return None if label is None else FloatingComponents(label, A.device, across)
         tell = self.look(scratch)
         if tell():
             return None

@@ -229,8 +229,9 @@ class GridOperator(Pickled):
 
     @property
     def unknowns(self) -> int:
-        """Number of FLUID cells, those of ghosts not counted."""
-        return sum(int(np.count_nonzero(plane == FLUID)) for plane in self.cells.numpy()[1:-1, 1:-1, 1:-1])
+        """Number of FLUID cells, those of ghosts not counted; of all ranks, collective."""
+        count, across = sum(int(np.count_nonzero(plane == FLUID)) for plane in self.cells.numpy()[1:-1, 1:-1, 1:-1]), self.layout.across
+        return count if across is None else int(across.sum(count))
 
     def _take_coefficients(self, cells: np.ndarray, *args: Any, **given: Any) -> None:
         """Check and store what the rows are made from."""

@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_lcp.operators.components import ComponentFinder, FaceCoefficients, FloatingComponents, Scratch
 from warp_lcp.operators.grid_operator import GridOperator, check_coefficients
-from warp_lcp.operators.padded_stencil import PaddedStencil
+from warp_lcp.operators.padded_stencil import CellDecomposition, PaddedStencil
 from warp_lcp.problem.pickling import OnHost, made_again
 from warp_lcp.problem.protocol import AIR, FLUID, SOLID
 from warp_lcp.rows import KernelFile, Rows
@@ -52,13 +52,17 @@ class GridPoisson(GridOperator):
             Face coefficients and shift may also be given in the padded shape (nz + 2, ny + 2, nx + 2), as wp.array of type `dtype` on
             the operator's device, a face's coefficient with the cell above it: they are then used in place and read again by `update`.
         periodic: whether x, y, z wrap around.
+        decomposition: boxes of cells, one a rank (`warp_lcp.distributed.Decomposition`). All arguments and fields are then those of this
+            rank's box, coefficients of its upper faces included. An `LCP` with the operator is one problem of all ranks, and making it
+            and `wl.solve` are collective: each rank gets its box of x, and status, residual and history of the whole.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 unequal coefficients and their sums are rounded, so that the
             problem solved is another one by about 1e-7 of the diagonal: for closed domains with such coefficients take wp.float64, and
             for tolerances below the rounding, where the status is FLOOR. Equal coefficients without a shift are not rounded.
 
     Raises:
-        ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names it.
+        ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names it. With a decomposition, on all
+            ranks, also if the kinds of arguments differ, an axis is periodic, or a box is one cell thin at a cut.
 
     Example:
         >>> import numpy as np, warp_lcp as wl
@@ -72,9 +76,16 @@ class GridPoisson(GridOperator):
     def __init__(
         self, cells: Any, *, face_x: Face = 1.0, face_y: Face = 1.0, face_z: Face = 1.0, shift: Any = None,
         periodic: tuple[bool, ...] = (False, False, False), device: Any = None, dtype: Any = wp.float32,
+        decomposition: CellDecomposition | None = None,
     ) -> None:  # fmt: skip
-        coefficients = {"face_x": face_x, "face_y": face_y, "face_z": face_z, "shift": shift}
-        super().__init__(cells, coefficients, periodic, device, dtype)
+        coefficients, self.decomposition = {"face_x": face_x, "face_y": face_y, "face_z": face_z, "shift": shift}, decomposition
+        if decomposition is None:
+            super().__init__(cells, coefficients, periodic, device, dtype)
+            return
+        decomposition.check_operator(np.shape(cells), periodic, coefficients)
+        self._ghosts, self._across = decomposition.ghosts, decomposition.across
+        with decomposition.together():
+            super().__init__(cells, coefficients, periodic, device, dtype)
 
     def _take_coefficients(self, cells: np.ndarray, *, face_x: Face, face_y: Face, face_z: Face, shift: Any) -> None:
         given = (face_x, face_y, face_z if cells.ndim == 3 else 1.0)
@@ -144,11 +155,8 @@ class GridPoisson(GridOperator):
     def component_finder(self) -> ComponentFinder:
         """Finder of floating components."""
         if self._finder is None:
-            self._finder = self._component_finder()
+            self._finder = ComponentFinder(self)
         return self._finder
-
-    def _component_finder(self) -> ComponentFinder:
-        return ComponentFinder(self)
 
     @property
     def form(self) -> Hashable | None:

@@ -8,6 +8,8 @@ not, whose `Pattern` says what neighbors there are.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +23,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.layout import Pattern, check_memory, put, stencil_struct
 from warp_lcp.rows.program import Launch, Task, launch_now
+from warp_lcp.rows.vectors import Across
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/stencil_operator.h")
 PRODUCT = KERNELS["stencil.product"]
@@ -83,6 +86,38 @@ class Ghosts(Protocol):
 
     def coarser(self, factors: tuple[int, int, int]) -> Ghosts | None:
         """Return what fills those of aggregates of so many cells along x, y, z; None if aggregates would be cut."""
+
+    def join_components(self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray | None:
+        """Join connected components of this process's cells with those of others; collective.
+
+        Args:
+            number: of the component of each stored cell, flat, from 0; -1: none, or something holds it.
+            held: which stored cells belong to components that something holds, bool.
+            faces: coefficients of the lower faces along x, y, z, stored or one number; 0: closed.
+
+        Returns:
+            The numbers of the joined components that nothing holds on any process, int32, flat, from 0, -1 elsewhere; None: there are none.
+        """
+
+
+class CellDecomposition(Protocol):
+    """Boxes of cells, of which each process has one: `warp_lcp.distributed.Decomposition`.
+
+    Attributes:
+        ghosts: fills ghost cells; None: there is one process.
+        across: the other processes; None: there are none.
+    """
+
+    @property
+    def ghosts(self) -> Ghosts | None: ...  # noqa: D102
+    @property
+    def across(self) -> Across | None: ...  # noqa: D102
+
+    def together(self) -> AbstractContextManager[Any]:
+        """Return a block in which an exception of one process is raised on all."""
+
+    def check_operator(self, shape: tuple[int, ...], periodic: Sequence[bool], coefficients: Mapping[str, Any]) -> None:
+        """Refuse an operator that does not fit the box, or is not of the same kind on all processes; collective."""
 
 
 @dataclass

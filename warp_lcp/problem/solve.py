@@ -147,11 +147,14 @@ class Workspace(Protocol):
 class BeginsAhead(Protocol):
     """A workspace whose device may begin a solve, and go on, before the host knows of it."""
 
-    def allow(self, steps: int) -> None:
-        """Say how many steps of the next solve may be taken without the host."""
+    def begin_ahead(self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int) -> float | None:
+        """Begin a solve; return the residual that tolerances refer to, None where nothing has begun. `start` comes next, then steps.
 
-    def begin_ahead(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria) -> float | None:
-        """Begin at a guess; return the residual at clip(0, l, u), None where nothing has begun. `start` comes next, then steps."""
+        Args:
+            guess: stored field; None: there is none.
+            criteria: of the solve.
+            steps: of this solve that may be taken without the host.
+        """
 
 
 class IterateMemory:
@@ -349,19 +352,19 @@ class _Loop:
 
     def _begun_in_place(self) -> float | None:
         """Begin on the device where the iterate is; return the residual there, None where it has not begun."""
-        work: Any = self.work
-        return work.begin_ahead(None, self.criteria) if self._lets_device_lead(work) else None
+        return self._begin_ahead(None)
 
-    def _lets_device_lead(self, work: Any) -> bool:
-        """Tell a workspace how many steps its device may take without the host; return whether it may take any.
+    def _begin_ahead(self, x0: Array | None) -> float | None:
+        """Let the device begin, where a workspace lets it take steps without the host; return as `BeginsAhead.begin_ahead`.
 
         With a callback, merits or a deadline the host takes each step.
         """
+        work: Any = self.work
         if not hasattr(work, "begin_ahead"):
-            return False
+            return None
         watched = self.callback is not None or self.stopping.merits or self.deadline.ends != math.inf
-        work.allow(0 if watched else self.stopping.max_iterations)
-        return not watched
+        guess = None if x0 is None or watched else self.problem.layout.load(x0, wp.float64, "x0")
+        return work.begin_ahead(guess, self.criteria, 0 if watched else self.stopping.max_iterations)
 
     def _refer(self, reference: float | None = None) -> None:
         """Take the residual at the start that tolerances refer to; None: that of the iterate."""
@@ -463,8 +466,12 @@ class _LoopInBox(_Loop):
 
     def _begin(self, x0: Array | None) -> SolveStatus | None:
         """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
-        work: Any = self.work
-        if self._lets_device_lead(work) and self._begin_ahead(work, x0):
+        reference = self._begin_ahead(x0)
+        if reference is not None:
+            self.warm = True
+            self._refer(reference)
+            self._record(0, Step("start", 0))
+            self._keep(0)
             return None
         x, residual = self.work.x, self.residual
         guess = None if x0 is None else self._guess(x0)
@@ -494,19 +501,6 @@ class _LoopInBox(_Loop):
         self._record(0, Step("start", 0))
         self._keep(0)
         return SolveStatus.INFEASIBLE if lost > self.tolerance else None
-
-    def _begin_ahead(self, work: BeginsAhead, x0: Array | None) -> bool:
-        """Begin on the device; return whether it has begun."""
-        if x0 is None:
-            return False
-        reference = work.begin_ahead(self.problem.layout.load(x0, wp.float64, "x0"), self.criteria)
-        if reference is None:
-            return False
-        self.warm = True
-        self._refer(reference)
-        self._record(0, Step("start", 0))
-        self._keep(0)
-        return True
 
     def _merits(self) -> Merits | None:
         """Return the merit functions at the iterate, if they are asked for."""

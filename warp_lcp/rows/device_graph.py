@@ -22,7 +22,7 @@ from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.joined import settle, waits
 from warp_lcp.rows.layout import RowLayout, make_struct, threads
 from warp_lcp.rows.memory import ARRAY_BYTES, LAYOUT_BYTES, Scalar, value_of
-from warp_lcp.rows.program import Conditional, DeviceCopy, Loop, Program, Task
+from warp_lcp.rows.program import Conditional, DeviceCopy, Loop, NotRecordable, Program, Task
 
 ALIGNED = 16  # bytes
 FIRST = "tasks_"  # member of a kernel's arguments: number of its tasks
@@ -36,10 +36,6 @@ if wp.int64((plane_ * given_[0].{{0}}.rows + row_) * given_[0].{{0}}.chunks + ch
     return
 """,
 }
-
-
-class NotRecordable(Exception):
-    """What a graph of CUDA cannot hold: a task of the host, a copy of a replaced array."""
 
 
 @forward_kernel(module="warp_lcp.device_graph")

@@ -467,6 +467,10 @@ def _identity(argument: Any) -> Hashable:
 MOST_RECORDED = 32  # sequences of a graph
 
 
+class NotRecordable(Exception):
+    """What a graph of CUDA cannot hold: a task of the host, a copy of a replaced array."""
+
+
 class LaunchGraph:
     """What a step launches between two decisions of the host: recorded at the first run, on the CPU then one native call.
 
@@ -481,6 +485,7 @@ class LaunchGraph:
     """
 
     on_device: ClassVar[bool] = os.environ.get("WARP_LCP_STEP_GRAPHS") == "1"  # whether CUDA graphs are captured: not yet run on a GPU
+    device_program: ClassVar[Any]  # makes the recording of a device: `device_graph.DeviceProgram`, set by `warp_lcp.rows`
     verify: ClassVar[bool] = False  # whether each run records again and compares with the first recording, for tests
 
     def __init__(self, device: wp.Device, record: Callable[..., None], *, at_once: bool = False) -> None:
@@ -529,9 +534,7 @@ class LaunchGraph:
             with recording(program):
                 self._record(*arguments)
             return program
-        from warp_lcp.rows.device_graph import DeviceProgram, NotRecordable
-
-        on_device = DeviceProgram(self.device)
+        on_device = LaunchGraph.device_program(self.device)
         try:
             with recording(on_device):
                 self._record(*arguments)

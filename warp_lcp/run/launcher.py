@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warp_lcp.run.devices import Engine, choose_device
+from warp_lcp.run.devices import choose_device
 from warp_lcp.run.folder import OutputError, RunRecord
 from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
 from warp_lcp.run.loop import RunRequest, run_scene
@@ -103,23 +102,3 @@ class Launcher:
 def default_folder(scene: Scene) -> Path:
     """Return the folder of a scene's run where none is given."""
     return Path("out") / scene.scene.name
-
-
-@contextmanager
-def launcher_of(engine: Engine, *, rank_timeout: float) -> Iterator[Launcher]:
-    """Give the launcher of a command.
-
-    Args:
-        engine: what carries it.
-        rank_timeout: seconds that one of several ranks may keep the others waiting; 0: any.
-
-    Raises:
-        EngineError: the engine cannot be used here.
-    """
-    if engine is Engine.SINGLE:
-        yield Launcher()
-        return
-    from warp_lcp.run.rank_launcher import ranks_together  # needs MPI and PETSc
-
-    with ranks_together(rank_timeout) as launcher:
-        yield launcher

@@ -124,6 +124,10 @@ class MinimumMapNewton(Settings):
             return DirectNewtonWorkspace(problem, self)
         if self.safeguard and takes_points(problem.A):
             return GridNewtonWorkspace(problem, problem.A, self)
+        return self.safeguarded(problem)
+
+    def safeguarded(self, problem: LCP) -> NewtonWorkspace:
+        """Return a workspace of safeguarded steps, for any operator that the method takes."""
         return NewtonWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:

@@ -220,13 +220,11 @@ class DirectNewtonWorkspace(IterateMemory):
 
     def _hand_over(self, x: wp.array[Any]) -> None:
         """Let safeguarded steps go on from the best iterate."""
-        from warp_lcp.solvers.minimum_map_newton import NewtonWorkspace
-
         self.restore()
         self._grace = IDLE
         self.residual.evaluate(x)
         self.residual.current = False
-        self.rest = NewtonWorkspace(self.problem, self.settings)
+        self.rest = self.settings.safeguarded(self.problem)
         self.rest.x, self.rest.residual, self.rest.floating = self.x, self.residual, self.floating
         self.rest.start(warm=self._warm, tolerance=self._target)
 

@@ -88,7 +88,7 @@ class GridNewtonWorkspace(MultigridWorkspace):
         self._norms, self._target = [], tolerance
         if self._serves:  # who shares the hierarchy may have written its finest diagonal since it was coarsened
             self.hierarchy.finest.changed.fill_(1)
-            self.residual.stale = True
+            self.distrust_hierarchy()
         super().start(warm=warm, tolerance=tolerance)
 
     def wants_monotone_cycle(self) -> bool:
@@ -112,7 +112,7 @@ class GridNewtonWorkspace(MultigridWorkspace):
         while True:
             self.truncated_step()
             iterations += 1
-            if residual.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations or time_is_up():
+            if self.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations or time_is_up():
                 break
             least, idle = (residual.norm, 0) if residual.norm < least else (least, idle + 1)
             if idle >= IDLE and self._rounded is not None:  # what rounding x to float32 leaves
@@ -127,8 +127,7 @@ class GridNewtonWorkspace(MultigridWorkspace):
         residual = self.residual
         residual.set(engine.STEP, 0.0)
         residual.set(engine.SIZE, residual.norm)
-        residual.classify = True
-        residual.evaluate(self.x)
+        residual.evaluate(self.x, classify=True)
 
     def _creeps(self) -> bool:
         """Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard has the word."""

@@ -77,12 +77,18 @@ class MPRGP(Settings):
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
-    def init(self, problem: LCP) -> MPRGPWorkspace:
+    def init(self, problem: LCP, system: SparseSystem | None = None) -> MPRGPWorkspace:
         """Return a workspace.
+
+        Args:
+            problem: the problem.
+            system: a sparse matrix's principal system to share, by a method that has checked A.
 
         Raises:
             ValueError: A is not symmetric, or has a negative diagonal entry.
         """
+        if system is not None:
+            return MPRGPWorkspace(problem, self, system)
         if not problem.A.symmetric:
             raise ValueError(
                 "A is not symmetric: MPRGP minimizes an energy that exists only for a symmetric A; use MinimumMapNewton or Lemke"

@@ -24,6 +24,7 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import Rows
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers.dense_problem import proved_infeasible
+from warp_lcp.solvers.method_table import METHODS
 from warp_lcp.solvers.principal_system import ALL_FREE, ON_FREE, GridSystem, LineSystem
 from warp_lcp.solvers.projected_multigrid_kernels import GAPS, SIZE
 
@@ -154,12 +155,10 @@ class AlgebraicSteps:
     """
 
     def __init__(self, problem: LCP, A: HasStencil, x: wp.array[Any], tolerance: float) -> None:
-        from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton  # which needs this module
-
         self._rows = np.flatnonzero(problem.unknown.numpy() == 1)
         b, lower, upper, start = (field.numpy()[self._rows] for field in (problem.b, problem.lower, problem.upper, x))
         matrix = SparseOperator(grid_matrix(A), device=problem.device, dtype=wp.float64)
-        self._inner = Inner(MinimumMapNewton(precision="double"), LCP(matrix, b, lower, upper))
+        self._inner = Inner(METHODS["minimum-map-newton"](precision="double"), LCP(matrix, b, lower, upper))
         self._inner.begin(start, tolerance, warm=False)
 
     @staticmethod
@@ -188,10 +187,8 @@ class GradientPhase:
     """
 
     def __init__(self, problem: LCP, system: SparseSystem, precision: str) -> None:
-        from warp_lcp.solvers.mprgp import MPRGP, MPRGPWorkspace  # which needs this module
-
-        method = MPRGP(precision=precision)
-        self._inner = Inner(method, problem, MPRGPWorkspace(problem, method, system))
+        method = METHODS["mprgp"](precision=precision)
+        self._inner = Inner(method, problem, method.init(problem, system))
 
     def start(self, x: wp.array[Any], floating: Any, tolerance: float) -> None:
         """Begin at x; `floating` are the operator's floating components."""
@@ -239,8 +236,6 @@ class ProximalPoint:
     """
 
     def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float) -> None:
-        from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet  # whose last resort this is
-
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
         A: Any = problem.A
         self._matrix, self._D = A.rows().matrix(), A.scale()
@@ -249,7 +244,7 @@ class ProximalPoint:
             self._matrix = self._matrix.toarray()
         self._operator: Any = as_operator(self._regularized(), problem.device)
         regularized = LCP(self._operator, self._b, problem.lower.numpy(), problem.upper.numpy())
-        self._inner = Inner(PrimalDualActiveSet(precision="double"), regularized)
+        self._inner = Inner(METHODS["primal-dual-active-set"](precision="double"), regularized)
         self._inner.work.last_resort = False
         self._smallest, self._idle, self._steps, self._near, self._least = residual.norm, 0, 0, 0.0, LEAST
 
@@ -329,10 +324,8 @@ class InteriorSteps:
     """
 
     def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float, *, patience: int = PATH_IDLE) -> None:
-        from warp_lcp.solvers.interior_point import InteriorPoint  # which knows the active-set methods
-
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
-        self._inner = Inner(InteriorPoint(precision="double"), problem)
+        self._inner = Inner(METHODS["interior-point"](precision="double"), problem)
         self._inner.work.residual.start(self._inner.work.x, keep=False)
         self._inner.begin(self._inner.work.x, tolerance, warm=False)
         self._smallest, self._idle, self._patience, self._norms = math.inf, 0, patience, list[float]()

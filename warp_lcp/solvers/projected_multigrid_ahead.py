@@ -209,13 +209,13 @@ class RunAhead:
 
     def steps(self, tolerance: float, left: int) -> bool:
         """Take a step and what follows it, at most `left`; return False, with nothing done, where kernels have yet to be loaded."""
-        work, r = self._work, self._work.residual
+        work = self._work
         if not self._rebuilds:
-            work.rebuild()
+            work.rebuild(classify=True)
         loop = self._loop(rebuilds=self._may_rebuild())
         if loop is None:
             return False
-        given = [int(r.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
+        given = [int(work.stale), min(left, ROWS), tolerance, *work.descent.standing, work.descent.noise]
         for number, value in zip(self._standing, given, strict=True):
             number.value = value
         self._resuming.run(loop, variant=work.program_key())
@@ -248,7 +248,7 @@ class RunAhead:
             hierarchy.refresh()
             renewed = False
         counted = criteria.counted if isinstance(criteria, MeanCriteria) else None
-        numbers = int(r.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, work.descent.noise
+        numbers = int(work.stale), min(left + 2, ROWS), criteria.rtol, criteria.atol, work.descent.noise
         if self._beginning is None or not self._beginning.fits(guess, counted):
             self._beginning = Beginning(work, guess, counted, self._found, self._judge_first)
         for number, value in zip(self._numbers, numbers, strict=True):
@@ -262,17 +262,18 @@ class RunAhead:
         self._take_rows()
         if isinstance(criteria, MeanCriteria) and criteria.count() == 0:  # no unknown counts: there is nothing to solve
             self.rows.clear()
-            r.stale, r.norm = True, 0.0  # of the free set nobody knows
+            work.distrust_hierarchy()  # of the free set nobody knows
+            r.norm = 0.0
             return 0.0
         reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
         usual = p.bounds.stays and self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
         if not (usual and reference > ORDINARY and RATIOS[0] * size < first < RATIOS[1] * size):
             self.rows.clear()
-            r.stale = True  # nobody knows what the hierarchy is of
+            work.distrust_hierarchy()  # it may be of any free set now
             return None
-        for _ in range(2):
-            r.take(self.rows.popleft(), size)
+        for classified in (False, True):
+            r.take(self.rows.popleft(), size, classified=classified)
         return reference
 
     def forget_guess(self) -> None:
@@ -359,7 +360,6 @@ class Beginning:
         assert self._program is not None
         self._searches.numpy()[0] = self._finder.wanted()
         self._program.run()
-        self._work.residual.classify = True
 
     def run_with(self, loop: Program | None, going: wp.array[Any], *, renewed: bool) -> None:
         """Launch everything on CUDA, and the steps that follow: one graph.
@@ -373,7 +373,6 @@ class Beginning:
         r, p = self._work.residual, self._work.problem
         for changed in (p.bounds, r.square_of_b, self._finder, self._faults):
             changed.changed()
-        r.classify = True
 
     def _launch(self, loop: Program | None, going: wp.array[Any], renewed: bool, searches: bool) -> None:
         """Launch or record everything, with arguments as of `run_with`; `searches`: for floating components."""
@@ -404,8 +403,7 @@ class Beginning:
         work.round_iterate(launch=launch)
         r.launch_square_of_b(launch)
         launch(take_unit_kernel, 1, [r.scalars, r.square_of_b.array], device=device)
-        r.classify = False
-        r.assess(x, launch=launch)
+        r.assess(x, classify=False, launch=launch)
         launch(keep_row_kernel, 1, [r.scalars, self._found.array, 0], device=device)
         if isinstance(search, Conditional):
             assert self._program is not None
@@ -419,8 +417,7 @@ class Beginning:
             CONVERT.bind(Rows.of_fields(p.layout), a=self._guess, b=x).launch(launch)
         r.project(x, keep=True, launch=launch)
         work.round_iterate(launch=launch)
-        r.classify = True
-        r.assess(x, launch=launch)
+        r.assess(x, classify=True, launch=launch)
         if device.is_cuda:
             work.note_free_set(launch)
         if work.scratch is not None:

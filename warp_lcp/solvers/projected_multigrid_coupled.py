@@ -45,30 +45,30 @@ class CoupledResidual(AssessedResidual):
         """Take operator and bodies again if they have changed."""
         super().renew()
         if self._low_version != self._low.version:
-            self._low_version, self.stale = self._low.version, True
+            self._low_version, self.free_set = self._low.version, self.free_set + 1
 
     def project(self, x: wp.array[Any], *, keep: bool, launch: Launch = launch_now) -> None:
         """Launch the projection of x, or of 0, onto the bounds; take b, off U's rows."""
         CONVERT.bind(rows_of(self._b), a=self.problem.b, b=self._b).launch(launch)
         super().project(x, keep=keep, launch=launch)
 
-    def assess(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def assess(self, x: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
         """Launch the evaluation, of b + U W U' x first, and correct the energy for that."""
         low = self._low
         low.add(x, self.problem.b, self._b, launch=launch)
-        super().assess(x, launch=launch)
+        super().assess(x, classify=classify, launch=launch)
         inputs = [low.columns.sums, low.weighed, low.rank, self.scalars, low.products.array]
         launch(coupling.subtract_energy_kernel, 1, inputs, device=low.device)
 
-    def read(self) -> float:
+    def read(self, *, classified: bool) -> float:
         """Read what the evaluation found, U'x too."""
         self._low.products.changed()
-        return super().read()
+        return super().read(classified=classified)
 
-    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
         """Launch the step and the evaluation where it ends; U'x is needed between them."""
         self.update(x, direction, launch=launch)
-        self.assess(x, launch=launch)
+        self.assess(x, classify=classify, launch=launch)
 
 
 class CoupledWorkspace(MultigridWorkspace):
@@ -101,10 +101,11 @@ class CoupledWorkspace(MultigridWorkspace):
         super().start(warm=warm, tolerance=tolerance)
         self._fresh, self._searches = True, False
 
-    def begin_ahead(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria) -> float | None:
+    def begin_ahead(self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int) -> float | None:
         """Begin a solve, and take steps, without the host, see `MultigridWorkspace`."""
-        self.correction.prepare()
-        reference = super().begin_ahead(guess, criteria)
+        if guess is not None:
+            self.correction.prepare()
+        reference = super().begin_ahead(guess, criteria, steps)
         self._prepared = reference is not None and self.calm is not None and self.correction.slots > 0
         return reference
 
@@ -152,19 +153,19 @@ class CoupledWorkspace(MultigridWorkspace):
     def _begin_cycles(self, count: int) -> None:
         self._cycles_left = count
         self._forget()
-        self.residual.classify = self.free_set_noted = False
-        self._evaluation.run(self.x, variant=(False, *self.problem_key()))
-        self.residual.read()
+        self.free_set_noted = False
+        self._evaluation.run(self.x, False, variant=self.problem_key())
+        self.residual.read(classified=False)
 
-    def _move_monotonely(self, safe: bool, launch: Launch) -> None:
+    def _move_monotonely(self, safe: bool, classify: bool, launch: Launch) -> None:
         if not self.exact:
-            super()._move_monotonely(safe, launch)
+            super()._move_monotonely(safe, classify, launch)
             return
         assert self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle  # made now, not among recorded launches
-        self._monotone.run(safe, variant=(self.residual.classify, *self.problem_key()))
+        self._monotone.run(safe, classify, variant=self.problem_key())
 
-    def _launch_monotone(self, safe: bool) -> None:
-        super()._move_monotonely(safe, launch_recorded)
+    def _launch_monotone(self, safe: bool, classify: bool) -> None:
+        super()._move_monotonely(safe, classify, launch_recorded)
 
     def _plan_monotone_step(self, launch: Launch) -> None:
         self._sum_products(launch=launch)
@@ -186,21 +187,21 @@ class CoupledWorkspace(MultigridWorkspace):
         self.residual.evaluate(self.x)
         return done
 
-    def rebuild(self) -> None:
+    def rebuild(self, *, classify: bool) -> None:
         """Follow the free set, with the correction too."""
-        stale = self.residual.stale
-        super().rebuild()
+        stale = self.stale
+        super().rebuild(classify=classify)
         if not (stale or self._fresh) or self._cycles_left > 0:
             return
         begins, self._fresh = self._fresh, False
         noted, self.free_set_noted = self.free_set_noted, False
         if self.correction.renew(begins=begins, noted=noted, made=noted and self._prepared):  # its right-hand side was overwritten
-            self._evaluation.run(self.x, variant=(self.residual.classify, *self.problem_key()))
+            self._evaluation.run(self.x, classify, variant=self.problem_key())
             if self.floating is not None:
                 self._project()
 
-    def _launch_evaluation(self, x: wp.array[Any]) -> None:
-        self.residual.assess(x, launch=launch_recorded)
+    def _launch_evaluation(self, x: wp.array[Any], classify: bool) -> None:
+        self.residual.assess(x, classify=classify, launch=launch_recorded)
 
     def _cycle(self) -> None:
         """Run a cycle on the residual."""

@@ -38,8 +38,8 @@ class AssessedResidual(NaturalResidual):
     """The natural residual, evaluated together with the free set and the right-hand side on it.
 
     Attributes:
-        classify: whether unknowns at a bound leave the free set.
-        stale: whether the free set has changed since the hierarchy was built.
+        classified: whether the last evaluation let unknowns at a bound leave the free set; after `start`, whether the next one will.
+        free_set: version of the free set and of the operator: it grows when one of them changes.
         active: unknowns held.
         energy: x'Ax/2 + b'x.
     """
@@ -55,7 +55,7 @@ class AssessedResidual(NaturalResidual):
         self.scalars = self._reading.array
         places = A.stencil.rows.places
         self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=places, across=problem.layout.across)
-        self.classify, self.stale, self.active, self.energy, self._norm_of_b = False, True, 0, 0.0, 0.0
+        self.classified, self.free_set, self.active, self.energy, self._norm_of_b = False, 1, 0, 0.0, 0.0
         self.size = 1.0  # what the right-hand side is divided by
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
@@ -69,7 +69,7 @@ class AssessedResidual(NaturalResidual):
         for bound in (lower, upper, code):
             if ghosts is not None and bound.size:
                 ghosts.fill(bound)  # x's ghost cells will move as the cells do that they stand for
-        self.classify = keep
+        self.classified = keep
         if not keep:
             self._norm_of_b = float(np.sqrt(self.square_of_b.numpy()[0]))
             self.set(kernels.SIZE, self._norm_of_b or 1.0)
@@ -84,31 +84,37 @@ class AssessedResidual(NaturalResidual):
         """Return whether the operator has changed; the caller then refreshes the hierarchy."""
         if self._version == self._A.version:
             return False
-        self._version, self.stale = self._A.version, True
+        self._version, self.free_set = self._A.version, self.free_set + 1
         return True
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
         return self._norm_of_b
 
-    def evaluate(self, x: wp.array[Any]) -> float:
-        """Compute the norm of the natural residual at x, the free set and the right-hand side."""
+    def evaluate(self, x: wp.array[Any], classify: bool | None = None) -> float:
+        """Compute the norm of the natural residual at x, the free set and the right-hand side.
+
+        Args:
+            x: stored field.
+            classify: whether unknowns at a bound leave the free set; None: as in the last evaluation.
+        """
+        classify = self.classified if classify is None else classify
         plain = type(self).assess is AssessedResidual.assess  # others may launch by Warp alone
         with as_one_table(x.device, self.problem.layout.across) if plain else nullcontext():
-            self.assess(x)
-        return self.read()
+            self.assess(x, classify=classify)
+        return self.read(classified=classify)
 
-    def assess(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def assess(self, x: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
         """Launch the evaluation at x; `read` has what it finds."""
         self._A.stencil.wrap(x, launch=launch)
-        kernels.ADVANCE.launch(None, self._assessing(x), launch=launch)
+        kernels.ADVANCE.launch(None, self._assessing(x, classify), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
     def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Launch the step from x along the direction that the cycle's correction gives."""
         self._updating(self._A.stencil.rows, x, direction).launch(launch)
 
-    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = launch_now) -> None:
+    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, classify: bool, launch: Launch = launch_now) -> None:
         """Launch the step and the evaluation where it ends: one launch on the CPU, unless periodic ghost cells must be filled between.
 
         Ghost cells that stand for cells of others take the step by themselves; x's and the correction's are filled.
@@ -116,39 +122,45 @@ class AssessedResidual(NaturalResidual):
         p, s = self.problem, self._A.stencil
         if p.device.is_cuda or any(s.periodic):
             self.update(x, direction, launch=launch)
-            self.assess(x, launch=launch)
+            self.assess(x, classify=classify, launch=launch)
             return
         for axis, end in s.ghosts.cuts if s.ghosts is not None else ():
             self._updating(Rows.beyond(s.padding, p.device, axis, end), x, direction).launch(launch)
-        kernels.ADVANCE.launch(self._updating(s.rows, x, direction), self._assessing(x), launch=launch)
+        kernels.ADVANCE.launch(self._updating(s.rows, x, direction), self._assessing(x, classify), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
     def _updating(self, rows: Rows, x: wp.array[Any], direction: wp.array[Any]) -> Bound:
         bounds = self.problem.bounds.operands
         return kernels.UPDATE.bind(rows, bounds=bounds, x=x, z=self._finest.x, q=direction, scalars=self.scalars)
 
-    def _assessing(self, x: wp.array[Any]) -> Bound:
+    def _assessing(self, x: wp.array[Any], classify: bool) -> Bound:
         p, finest = self.problem, self._finest
         return kernels.ASSESS.bind(
             self._A.stencil.rows, stencil=self._A.stencil, bounds=p.bounds.operands, x=x, b=self._b, unknown=p.unknown,
             free=finest.stencil.d, g=finest.b, changed=finest.changed.flatten(), away=self._away, scalars=self.scalars,
-            classify=self.classify, out=self.sums.partials, MINIMUM_MAP=self._minimum_map, ROUNDED=self._rounded,
+            classify=classify, out=self.sums.partials, MINIMUM_MAP=self._minimum_map, ROUNDED=self._rounded,
         )  # fmt: skip
 
-    def read(self) -> float:
-        """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number."""
+    def read(self, *, classified: bool) -> float:
+        """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number.
+
+        Args:
+            classified: the evaluation's `classify`.
+        """
         self._reading.changed()
         scalars = self._reading.numpy()
-        return self.take([*scalars[:4], scalars[int(kernels.STEP)], scalars[int(kernels.SIZE)]])
+        return self.take([*scalars[:4], scalars[int(kernels.STEP)], scalars[int(kernels.SIZE)]], classified=classified)
 
-    def take(self, row: Iterable[float], norm_of_b: float | None = None) -> float:
+    def take(self, row: Iterable[float], norm_of_b: float | None = None, *, classified: bool) -> float:
         """Take what an evaluation has found, see `projected_multigrid_ahead.keep_row`; return the norm."""
+        self.classified = classified
         square, moved, active, twice, step, size = map(float, row)
         self.energy, self.size = 0.5 * twice, size
         self.norm, self.current, self.active = float(np.sqrt(square)), True, int(active)
         if not math.isfinite(step):
             self.norm = math.nan
-        self.stale = self.stale or moved > 0
+        if moved > 0:
+            self.free_set += 1
         if norm_of_b is not None:
             self._norm_of_b = norm_of_b
         return self.norm
@@ -193,7 +205,17 @@ class MultigridWorkspace(IterateMemory):
         self._tolerance, self._pace = 0.0, Pace(0.0)
         self._algebraic: AlgebraicSteps | None = None
         self._ahead = RunAhead(self) if type(self) is MultigridWorkspace and RunAhead.suits(self) else None
-        self._allowed, self._begun = 0, False  # steps without the host; whether the device has begun the solve
+        self._built = 0  # the version of the free set that the hierarchy has
+        self._budget, self._begun = 0, False  # steps that the device may take without the host; whether it has begun the solve
+
+    @property
+    def stale(self) -> bool:
+        """Whether the free set has changed since the hierarchy was built."""
+        return self._built != self.residual.free_set
+
+    def distrust_hierarchy(self) -> None:
+        """Have the hierarchy built again before the next cycle."""
+        self._built = 0
 
     def forget_solve(self) -> None:
         """Free what only the last solve needed, and the search direction, which no step must see again."""
@@ -202,21 +224,19 @@ class MultigridWorkspace(IterateMemory):
         if self._ahead is not None:
             self._ahead.forget_guess()
 
-    def allow(self, steps: int) -> None:
-        """Say how many steps of the next solve may be taken without the host."""
-        self._allowed = steps
-
-    def begin_ahead(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria) -> float | None:
+    def begin_ahead(self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int) -> float | None:
         """Begin a solve, and take steps, without the host; return the residual at clip(0, l, u), None where nothing has begun.
 
         Args:
-            guess: stored field.
+            guess: stored field; None: the host begins.
             criteria: of the solve.
+            steps: that may be taken without the host in this solve.
         """
-        if self._ahead is None or guess.ptr == self.x.ptr or self._allowed <= 0:
+        self._budget = steps
+        if self._ahead is None or guess is None or guess.ptr == self.x.ptr or steps <= 0:
             return None
         self.floating = None
-        reference = self._ahead.begin(guess, criteria, min(self._allowed, FIRST))
+        reference = self._ahead.begin(guess, criteria, min(steps, FIRST))
         self._begun = reference is not None
         return reference
 
@@ -313,16 +333,13 @@ class MultigridWorkspace(IterateMemory):
         rescale = not 1e-6 < self.residual.norm / self.residual.size < 1e6  # corrections in float32 would overflow, or vanish
         if rescale:
             self.residual.set(kernels.SIZE, self.residual.norm)
+        # unknowns at their bounds leave the free set unless a projected cycle comes next
+        classify = self._cycles_left == 0
         if self.floating is not None:
-            self._classify_next()
-            self.residual.evaluate(self.x)
+            self.residual.evaluate(self.x, classify)
             self._project()
-        elif rescale:
-            self._classify_next()
-            self.residual.evaluate(self.x)
-        elif self._cycles_left == 0 and not self.residual.classify and self.bounded:
-            self.residual.classify = True
-            self.residual.evaluate(self.x)
+        elif rescale or (classify and not self.residual.classified and self.bounded):
+            self.residual.evaluate(self.x, classify)
 
     def crawls(self) -> bool:
         """Return whether cycles have been too slow for the tolerance, above what rounding leaves, where a matrix can be had."""
@@ -341,8 +358,7 @@ class MultigridWorkspace(IterateMemory):
         self._past += 1
         done = self._algebraic.step(self.x)
         self._round(self.x)
-        self.residual.classify = True
-        self.residual.evaluate(self.x)
+        self.residual.evaluate(self.x, classify=True)
         return done
 
     def wants_monotone_cycle(self) -> bool:
@@ -357,34 +373,33 @@ class MultigridWorkspace(IterateMemory):
         """Let projected cycles come next: all unknowns are in their right-hand side."""
         self._cycles_left = count
         self._forget()
-        self.residual.classify = False
-        self.residual.evaluate(self.x)
+        self.residual.evaluate(self.x, classify=False)
 
     def monotone_step(self) -> Step:
         """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
         descent = self.descent
         self._leave()
         self._cycles_left -= 1
-        self._allowed -= 1
+        self._budget -= 1
+        classify = self._cycles_left == 0
         plain = type(self) is MultigridWorkspace and self._ahead is not None  # others read on the way
         with as_one_table(self.problem.device) if plain else nullcontext():
-            self.rebuild()
-            self._classify_next()
-            self._move_monotonely(descent.safe, launch_recorded)
-        self.residual.read()
+            self.rebuild(classify=self.residual.classified)
+            self._move_monotonely(descent.safe, classify, launch_recorded)
+        self.residual.read(classified=classify)
         if self.floating is not None and self._cycles_left == 0:
             self._project()
         descent.weigh(self._judge())
         return Step("monotone cycle", 1, None, interim=descent.sinks)
 
-    def _move_monotonely(self, safe: bool, launch: Launch) -> None:
+    def _move_monotonely(self, safe: bool, classify: bool, launch: Launch) -> None:
         """Launch a projected cycle, or a sweep if `safe`, its step, and the evaluation where that ends."""
         p, finest = self.problem, self.hierarchy.finest
         lo, hi, bounds, scalars = finest.lower, finest.upper, p.bounds.operands, self.residual.scalars
         kernels.GAPS.bind(self.flat, bounds=bounds, x=self.x, unknown=p.unknown, lo=lo, hi=hi, scalars=scalars).launch(launch)
         (self.hierarchy.projected_sweep if safe else self.hierarchy.monotone_cycle).run()
         self._plan_monotone_step(launch)
-        self._advance(launch=launch)
+        self._advance(classify=classify, launch=launch)
 
     def _plan_monotone_step(self, launch: Launch) -> None:
         """Take the projected cycle's correction as it is."""
@@ -396,10 +411,9 @@ class MultigridWorkspace(IterateMemory):
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
         active = self.residual.active
         self._leave()
-        self.residual.classify = True
-        self._allowed -= 1
+        self._budget -= 1
         if not self._has_run_ahead():
-            self.rebuild()
+            self.rebuild(classify=True)
             if self.floating is None:
                 self.step_program().run()
             else:
@@ -407,8 +421,8 @@ class MultigridWorkspace(IterateMemory):
                 self._measure()
                 self.residual.update(self.x, self._p)
                 self._finish_move(self.x)
-                self.residual.assess(self.x)
-            self.residual.read()
+                self.residual.assess(self.x, classify=True)
+            self.residual.read(classified=True)
         if self.floating is not None:
             self._project()
         if self._creeps():
@@ -417,19 +431,19 @@ class MultigridWorkspace(IterateMemory):
 
     def _has_run_ahead(self) -> bool:
         """Let the device take a step, and those that follow it; return whether it has, and take over what came of one."""
-        ahead, left = self._ahead, min(self._allowed + 1, FIRST - self._pace.taken)
+        ahead, left = self._ahead, min(self._budget + 1, FIRST - self._pace.taken)
         if ahead is None or self.floating is not None:
             return False
         starts = left > 0 and (self._rounded is None or self._past == 1)  # from the best iterate, where steps cannot be taken back
         if not (ahead.rows or (starts and ahead.steps(self._tolerance, left))):
             return False
-        self.residual.stale = False
-        self.residual.take(ahead.rows.popleft())
+        self._built = self.residual.free_set
+        self.residual.take(ahead.rows.popleft(), classified=True)
         return True
 
     def _creeps(self) -> bool:
         """Judge a truncated step; return whether a projected cycle should follow."""
-        return self.descent.creeps(self._judge(), moved=self.bounded and self.residual.stale)
+        return self.descent.creeps(self._judge(), moved=self.bounded and self.stale)
 
     def _judge(self) -> float:
         """Let the energy judge the step that has been evaluated; return by how much it has lowered it."""
@@ -444,11 +458,9 @@ class MultigridWorkspace(IterateMemory):
         key = self.program_key()
         program = self._programs.get(key)
         if program is None:
-            program, before = Program(self.A.device), self.residual.classify
-            self._programs[key], self.residual.classify = program, True
+            program = self._programs[key] = Program(self.A.device)
             self._correct(program)
-            self._advance(launch=program.launch)
-            self.residual.classify = before
+            self._advance(classify=True, launch=program.launch)
         return program
 
     def problem_key(self) -> tuple[Any, ...]:
@@ -500,24 +512,24 @@ class MultigridWorkspace(IterateMemory):
         self.residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
 
-    def _advance(self, *, launch: Launch = launch_now) -> None:
+    def _advance(self, *, classify: bool, launch: Launch = launch_now) -> None:
         """Take the planned step and evaluate the residual there."""
         if self.exact:
-            self.residual.advance(self.x, self._p, launch=launch)
+            self.residual.advance(self.x, self._p, classify=classify, launch=launch)
             return
         self.residual.update(self.x, self._p, launch=launch)
         self._round(self.x, launch=launch)
-        self.residual.assess(self.x, launch=launch)
+        self.residual.assess(self.x, classify=classify, launch=launch)
 
-    def rebuild(self) -> None:
-        """Let the hierarchy follow the free set, if that has changed."""
-        if self.residual.stale:
+    def rebuild(self, *, classify: bool) -> None:
+        """Let the hierarchy follow the free set, if that has changed.
+
+        Args:
+            classify: as of the residual's `evaluate`, where the right-hand side has to be made again.
+        """
+        if self.stale:
             self.hierarchy.rebuild_changed()
-            self.residual.stale = False
-
-    def _classify_next(self) -> None:
-        """Unknowns at their bounds leave the free set unless a projected cycle comes next."""
-        self.residual.classify = self._cycles_left == 0
+            self._built = self.residual.free_set
 
     def _forget(self) -> None:
         """Let the next step begin without a search direction."""

@@ -1,0 +1,91 @@
+"""Distances to solids that several processes measure together, each its share of the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.cell_box import CellBox
+from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
+from warp_lcp.grid.node_distance_kernels import claim_nodes
+from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.solids_kernels import block_of
+from warp_lcp.grid.staggered import StaggeredGrid
+
+Layer = tuple[CellBox, np.ndarray]  # nodes of the domain, and the distances [cells] there, shape (nz, ny, nx)
+
+
+def measure_together(sampler: NodeSampler, geometries: Mapping[int, Geometry]) -> dict[int, list[Layer]]:
+    """Measure solids, each process a layer of equally many nodes of each solid; collective.
+
+    Args:
+        sampler: of this process's part of the grid.
+        geometries: the solids where they are, the same on all processes.
+
+    Returns:
+        For each solid the layers of all processes; none where no node of the domain is near.
+    """
+    grid, ranks = sampler.grid, sampler.grid.part.ranks
+    domain = StaggeredGrid(grid.domain_counts, grid.spacing, grid.dimension, grid.device)
+    boxes = {key: box for key, geometry in geometries.items() if (box := nodes_near(domain, geometry)) is not None}
+    found: dict[int, list[Layer]] = {key: [] for key in geometries}
+    if not boxes:
+        return found
+    layers = {key: [layer_of(box, rank, ranks.size) for rank in range(ranks.size)] for key, box in boxes.items()}
+    thickest = {key: of[0].cells for key, of in layers.items()}
+    mine = np.empty(sum(thickest.values()), dtype=np.float32)
+    first = 0
+    for key, of in layers.items():
+        layer = of[ranks.rank]
+        mine[first : first + layer.cells] = _measure(sampler, geometries[key], layer)
+        first += thickest[key]
+    everyone, first = ranks.gather(mine), 0
+    for key, of in layers.items():
+        for layer, distances in zip(of, everyone[:, first : first + thickest[key]], strict=True):
+            found[key].append((layer, distances[: layer.cells].reshape(layer.counts[::-1])))
+        first += thickest[key]
+    return found
+
+
+def layer_of(box: tuple[np.ndarray, np.ndarray], rank: int, ranks: int) -> CellBox:
+    """Return the layer of a box of nodes that a rank measures: across its longest axis, the first one the thickest."""
+    low, high = (corner.copy() for corner in box)
+    axis = int(np.argmax(high - low))
+    thick, end = -(-int(high[axis] - low[axis]) // ranks), high[axis]
+    low[axis] = min(low[axis] + rank * thick, end)
+    high[axis] = min(low[axis] + thick, end)
+    return CellBox.of(low, high)
+
+
+def _measure(sampler: NodeSampler, geometry: Geometry, layer: CellBox) -> np.ndarray:
+    """Return the distances of a solid at a layer of the domain's nodes [cells], flat."""
+    if not layer.cells:
+        return np.empty(0, dtype=np.float32)
+    grid = sampler.grid
+    nx, ny, nz = (max(n - 2, 1) for n in layer.counts)
+    before = (*layer.low[:2], layer.low[2] if grid.dimension == 3 else 0)
+    around = StaggeredGrid((nx, ny, nz), grid.spacing, grid.dimension, grid.device, before, grid.domain_counts)
+    nodes = NodeDistances(around, second=False)
+    sampler.enter(nodes, 1, geometry)
+    return np.asarray(nodes.near.numpy()[layer.moved(before, -1).slices].ravel())
+
+
+def enter_layers(nodes: NodeDistances, number: int, layers: list[Layer]) -> None:
+    """Enter a solid's measured distances where this process's part of the grid has the nodes.
+
+    Args:
+        nodes: where to (updated).
+        number: the solid's, > 0.
+        layers: of `measure_together`.
+    """
+    grid = nodes.grid
+    stored = CellBox((0, 0, 0), grid.shape[::-1]).moved(grid.origin)
+    for layer, distances in layers:
+        common = layer.common(stored)
+        if common.cells:
+            inside, here = common.moved(layer.low, -1), common.moved(grid.origin, -1)
+            given = wp.array(np.ascontiguousarray(distances[inside.slices]).ravel(), dtype=wp.float32, device=grid.device)
+            block = block_of(here.low, here.high, 1.0, grid.dimension, grid.origin)
+            wp.launch(claim_nodes, len(given), [block, given, 0.0, number, nodes.struct], device=grid.device)
