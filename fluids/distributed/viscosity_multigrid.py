@@ -14,10 +14,10 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.hierarchy import GATHERED
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.viscosity_multigrid import LEAST, LevelShift, VectorLevel, VectorMultigrid
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
+from warp_lcp.multigrid.halo_levels import GATHERED
 from warp_lcp.rows.program import Launch, perform
 
 KNOWN = 3  # layers of ghost cells that sweeps need: rows of the second color look at those of the first, where odd cells look at even ones

@@ -101,7 +101,7 @@ class GridSystem(GuardedSystem):
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = zeros_like(self.r) if shifted else None
         # one CPU thread, no ghost cells to fill
-        self.fused = self.hierarchy.open_cycle is not None and A.symmetric and A.stencil.ghosts is None
+        self.fused = self.hierarchy.ends_in_wave and A.symmetric and A.stencil.ghosts is None
         self._iterate_by(self._krylov_method(), self._weight)
         if not A.symmetric and A.stencil.ghosts is None:
             self._guard(partial(MatrixSystem, A, shifted=shifted))
