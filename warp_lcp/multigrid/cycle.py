@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import warp as wp
@@ -123,13 +124,22 @@ class Leg:
 
 @dataclass(frozen=True)
 class Launches:
-    """What a function launches, as a stage of a cycle."""
+    """What a function launches, given `launch=`, as a stage of a cycle."""
 
-    function: Callable[[Launch], object]
+    function: Callable[..., object]
+
+    @classmethod
+    def of_kernel(cls, kernel: Any, dim: int, inputs: list[Any], device: wp.Device) -> Launches:
+        """Return the launch of a Warp kernel."""
+        return cls(partial(_launch_kernel, kernel, dim, inputs, device))
 
     def launch(self, launch: Launch = launch_now) -> None:
         """Launch it now, or record it."""
-        self.function(launch)
+        self.function(launch=launch)
+
+
+def _launch_kernel(kernel: Any, dim: int, inputs: list[Any], device: wp.Device, *, launch: Launch) -> None:
+    launch(kernel, dim, inputs, device=device)
 
 
 @dataclass(frozen=True)
