@@ -219,7 +219,7 @@ class AlgebraicHierarchy:
         last, weights = self.levels[-1], self.settings.weights
         if not self.inverts:  # forth and back, so that the whole is symmetric
             pairs = range(self.settings.last_sweeps)
-            return [s for i in pairs for s in last.pair(weights[:: -1 if i % 2 else 1], from_zero=from_zero and i == 0)]
+            return [s for i in pairs for s in last.pair(weights[::-1] if i % 2 else weights, from_zero=from_zero and i == 0)]
         return [self._multiply_by_inverse]
 
     @cached_property

@@ -41,12 +41,11 @@ class CycleLevel(Protocol):
     """Problem (1) on one level, and its transfers from and to the next coarser one.
 
     Smoothing and transfer come together, since a CPU passes through memory once for both.
-
-    Attributes:
-        visits: cycles on this level in each cycle on the next finer one; of no meaning on the coarsest.
     """
 
-    visits: int
+    @property
+    def visits(self) -> int:
+        """Cycles on this level in each cycle on the next finer one; see `CoarsestSolver` for the coarsest."""
 
     def descend(self, coarse: Any, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
         """Return steps 1 and 2; x is taken for 0 if `from_zero`."""

@@ -60,7 +60,8 @@ class Hierarchy:
         self.finest.shrunk = shrunk
         while not self._is_coarsest(self.levels[-1]):
             self.levels.append(self._coarser(self.levels[-1], bounded=bounded))
-        self._first_small, self._small = len(self.levels), None
+        self._first_small = len(self.levels)
+        self._small: FusedCoarseLevels | None = None
         self._gathered: Hierarchy | None = None
         solve = self._coarsest_solver() if stencil.ghosts is None else self._gather(bounded=bounded)
         self.cycles = {projected: Cycle(self.levels[: self._first_small + 1], solve, projected) for projected in (False, True)}
