@@ -12,7 +12,7 @@ from multigrid.test_aggregates import convection_diffusion
 from multigrid.test_hierarchy import aggregation, masked_hierarchy
 from oracle import assemble
 from warp_lcp.multigrid import CycleSettings
-from warp_lcp.multigrid.aggregates import AggregateCycles
+from warp_lcp.multigrid.aggregates import MonotoneAggregation
 from warp_lcp.multigrid.algebraic import AlgebraicHierarchy
 from warp_lcp.multigrid.cycle import Cycle, GatheredLevel
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
@@ -170,7 +170,7 @@ def test_a_cycle_on_aggregates_is_the_plain_loop():
     """A bounded problem, three visits of each level, from an iterate that is not 0."""
     n, rng = 20, np.random.default_rng(5)
     host = convection_diffusion(n, 10.0)
-    cycles = AggregateCycles(wl.SparseOperator(host, device="cpu"))
+    cycles = MonotoneAggregation(wl.SparseOperator(host, device="cpu"))
     assert cycles.refresh()
     prolongations = []
     for level in cycles._levels[:-1]:

@@ -8,7 +8,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.stencil_level import StencilLevel
-from warp_lcp.multigrid.turning import TurningHierarchy, make_hierarchy, turns
+from warp_lcp.multigrid.turning import MultipleSemicoarsening, make_hierarchy, turns
 
 AXES = ("face_x", "face_y", "face_z")
 
@@ -200,7 +200,7 @@ def test_ways_found():
 def made(A, settings=None):
     """Return the hierarchy of an operator, coarsened for all its cells."""
     hierarchy = make_hierarchy(A.stencil, wp.float64, bounded=True, settings=settings)
-    assert isinstance(hierarchy, TurningHierarchy)
+    assert isinstance(hierarchy, MultipleSemicoarsening)
     assert len(hierarchy.companions) == 2
     hold(A, hierarchy, A.cells.numpy().ravel() == wl.FLUID)
     return hierarchy

@@ -169,7 +169,7 @@ class AggregateLevel:
         return Launches.of_kernel(kernel, dim, inputs, self.A.device)
 
 
-class AggregateCycles:
+class MonotoneAggregation:
     """Projected W-cycles: sweeps within the bounds, and corrections of whole aggregates within their members' gaps (Kornhuber 1994).
 
     A coarse unknown may move by what its most confined member may, so that no bound is overstepped and nothing need be projected

@@ -121,7 +121,7 @@ class Hierarchy:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the levels [bytes], the gathered ones too, without shared weights of the finest one."""
+        """Memory of all levels [bytes], without shared weights of the finest one."""
         return sum(level.nbytes for level in self.levels) + (0 if self._gathered is None else self._gathered.nbytes)
 
     def refresh(self) -> None:
@@ -142,7 +142,10 @@ class Hierarchy:
 
     @property
     def knows_changes(self) -> bool:
-        """Whether `refresh` finds the changed rows, by launches that can be recorded; no process knows those of others."""
+        """Whether `refresh` finds the changed rows, by launches that can be recorded.
+
+        On several processes none knows what others have changed.
+        """
         s = self.finest.stencil
         return s.spans is not None and s.pattern is None and s.ghosts is None
 
@@ -236,7 +239,10 @@ class Hierarchy:
 
     @property
     def ends_in_wave(self) -> bool:
-        """Whether the last leg of a linear cycle is one pass through memory, with which a caller may fuse more."""
+        """Whether the last leg of a linear cycle is one pass through memory.
+
+        A caller may then fuse more with it, see `cycle_with`.
+        """
         return len(self.cycles[False].levels) > 1 and self.finest.fuses
 
     def cycle_with(self, wave: Wave, *more: Bound) -> Program:

@@ -181,7 +181,7 @@ class LineLevel:
         return UP.bind(rows, self.fields, coarse=coarse.x, shares=self.shares, add=add)
 
 
-class LineHierarchy:
+class BlackBoxMultigrid:
     """Multigrid for (P A P + P D P) e = r of a compact stencil in 2-D.
 
     `restrict` takes the free set and the shift, `cycle` makes the finest level's x from its b.

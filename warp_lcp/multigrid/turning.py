@@ -24,7 +24,7 @@ EDGES = {2: 8, 3: 4}  # cells of a block along each long axis: 64 faces an axis,
 SAMPLES = {2: 24, 3: 8}  # the most blocks that are sampled along each axis: 2 ms in all, whatever the grid
 
 
-class TurningHierarchy(Hierarchy):
+class MultipleSemicoarsening(Hierarchy):
     """`Hierarchy` and companions that coarsen other axes first; cycles visit them one after another, forth and back.
 
     Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong axis differs from place to place no
@@ -77,7 +77,7 @@ class TurningHierarchy(Hierarchy):
 def make_hierarchy(stencil: PaddedStencil, real: Any, **options: Any) -> Hierarchy:
     """Return the hierarchy of a stencil; options as of `Hierarchy`."""
     strengths = turns(stencil) if stencil.ghosts is None else []
-    return TurningHierarchy(stencil, real, strengths, **options) if strengths else Hierarchy(stencil, real, **options)
+    return MultipleSemicoarsening(stencil, real, strengths, **options) if strengths else Hierarchy(stencil, real, **options)
 
 
 def turns(stencil: PaddedStencil) -> list[Strength]:
