@@ -34,7 +34,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.fluids.viscosity_bodies import BodyDrag, ViscousWalls, WallPull
-from warp_lcp.fluids.viscosity_multigrid import make_multigrid
+from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.fluids.viscosity_passes import viscous_passes
 from warp_lcp.grid.sides import open_sides_of
 from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window, three_components
@@ -136,7 +136,7 @@ class Viscosity:
         self._slips = wp.array(slips, dtype=wp.float32, device=grid.device)
         self._walls = ~open_sides_of(grid, boundary.open_sides) & (1 << 2 * grid.dimension) - 1
         self._walls_change, self._placed = boundary.moves or sources, False
-        self.multigrid = make_multigrid(grid)
+        self.multigrid = ViscosityMultigrid(grid)
         self._fine = self.multigrid.levels[0]
         size = grid.dimension * grid.size
         self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)

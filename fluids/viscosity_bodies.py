@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 import warp as wp
 
-from warp_lcp.fluids.viscosity_multigrid import VectorLevel
+from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.operators.low_rank import BlockColumns, weigh_kernel
@@ -67,7 +67,7 @@ class WallPull:
         self._owners = wp.array(owners, dtype=wp.int32, device=grid.device)
         self._counts = wp.zeros(grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
-    def take(self, window: Window | None, level: VectorLevel, walls: ViscousWalls, points: np.ndarray) -> None:
+    def take(self, window: Window | None, level: ViscosityLevel, walls: ViscousWalls, points: np.ndarray) -> None:
         """Find `rows`, `blocks` and `values`.
 
         Args:
@@ -184,7 +184,7 @@ class BodyDrag:
         self._response = wp.zeros((rank, rank), dtype=wp.float64, device=grid.device)
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
 
-    def take(self, level: VectorLevel, walls: ViscousWalls, velocity: Sequence[wp.array]) -> None:
+    def take(self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]) -> None:
         """Find what pulls the bodies in a step, and how they answer to the liquid's velocity as it is; arguments as of `WallPull`."""
         block, bodies, dimension = self.boundary.cut.moving_block(), self.bodies.bodies, self.grid.dimension
         window = None if block is None else self.grid.window(*block, grow=1).common(self._solved)

@@ -28,6 +28,7 @@ from warp_lcp.grid.sides import wrap_kernel
 from warp_lcp.grid.transfer import transfer_passes
 from warp_lcp.material.density_correction import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
+from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.rows import Rows
 from warp_lcp.rows.native import sections
 from warp_lcp.rows.pass_form import Form
@@ -60,7 +61,7 @@ def use_every_kernel(reals):
             problem = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), -np.ones(cells.shape))
             for solver in METHODS:
                 assert wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-4))
-            fused = mock.patch.object(Hierarchy, "_fuses", lambda self, level: False)
+            fused = mock.patch.object(StencilLevel, "fuses", False)
             with fused:  # as on CUDA, with small levels apart and together
                 for precision, cycle in itertools.product(("mixed", "double"), (CycleSettings(coarsest_cpu=8), *ONE_LAUNCH)):
                     method = wl.ProjectedMultigrid(precision=precision, cycle=cycle)

@@ -3,17 +3,18 @@
 import sys
 from functools import partial
 from itertools import product
+from unittest import mock
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.distributed import hierarchy as shared_hierarchy
 from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.halo import Halo
-from warp_lcp.distributed.hierarchy import DistributedHierarchy
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.waiting import waiting
+from warp_lcp.multigrid import halo_levels
+from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.rows.program import Task, run_table
 from warp_lcp.rows.team import Table
@@ -216,23 +217,23 @@ def memory_in_place(ranks):
 
 def as_on_devices(ranks):
     """Ghost cells that go through the host's memory, and no leg of a cycle in one pass."""
-    fill, filling, streams = Halo.fill, Halo.filling, DistributedHierarchy._streams
+    fill, filling, fuses = Halo.fill, Halo.filling, StencilLevel.fuses
     Halo.filling = lambda self, field: Task(partial(self.fill, field))
     Halo.fill = lambda self, field: self._fill_through_host(field.reshape(self.shape)) if isinstance(field, wp.array) else fill(self, field)
-    DistributedHierarchy._streams = lambda self, level: False
+    StencilLevel.fuses = False
     cells = scene((34, 21, 40))
     b = rng.standard_normal(cells.shape)
     for method in (PM, NEWTON):
         compare(ranks, "as on a device", cells, b, 0.0, method=method, **coefficients(cells.shape))
-    Halo.fill, Halo.filling, DistributedHierarchy._streams = fill, filling, streams
+    Halo.fill, Halo.filling, StencilLevel.fuses = fill, filling, fuses
 
 
 def legs(ranks):
     """Legs that go through memory once are those that do not, linear and projected, on any cuts and by any number of threads."""
-    shape, gathered = (32, 40, 48), shared_hierarchy.GATHERED
+    shape, gathered = (32, 40, 48), halo_levels.GATHERED
     cells, faces = scene(shape), coefficients(shape)
     free, b, gaps = rng.random(shape) < 0.9, rng.standard_normal(shape), rng.random((2, *shape))
-    shared_hierarchy.GATHERED = 64
+    halo_levels.GATHERED = 64
     cuts = {(1, 1, ranks.size), (1, ranks.size, 1), (ranks.size, 1, 1), Decomposition(shape[::-1], ranks).processes}
     for processes, given in product(sorted(cuts), (faces, {})):
         boxes, found = Decomposition(shape[::-1], ranks, processes=processes), []
@@ -242,19 +243,20 @@ def legs(ranks):
         for streams, threads in ((True, 1), (False, 1), (True, 2)):
             wl.set_threads(threads)
             made = make_hierarchy(A.stencil, wp.float64, bounded=True)
-            made._streams = made._streams if streams else lambda level: False
             made.hold(A.stencil.d, A.layout.load(part(free, boxes.box, shape).astype(np.uint8), wp.uint8))
             made.rebuild_changed()
             for field, values in ((made.finest.b, b), (made.finest.lower, -gaps[0]), (made.finest.upper, gaps[1])):
                 field.assign(A.layout.load(part(np.where(free & (cells == wl.FLUID), values, 0.0), boxes.box, shape), wp.float64))
-            for cycle in (made.cycle, made.cycle, made.monotone_cycle, made.cycle):
+            with mock.patch.object(StencilLevel, "fuses", StencilLevel.fuses if streams else False):
+                cycles = made.cycle, made.cycle, made.monotone_cycle, made.cycle
+            for cycle in cycles:
                 cycle.run()
                 found.append(A.layout.unload(made.finest.x).numpy())
         wl.set_threads(1)
         for once, apart, together in zip(found[:4], found[4:8], found[8:], strict=True):
             assert once.tobytes() == together.tobytes(), processes
             assert np.abs(once - apart).max() <= 1e-13 * ranks.max(np.abs(apart).max()) > 0, processes
-    shared_hierarchy.GATHERED = gathered
+    halo_levels.GATHERED = gathered
 
 
 def wrong_input(ranks):

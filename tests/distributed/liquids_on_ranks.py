@@ -13,7 +13,8 @@ from small_liquids import box
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.fluids.distributed import create, viscosity_multigrid
+from warp_lcp.fluids import viscosity_multigrid
+from warp_lcp.fluids.distributed import create
 from warp_lcp.frames.pieces import one_mesh
 from warp_lcp.frames.vtu import Mesh
 from warp_lcp.material.particle_scene import ParticleScene

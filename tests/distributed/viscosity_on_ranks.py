@@ -8,7 +8,8 @@ import warp as wp
 from small_liquids import create as create_alone
 from viscous_scenes import viscous_scene
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.fluids.distributed import create, viscosity_multigrid
+from warp_lcp.fluids import viscosity_multigrid
+from warp_lcp.fluids.distributed import create
 from warp_lcp.fluids.simulator import LiquidSimulation
 
 SEEDS = (10, 21, 27)  # 3-D and 2-D, cut along rows and across, with two to four shared levels and cores that lie in one box or in both

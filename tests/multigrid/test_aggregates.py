@@ -7,7 +7,7 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import lemke, natural_residual
-from warp_lcp.multigrid.aggregates import AggregateCycles
+from warp_lcp.multigrid.aggregates import MonotoneAggregation
 
 
 def convection_diffusion(n, wind):
@@ -34,7 +34,7 @@ def test_cycles_alone_solve_and_stay_there(wind, dtype, device):
     """More cycles than a CPU graph is recorded after; a coarse bound of the wrong sign or child would overstep or never let go."""
     n = 15
     A, b = convection_diffusion(n, wind), load(n)
-    cycles = AggregateCycles(wl.SparseOperator(A, device=device, dtype=dtype))
+    cycles = MonotoneAggregation(wl.SparseOperator(A, device=device, dtype=dtype))
     assert cycles.refresh()
     expected = lemke(A.toarray(), b)
     assert 30 < np.count_nonzero(expected) < n * n - 30
@@ -50,7 +50,7 @@ def test_boxes_and_the_energy(device):
     n = 20
     A, b, rng = convection_diffusion(n, 0.0), load(n), np.random.default_rng(127)
     low, high = -0.02 * rng.random(n * n), 0.02 * rng.random(n * n)
-    cycles = AggregateCycles(wl.SparseOperator(A, device=device))
+    cycles = MonotoneAggregation(wl.SparseOperator(A, device=device))
     assert cycles.refresh()
     x, right, lower, upper = fields(device, np.clip(0.05 * rng.standard_normal(n * n), low, high), b, low, high)
     energies = []
@@ -71,7 +71,7 @@ def test_an_unknown_in_no_aggregate_is_not_moved_with_one(device):
     A = scipy.sparse.block_array([[scipy.sparse.eye_array(1) * stiff, None], [None, convection_diffusion(n, 0.0)]]).tolil()
     A[0, 1] = A[1, 0] = -coupling
     A, b = A.tocsr(), np.concatenate([[0.0], load(n)])
-    cycles = AggregateCycles(wl.SparseOperator(A, device=device))
+    cycles = MonotoneAggregation(wl.SparseOperator(A, device=device))
     assert cycles.refresh()
     x, right, lower, upper = fields(device, np.zeros(n * n + 1), b, np.full(n * n + 1, -1.0), np.full(n * n + 1, 1.0))
     energies = []
@@ -86,7 +86,7 @@ def test_a_matrix_may_change_and_so_may_the_fields():
     n = 15
     A, b = convection_diffusion(n, 30.0), load(n)
     operator = wl.SparseOperator(A, device="cpu")
-    cycles = AggregateCycles(operator)
+    cycles = MonotoneAggregation(operator)
     for factor, sign in ((1.0, 1.0), (3.0, 1.0), (3.0, -1.0)):
         operator.update(factor * A)
         assert cycles.refresh()
@@ -127,7 +127,7 @@ def test_warm_starts_and_other_matrices_take_none(device):
     again = wl.solve(problem, wl.MinimumMapNewton(), x0=first.x.numpy())
     assert "monotone cycle" not in {r.step for r in again.history}
     plus = scipy.sparse.csr_array(abs(A))  # positive off the diagonal: aggregates would average what alternates
-    assert not AggregateCycles(wl.SparseOperator(plus, device=device)).refresh()
+    assert not MonotoneAggregation(wl.SparseOperator(plus, device=device)).refresh()
     result = wl.solve(wl.LCP(wl.SparseOperator(plus + 4 * scipy.sparse.eye_array(n * n), device=device), b), wl.MinimumMapNewton())
     assert result, result.status
     assert "monotone cycle" not in {r.step for r in result.history}

@@ -8,7 +8,7 @@ import warp_lcp as wl
 from multigrid.test_hierarchy import level_matrix, masked_hierarchy
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
-from warp_lcp.multigrid.small_levels import SmallLevels
+from warp_lcp.multigrid.fused_levels import FusedCoarseLevels
 from warp_lcp.rows import Rows
 from warp_lcp.rows.sequence import CUDA_THREADS
 
@@ -85,7 +85,8 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
     first.b.assign(rng.standard_normal(inside.size) * inside)
     first.lower.assign(-rng.uniform(0, 0.3, inside.size) * inside)
     first.upper.assign(rng.uniform(0, 0.3, inside.size) * inside)
-    rows.cycle(2, wp.launch, projected=projected)
+    for stage in rows.solve(2, projected=projected, from_zero=True):
+        stage.launch(wp.launch)
     expected = first.x.numpy() * inside
     assert np.abs(expected).max() > 0.1
 
@@ -107,9 +108,10 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
     ]
     wp.launch(kernels.invert, 1, inputs, device="cpu")
     np.testing.assert_allclose(hierarchy._dense.inverse.numpy(), inverse, rtol=1e-12)
-    solve = hierarchy._solving._replace(rows=Rows.by_turns(m, first.x.device, m))
-    small = SmallLevels(rows.levels, rows.settings, solve)
-    cycles = small.sequence(2, projected, True)
+    dense = hierarchy._dense
+    dense.product = dense.product._replace(rows=Rows.by_turns(m, first.x.device, m))
+    small = FusedCoarseLevels(rows.levels, dense.solve)
+    (cycles,) = small.solve(2, projected=projected, from_zero=True)
     for threads in (1, 7, 64):
         for level in rows.levels:
             level.x.zero_()
@@ -194,7 +196,7 @@ def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_p
     """Barriers are in the GPU's source only, and no load goes past the cache that sees a block's own writes."""
     cells, free, keywords = problem((8, 12, 10), "arrays")
     hierarchy = masked_hierarchy(cells, free, (True, False, True), "cpu", CycleSettings(**TOGETHER), real, True, **keywords)[1]
-    modules = {hierarchy._small.sequence(1, projected, True).kernel.module.name: 1 for projected in (False, True)}
+    modules = {hierarchy._small.solve(1, projected=projected, from_zero=True)[0].kernel.module.name: 1 for projected in (False, True)}
     modules[hierarchy._small.coarsening.kernel.module.name] = 1
     modules[coarsest_kernels(True, real, real).invert.module.name] = 3  # assembled, eliminated to and fro
     for module, barriers in modules.items():

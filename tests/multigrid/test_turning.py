@@ -7,7 +7,8 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.multigrid import CycleSettings, Hierarchy
-from warp_lcp.multigrid.turning import TurningHierarchy, make_hierarchy, turns
+from warp_lcp.multigrid.stencil_level import StencilLevel
+from warp_lcp.multigrid.turning import MultipleSemicoarsening, make_hierarchy, turns
 
 AXES = ("face_x", "face_y", "face_z")
 
@@ -199,7 +200,7 @@ def test_ways_found():
 def made(A, settings=None):
     """Return the hierarchy of an operator, coarsened for all its cells."""
     hierarchy = make_hierarchy(A.stencil, wp.float64, bounded=True, settings=settings)
-    assert isinstance(hierarchy, TurningHierarchy)
+    assert isinstance(hierarchy, MultipleSemicoarsening)
     assert len(hierarchy.companions) == 2
     hold(A, hierarchy, A.cells.numpy().ravel() == wl.FLUID)
     return hierarchy
@@ -278,7 +279,7 @@ def test_new_cells_in_place(device):
 def test_legs_apart_give_the_same_iterates(monkeypatch):
     strengths = turn(1e-3)
     fused, _ = solved((64, 64), strengths, 0.0)
-    monkeypatch.setattr(Hierarchy, "_fuses", lambda self, level: False)
+    monkeypatch.setattr(StencilLevel, "fuses", False)
     apart, _ = solved((64, 64), strengths, 0.0)
     np.testing.assert_array_equal(apart.x.numpy(), fused.x.numpy())
 

@@ -5,7 +5,7 @@ import pytest
 
 import warp_lcp as wl
 from warp_lcp.benchmarks import problems
-from warp_lcp.multigrid import Hierarchy
+from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.rows import layout, team
 
 BOUNDS = ["none", "walls", "everywhere"]
@@ -103,7 +103,7 @@ def test_convergence_to_ten_digits():
 def test_every_way_to_launch_gives_the_same_iterates(bounds, monkeypatch):
     """Fused legs, sums over slabs of planes and launches without a team change no iteration; the sums alone may round otherwise."""
     _, plain = solve(24, bounds, "multigrid")
-    monkeypatch.setattr(Hierarchy, "_fuses", lambda self, level: False)
+    monkeypatch.setattr(StencilLevel, "fuses", False)
     _, unfused = solve(24, bounds, "multigrid")
     np.testing.assert_array_equal(unfused.x.numpy(), plain.x.numpy())
     monkeypatch.setitem(layout.PLANES_A_THREAD, "cpu", 5)

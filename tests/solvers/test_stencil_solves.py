@@ -8,7 +8,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.multigrid.line_hierarchy import LineHierarchy, takes_points
+from warp_lcp.multigrid.line_hierarchy import BlackBoxMultigrid, takes_points
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.matrix_stencil import stencil_of
 
@@ -131,7 +131,7 @@ def test_coarse_matrices_are_products_of_the_transfers():
     cells = np.where(np.random.default_rng(9).random((21, 30)) < 0.1, wl.AIR, wl.FLUID)
     a = {o: -(1.0 + o[0] + 0.3 * o[1]) for o in itertools.product((-1, 0, 1), repeat=2) if any(o)}
     A = wl.Stencil(cells, {o: v - 0.1 for o, v in a.items()} | {(0, 0): 12.0}, outside=wl.AIR, device="cpu", dtype=wp.float64)
-    hierarchy = LineHierarchy(A.stencil, wp.float64, symmetric=False)
+    hierarchy = BlackBoxMultigrid(A.stencil, wp.float64, symmetric=False)
     hierarchy.restrict(wp.array((A.cells.numpy().ravel() == wl.FLUID).astype(np.uint8), device="cpu"))
     rng = np.random.default_rng(2)
     for fine, coarse in itertools.pairwise(hierarchy.levels):

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_lcp.distributed.decomposition import OPEN, Decomposition, Triple, cuttings, parts, seen_by
-from warp_lcp.distributed.hierarchy import GATHERED
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.multigrid.halo_levels import GATHERED
 
 STEP = 1 << 13  # cells full of material whose work is that which a step takes however little there is of it
 BLOCKS = 128  # of a rank, five along an axis

@@ -68,13 +68,6 @@ class Halo:
         d = self.decomposition
         return [(axis, side) for axis in d.cut_axes for side in range(2) if d.neighbor(axis, side) is not None]
 
-    @property
-    def hierarchy(self) -> Any:
-        """Class of the multigrid hierarchies on distributed grids."""
-        from warp_lcp.distributed.hierarchy import DistributedHierarchy
-
-        return DistributedHierarchy
-
     def coarser(self, factors: tuple[int, int, int]) -> Halo | None:
         """Return the halo of aggregates of cells along x, y, z; None if one is cut."""
         if factors not in self._coarser:  # solves on the same boxes share what it takes to exchange

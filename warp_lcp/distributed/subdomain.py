@@ -147,6 +147,20 @@ class Subdomain(GridPart):
         grid = self.grid
         return Subdomain(decomposition, spacing=grid.spacing, dimension=self.dimension, device=grid.device, layers=self.layers)
 
+    def coarser(self, layers: int) -> StaggeredGrid | None:
+        """Return this rank's part of the grid of cells of twice the edge; None if a cut lies in one, or a box is thinner than `layers`."""
+        if self.across is None:
+            return super().coarser(layers)
+        boxes, grid = self.decomposition.coarser((2, 2, self.dimension - 1)), self.grid
+        if boxes is None or any(min(boxes.parts[axis]) < layers for axis in boxes.cut_axes):
+            return None
+        return Subdomain(boxes, spacing=2.0 * grid.spacing, dimension=self.dimension, device=grid.device, layers=layers).grid
+
+    @property
+    def row_ranks(self) -> Any:
+        """The ranks that have cells of the same rows along x, in their order; None if rows are not cut."""
+        return self.ranks.in_rows(self.decomposition.processes[0]) if 0 in self.decomposition.cut_axes else None
+
     def _cells(self, box: CellBox) -> CellBox:
         """Return the cells of the part around a box, without its ring."""
         counts, joined = self.decomposition.counts, self.decomposition.joined

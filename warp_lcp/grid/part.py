@@ -124,6 +124,19 @@ class GridPart:
         """Return the cells that all processes visit together, of a window around this one's material."""
         return window
 
+    def coarser(self, layers: int) -> StaggeredGrid | None:
+        """Return the grid of cells of twice the edge on which the same processes work (coarse level); None if they cannot share it.
+
+        Args:
+            layers: of ghost cells of its parts, the ring included.
+        """
+        return self.grid.coarser()
+
+    @property
+    def row_ranks(self) -> Any:
+        """The processes that have cells of the same rows along x, in their order; None if rows are not cut."""
+        return None
+
     def known_of(self, field: np.ndarray) -> np.ndarray:
         """Return the view of a host's field on what this process alone knows."""
         return field

@@ -541,6 +541,11 @@ class StaggeredGrid:
         assert counts is not None and origin is not None
         return StaggeredGrid(counts, self.spacing / parts, self.dimension, self.device, origin, whole)
 
+    def coarser(self) -> "StaggeredGrid":
+        """Return the grid of cells of twice the edge that covers this one, in one process."""
+        nx, ny, nz = (-(-n // 2) for n in self.counts)
+        return StaggeredGrid((nx, ny, nz), 2.0 * self.spacing, self.dimension, self.device)
+
     def field(self, dtype: typing.Any = wp.float32) -> wp.array:
         """Return a field of zeros with one value per stored cell."""
         return zeros(self.size, dtype, self.device, small_pages=self.sparse).reshape(self.shape)

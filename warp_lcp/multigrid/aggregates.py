@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, no_type_check
 
 import numpy as np
@@ -13,9 +14,10 @@ from pyamg.classical.interpolate import classical_interpolation
 from pyamg.classical.split import RS
 from pyamg.strength import classical_strength_of_connection, symmetric_strength_of_connection
 
+from warp_lcp.multigrid.cycle import Cycle, CycleStage, Launches, recorded
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.program import Program
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 
@@ -75,7 +77,7 @@ def settle_kernel(
 
 
 # of 1, 1.4 and 1.8 with 2 and 3 coarse cycles: obstacles under diffusion and convection on 257^2 cells, Newton's steps after 4 cycles
-OVERCORRECTION = 1.4  # of plain aggregates' corrections, which are too small where x is smooth
+ALPHA = wp.float64(1.4)  # over-correction of plain aggregates' corrections, which are too small where x is smooth
 GAMMA = 3  # coarse cycles a level: aggregates of 5 to 9 unknowns leave room for them
 COARSEST, STALL = 64, 0.7  # unknowns of the coarsest level, and the largest share of unknowns that a level may keep
 SWEEPS, ENOUGH = 20, 1e-2  # the most pairs of sweeps of the coarsest level, and the part of the first change at which they end
@@ -109,7 +111,18 @@ class Aggregation:
 
 @dataclass(frozen=True)
 class AggregateLevel:
-    """A matrix; its iterate, right-hand side, bounds and A x + b; and its aggregates, None on the coarsest level."""
+    """Problem of a sparse matrix, see `CycleLevel`: 0 = A x + b within bounds.
+
+    Attributes:
+        A: the matrix.
+        x: iterate, shape (n,), wp.float64, as the fields that follow.
+        b: right-hand side, with the sign of A x + b.
+        lower: lower bounds of x.
+        upper: upper bounds of x.
+        y: A x + b.
+        aggregation: of the unknowns; None on the coarsest level.
+        visits: cycles on this level in each of the next finer one.
+    """
 
     A: SparseOperator
     x: wp.array[Any]
@@ -118,9 +131,45 @@ class AggregateLevel:
     upper: wp.array[Any]
     y: wp.array[Any]
     aggregation: Aggregation | None
+    visits: int = GAMMA
+    _legs: dict[str, list[CycleStage]] = field(default_factory=dict, init=False, repr=False)
+
+    def descend(self, coarse: AggregateLevel, *, projected: bool, from_zero: bool) -> list[CycleStage]:
+        """Return steps 1 to 3 of a cycle: a projected Gauss-Seidel sweep; sums and bounds of aggregates, from x_c = 0."""
+        assert self.aggregation is not None, "not the coarsest level"
+        if "down" not in self._legs:
+            parts, bounds = self.aggregation, [self.x, self.lower, self.upper]
+            residual = Launches(partial(self.A.product, self.x, self.y, plus=self.b))
+            sums = [parts.first, parts.members, self.y, *bounds, ALPHA, coarse.b, coarse.lower, coarse.upper, coarse.x]
+            self._legs["down"] = [self._sweep(forward=True), residual, self._launch(restrict_kernel, coarse.x.size, sums)]
+        return self._legs["down"]
+
+    def coarsen_bounds(self, coarse: AggregateLevel) -> tuple[()]:
+        """Return nothing: `descend` coarsens bounds in the kernel that restricts."""
+        return ()
+
+    def ascend(self, coarse: AggregateLevel, *, projected: bool) -> list[CycleStage]:
+        """Return steps 5 and 6: the sweep goes backward, so that the cycle is symmetric if A is."""
+        assert self.aggregation is not None, "not the coarsest level"
+        if "up" not in self._legs:
+            inputs = [self.aggregation.owner, coarse.x, ALPHA, self.lower, self.upper, self.x]
+            self._legs["up"] = [self._launch(correct_kernel, self.x.size, inputs), self._sweep(forward=False)]
+        return self._legs["up"]
+
+    def solve(self, visits: int, *, projected: bool, from_zero: bool) -> list[CycleStage]:
+        """Return the stages of a `CoarsestSolver`: projected Gauss-Seidel by one thread, until it converges."""
+        A, last = self.A, wp.float64(ENOUGH)
+        inputs = [A.indptr, A.indices, A.values, A.diagonal(), self.b, self.lower, self.upper, SWEEPS, last, self.x]
+        return self._legs.setdefault("solve", [self._launch(settle_kernel, 1, inputs)])
+
+    def _sweep(self, *, forward: bool) -> CycleStage:
+        return Launches(partial(self.A.relax, self.x, self.b, self.lower, self.upper, 1.0, forward=forward))
+
+    def _launch(self, kernel: Any, dim: int, inputs: list[Any]) -> CycleStage:
+        return Launches.of_kernel(kernel, dim, inputs, self.A.device)
 
 
-class AggregateCycles:
+class MonotoneAggregation:
     """Projected W-cycles: sweeps within the bounds, and corrections of whole aggregates within their members' gaps (Kornhuber 1994).
 
     A coarse unknown may move by what its most confined member may, so that no bound is overstepped and nothing need be projected
@@ -157,26 +206,10 @@ class AggregateCycles:
         """Move x (float64, within its bounds) by one cycle. It is recorded, and recorded anew where a field is another."""
         fields = tuple(field.ptr for field in (x, b, lower, upper))
         if self._program is None or self._fields != fields:
-            finest, self._fields, self._program = self._levels[0], fields, Program(self.A.device)
-            self._visit(AggregateLevel(finest.A, x, b, lower, upper, finest.y, finest.aggregation), 0, self._program.launch)
+            finest = replace(self._levels[0], x=x, b=b, lower=lower, upper=upper)
+            cycle = Cycle([finest, *self._levels[1:]], self._levels[-1].solve, projected=True)
+            self._fields, self._program = fields, recorded(self.A.device, cycle.stages(from_zero=False))
         self._program.run()
-
-    def _visit(self, L: AggregateLevel, depth: int, launch: Launch) -> None:
-        """Launch a cycle on a level and those below it."""
-        A, device = L.A, self.A.device
-        if L.aggregation is None:
-            matrix = [A.indptr, A.indices, A.values, A.diagonal()]
-            launch(settle_kernel, 1, [*matrix, L.b, L.lower, L.upper, SWEEPS, wp.float64(ENOUGH), L.x], device=device)
-            return
-        coarse, factor, parts = self._levels[depth + 1], wp.float64(OVERCORRECTION), L.aggregation
-        A.relax(L.x, L.b, L.lower, L.upper, 1.0, forward=True, launch=launch)
-        A.product(L.x, L.y, plus=L.b, launch=launch)
-        inputs = [parts.first, parts.members, L.y, L.x, L.lower, L.upper, factor, coarse.b, coarse.lower, coarse.upper, coarse.x]
-        launch(restrict_kernel, coarse.x.size, inputs, device=device)
-        for _ in range(GAMMA if coarse.aggregation is not None else 1):
-            self._visit(coarse, depth + 1, launch)
-        launch(correct_kernel, L.x.size, [parts.owner, coarse.x, factor, L.lower, L.upper, L.x], device=device)
-        A.relax(L.x, L.b, L.lower, L.upper, 1.0, forward=False, launch=launch)
 
 
 def _aggregates(host: scipy.sparse.csr_array) -> scipy.sparse.csr_array | None:

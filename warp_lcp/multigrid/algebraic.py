@@ -20,6 +20,7 @@ from pyamg.strength import symmetric_strength_of_connection
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
 from warp_lcp.multigrid.coarsest_kernels import PINNED
+from warp_lcp.multigrid.cycle import Cycle, CycleStage, Launches, recorded
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.compressed_rows import RowEntries
 from warp_lcp.operators.sparse import GATHER, PRODUCT, SparseOperator
@@ -47,9 +48,9 @@ class DeviceMatrix:
         self.values = kept(host.data, real, device)
         self.rows, self.entries = Rows.flat(self.shape[0], device), RowEntries(self.indptr, self.indices, self.values)
 
-    def product(self, x: wp.array[Any], y: wp.array[Any], launch: Launch, *, add: bool = False) -> None:
-        """y = A x, or y + A x."""
-        PRODUCT.bind(self.rows, self.entries, x=x, plus=y if add else None, y=y).launch(launch)
+    def multiplying(self, x: wp.array[Any], y: wp.array[Any], *, add: bool = False) -> Bound:
+        """Return the kernel y = A x, or y + A x."""
+        return PRODUCT.bind(self.rows, self.entries, x=x, plus=y if add else None, y=y)
 
 
 def product_pass(left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]) -> Bound:
@@ -75,10 +76,22 @@ def product_pass(left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hos
 
 
 class AlgebraicLevel:
-    """One level: its matrix, iterate x, right-hand side b, a second buffer t, the smoother's scale, and the way to the next level."""
+    """One level, see `CycleLevel`: its matrix, the smoother's scale, and the way to the next level.
 
-    def __init__(self, host: Matrix, real: Any, device: wp.Device) -> None:
-        self.size, self.device = host.shape[0], device
+    Args:
+        host: the matrix.
+        real: type of the fields.
+        device: where they are.
+        weights: relaxation factors of a pair of sweeps.
+        visits: cycles on this level in each of the next finer one.
+
+    Attributes:
+        x, b, t: iterate, right-hand side and what lies between two sweeps.
+    """
+
+    def __init__(self, host: Matrix, real: Any, device: wp.Device, weights: tuple[float, float], visits: int) -> None:
+        self.size, self.device, self.weights, self.visits = host.shape[0], device, weights, visits
+        self._legs: dict[tuple[str, bool], list[CycleStage]] = {}
         self.A = DeviceMatrix(host, real, device)
         self.x, self.b, self.t, self.inverse = (zeros(self.size, real, device) for _ in range(4))
         self.P: DeviceMatrix | None = None
@@ -96,10 +109,35 @@ class AlgebraicLevel:
             product_pass(self.R, self.AP, coarse.A, (R, AP, coarse_host)),
         )
 
-    def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, launch: Launch, *, from_zero: bool = False) -> None:
-        """y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
+    def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, *, from_zero: bool = False) -> Bound:
+        """Return the sweep y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
         A = self.A
-        SMOOTH.bind(A.rows, A.entries, inverse=self.inverse, x=x, b=self.b, y=y, omega=omega, from_zero=from_zero).launch(launch)
+        return SMOOTH.bind(A.rows, A.entries, inverse=self.inverse, x=x, b=self.b, y=y, omega=omega, from_zero=from_zero)
+
+    def pair(self, weights: tuple[float, float], *, from_zero: bool = False) -> list[CycleStage]:
+        """Return two sweeps, x to t and back."""
+        return [self.sweep(self.t, self.x, weights[0], from_zero=from_zero), self.sweep(self.x, self.t, weights[1])]
+
+    def descend(self, coarse: AlgebraicLevel, *, projected: bool, from_zero: bool) -> list[CycleStage]:
+        """Return steps 1 and 2 of a cycle: a pair of Chebyshev-Jacobi sweeps, and b_c = P'(b - A x)."""
+        assert not projected, "smoothed aggregates know no bounds"
+        key = "down", from_zero
+        if key not in self._legs:
+            residual = REMAINDER.bind(self.A.rows, self.A.entries, x=self.x, b=self.b, y=self.t)
+            self._legs[key] = [*self.pair(self.weights, from_zero=from_zero), residual, self.R.multiplying(self.t, coarse.b)]
+        return self._legs[key]
+
+    def coarsen_bounds(self, coarse: AlgebraicLevel) -> tuple[()]:
+        """Return nothing: there are no bounds."""
+        return ()
+
+    def ascend(self, coarse: AlgebraicLevel, *, projected: bool) -> list[CycleStage]:
+        """Return steps 5 and 6: x + P x_c, and the pair in reverse order."""
+        key = "up", projected
+        if key not in self._legs:
+            assert self.P is not None, "not the coarsest level"
+            self._legs[key] = [self.P.multiplying(coarse.x, self.x, add=True), *self.pair(self.weights[::-1])]
+        return self._legs[key]
 
 
 class AlgebraicHierarchy:
@@ -125,7 +163,6 @@ class AlgebraicHierarchy:
         pattern = _with_diagonal(host if A.symmetric else _union(host))
         self._order = self._find_entries(host, pattern)
         self.levels = _coarsen(A, host, pattern, real, self.settings, self._most)
-        self._gamma = self.settings.gamma if A.symmetric else self.settings.gamma_unsymmetric
         n, last = A.unknowns, self.levels[-1].size
         self.scale = zeros(n, real, self.device)
         self.weight = zeros(n, real, self.device)
@@ -145,14 +182,12 @@ class AlgebraicHierarchy:
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """q = M p, on the finest level."""
-        self.levels[0].A.product(p, q, launch)
+        self.levels[0].A.multiplying(p, q).launch(launch)
 
     @cached_property
     def program(self) -> Program:
         """One cycle: z = an approximation of M^-1 r, symmetric positive (semi-)definite if M is."""
-        program = Program(self.device)
-        self._visit(0, program.launch, from_zero=True)
-        return program
+        return recorded(self.device, Cycle(self.levels, self._solve).stages())
 
     def apply(self) -> None:
         """Cycle once: run `program`."""
@@ -179,32 +214,18 @@ class AlgebraicHierarchy:
             launch(invert_kernel, last.size, [self._matrix, self._inverse], device=self.device)
         return program
 
-    def _visit(self, depth: int, launch: Launch, *, from_zero: bool) -> None:
-        """Launch a cycle on a level and those below it."""
-        L, (first, second) = self.levels[depth], self.settings.weights
-        if depth == len(self.levels) - 1:
-            self._solve_coarsest(L, launch, from_zero=from_zero)
-            return
-        C, P = self.levels[depth + 1], L.P
-        assert P is not None
-        L.sweep(L.t, L.x, first, launch, from_zero=from_zero)
-        L.sweep(L.x, L.t, second, launch)
-        REMAINDER.bind(L.A.rows, L.A.entries, x=L.x, b=L.b, y=L.t).launch(launch)
-        L.R.product(L.t, C.b, launch)
-        for visit in range(self._gamma if depth + 2 < len(self.levels) else 1):
-            self._visit(depth + 1, launch, from_zero=visit == 0)
-        P.product(C.x, L.x, launch, add=True)
-        L.sweep(L.t, L.x, second, launch)
-        L.sweep(L.x, L.t, first, launch)
+    def _solve(self, visits: int, *, projected: bool, from_zero: bool) -> list[CycleStage]:
+        """Return the stages of a `CoarsestSolver`: multiply by the inverse, or sweep where the level is too large for that."""
+        last, weights = self.levels[-1], self.settings.weights
+        if not self.inverts:  # forth and back, so that the whole is symmetric
+            pairs = range(self.settings.last_sweeps)
+            return [s for i in pairs for s in last.pair(weights[::-1] if i % 2 else weights, from_zero=from_zero and i == 0)]
+        return [self._multiply_by_inverse]
 
-    def _solve_coarsest(self, L: AlgebraicLevel, launch: Launch, *, from_zero: bool) -> None:
-        if self.inverts:
-            launch(solve_kernel, L.size, [self._inverse, L.b, L.x], device=self.device)
-            return
-        first, second = self.settings.weights
-        for pair in range(self.settings.last_sweeps):  # forth and back, so that the whole is symmetric
-            L.sweep(L.t, L.x, first if pair % 2 == 0 else second, launch, from_zero=from_zero and pair == 0)
-            L.sweep(L.x, L.t, second if pair % 2 == 0 else first, launch)
+    @cached_property
+    def _multiply_by_inverse(self) -> CycleStage:
+        last = self.levels[-1]
+        return Launches.of_kernel(solve_kernel, last.size, [self._inverse, last.b, last.x], self.device)
 
     @property
     def _most(self) -> int:
@@ -226,7 +247,8 @@ def _coarsen(source: SparseOperator, A: Matrix, pattern: Matrix, real: Any, sett
     values[_places(A, pattern)] = A.data
     current = scipy.sparse.csr_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
     candidates = np.ones((A.shape[0], 1)) if B is None else B
-    levels = [AlgebraicLevel(current, real, device)]
+    cycles = settings.weights, settings.gamma if source.symmetric else settings.gamma_unsymmetric
+    levels = [AlgebraicLevel(current, real, device, *cycles)]
     while current.shape[0] > most:
         fine = levels[-1]
         entries = symmetric_part(current)
@@ -248,7 +270,7 @@ def _coarsen(source: SparseOperator, A: Matrix, pattern: Matrix, real: Any, sett
         coarse = _pattern_product(R, AP)
         if coarse.nnz > current.nnz or np.diff(AP.indptr).max() > WIDEST:  # wide rows, which coarsening fills
             break
-        levels.append(AlgebraicLevel(coarse, real, device))
+        levels.append(AlgebraicLevel(coarse, real, device, *cycles))
         fine.connect((current, P, R, AP, coarse), levels[-1], real)
         for product in fine.products:
             product.launch()

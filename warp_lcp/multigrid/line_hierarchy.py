@@ -17,8 +17,9 @@ from typing import Any, TypeGuard
 
 import warp as wp
 
-from warp_lcp.multigrid.compact_levels import DenseInverse
+from warp_lcp.multigrid.cycle import Cycle, CycleStage, recorded
 from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.dense_inverse import DenseInverse
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.stencil import AROUND
 from warp_lcp.problem.protocol import HasStencil, Operator, has
@@ -67,10 +68,22 @@ class LineFields:
 
 
 class LineLevel:
-    """One grid: its stored stencil, iterate x, right-hand side b, a buffer t, factors of its lines, and shares in the next coarser one."""
+    """One grid, see `CycleLevel`: its stored stencil, factors of its lines, and shares in the next coarser one.
 
-    def __init__(self, padding: Padding, real: Any, device: wp.Device, *, symmetric: bool) -> None:
-        self.padding, self.device, n = padding, device, padding.size
+    Args:
+        padding: counts of cells and of stored cells.
+        real: type of the fields.
+        device: where they are.
+        symmetric: whether the operator is.
+        visits: cycles on this level in each of the next finer one.
+
+    Attributes:
+        x, b, t: iterate, right-hand side and residual.
+    """
+
+    def __init__(self, padding: Padding, real: Any, device: wp.Device, *, symmetric: bool, visits: int = 1) -> None:
+        self.padding, self.device, self.visits, n = padding, device, visits, padding.size
+        self._legs: dict[tuple[str, bool], list[CycleStage]] = {}
         self.factors = 2 if padding.counts[2] > SHORT else 1, 2 if padding.counts[1] > SHORT else 1
         make = lambda count: zeros(count * n, real, device)  # noqa: E731
         self.weights, self.shares = make(8), make(4)
@@ -132,9 +145,29 @@ class LineLevel:
         sweeps = [sweep for axis in self._zebras for sweep in axis]
         return sweeps[::-1] if up else sweeps
 
+    def descend(self, coarse: LineLevel, *, projected: bool, from_zero: bool) -> list[CycleStage]:
+        """Return steps 1 and 2 of a cycle: sweeps of lines, and the residual on the next level."""
+        assert not projected, "sweeps of lines know no bounds"
+        key = "down", from_zero
+        if key not in self._legs:
+            zero = [ZERO.bind(Rows.flat(self.x.size, self.device), x=self.x)] if from_zero else []
+            self._legs[key] = [*zero, *self.smoothing(up=False), *self.restricting(coarse)]
+        return self._legs[key]
+
     def restricting(self, coarse: LineLevel) -> list[Bound]:
         """Return what hands the residual on."""
         return [RESIDUAL.bind(self.rows, self.fields, stencil=self.stencil), self.handing_down(coarse)]
+
+    def coarsen_bounds(self, coarse: LineLevel) -> tuple[()]:
+        """Return nothing: there are no bounds."""
+        return ()
+
+    def ascend(self, coarse: LineLevel, *, projected: bool) -> list[CycleStage]:
+        """Return steps 5 and 6."""
+        key = "up", projected
+        if key not in self._legs:
+            self._legs[key] = [self.correcting(coarse), *self.smoothing(up=True)]
+        return self._legs[key]
 
     def handing_down(self, coarse: LineLevel) -> Bound:
         """Return what makes t the coarse right-hand side."""
@@ -148,7 +181,7 @@ class LineLevel:
         return UP.bind(rows, self.fields, coarse=coarse.x, shares=self.shares, add=add)
 
 
-class LineHierarchy:
+class BlackBoxMultigrid:
     """Multigrid for (P A P + P D P) e = r of a compact stencil in 2-D.
 
     `restrict` takes the free set and the shift, `cycle` makes the finest level's x from its b.
@@ -168,8 +201,8 @@ class LineHierarchy:
             fine = self.levels[-1]
             _, ny, nx = fine.padding.counts
             padding = Padding((1, -(-ny // fine.factors[1]), -(-nx // fine.factors[0])))
-            self.levels.append(LineLevel(padding, real, self.device, symmetric=symmetric))
-        self._inverse, self._real = DenseInverse(self.levels[-1].padding.counts, self.device), real
+            self.levels.append(LineLevel(padding, real, self.device, symmetric=symmetric, visits=self.settings.gamma))
+        self._dense = DenseInverse(self.levels[-1])
 
     @property
     def finest(self) -> LineLevel:
@@ -197,30 +230,13 @@ class LineHierarchy:
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
             for made in (*fine.transferring(), *fine.factoring(), fine.coarsening(coarse)):
                 made.launch(program.launch)
-        self._inverse.making(self.levels[-1].stencil, self._real, program.launch)
+        self._dense.record(program, by_block=False)
         return program
 
     @cached_property
     def cycle(self) -> Program:
         """One cycle from x = 0."""
-        program = Program(self.device)
-        self._descend(0, program, from_zero=True)
-        return program
-
-    def _descend(self, level: int, program: Program, *, from_zero: bool) -> None:
-        L, launch = self.levels[level], program.launch
-        if level == len(self.levels) - 1:
-            self._inverse.solving(L).launch(launch)
-            return
-        if from_zero:
-            ZERO.bind(Rows.flat(L.x.size, self.device), x=L.x).launch(launch)
-        coarse = self.levels[level + 1]
-        for sweep in (*L.smoothing(up=False), *L.restricting(coarse)):
-            sweep.launch(launch)
-        for visit in range(self.settings.gamma if level + 2 < len(self.levels) else 1):
-            self._descend(level + 1, program, from_zero=visit == 0)
-        for sweep in (L.correcting(coarse), *L.smoothing(up=True)):
-            sweep.launch(launch)
+        return recorded(self.device, Cycle(self.levels, self._dense.solve).stages())
 
 
 def takes_points(A: Operator) -> TypeGuard[HasStencil]:

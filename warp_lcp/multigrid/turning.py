@@ -1,19 +1,19 @@
 """Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.multigrid.cycle import CycleStage
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.operators.sparse import GATHER
-from warp_lcp.rows import Bound, Rows
-from warp_lcp.rows.program import Program
+from warp_lcp.rows import Rows
 
 Strength = list[float]  # mean weights along x, y and z, in units of the largest
 
@@ -24,7 +24,7 @@ EDGES = {2: 8, 3: 4}  # cells of a block along each long axis: 64 faces an axis,
 SAMPLES = {2: 24, 3: 8}  # the most blocks that are sampled along each axis: 2 ms in all, whatever the grid
 
 
-class TurningHierarchy(Hierarchy):
+class MultipleSemicoarsening(Hierarchy):
     """`Hierarchy` and companions that coarsen other axes first; cycles visit them one after another, forth and back.
 
     Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong axis differs from place to place no
@@ -48,8 +48,7 @@ class TurningHierarchy(Hierarchy):
     @property
     def nbytes(self) -> int:
         """Bytes that the levels hold, the finest one once; shared weights not counted."""
-        finest = {id(v): v.capacity for v in (self.finest.x, self.finest.b, self.finest.t, self.finest.lower, self.finest.upper)}
-        return super().nbytes + sum(c.nbytes - sum(finest.values()) for c in self.companions)
+        return super().nbytes + sum(c.nbytes - self.finest.nbytes for c in self.companions)
 
     def refresh(self) -> None:
         """Take the operator's rows and weights again."""
@@ -64,43 +63,21 @@ class TurningHierarchy(Hierarchy):
             wp.copy(self.finest.changed, self._marks)
             part.rebuilding.run()
 
-    @cached_property
-    def cycle(self) -> Program:
-        """One cycle on each hierarchy, forth and back: symmetric."""
-        return self._one_by_one([*self.companions, self, *self.companions[::-1]], projected=False)
+    def _last_leg(self) -> tuple[CycleStage, ...]:
+        """Return the stages of the last leg of a linear cycle."""
+        return self.companions[0]._last_leg()
 
-    @cached_property
-    def monotone_cycle(self) -> Program:
-        """One projected cycle on each hierarchy."""
-        return self._one_by_one([*self.companions, self], projected=True)
-
-    @cached_property
-    def open_cycle(self) -> Program | None:
-        """The linear cycle without its last leg."""
-        if super().open_cycle is None:
-            return None
-        program = self._one_by_one([*self.companions, self, *self.companions[:0:-1]], projected=False)
-        self.companions[0]._descend(0, program, projected=False, from_zero=False, whole=False)
-        return program
-
-    def last_leg(self) -> tuple[Bound, ...]:
-        """Return what the last leg of a linear cycle takes."""
-        return self.companions[0].last_leg()
-
-    def _one_by_one(self, parts: list[Hierarchy], *, projected: bool) -> Program:
-        """Return a cycle on each part, the first from x = 0."""
-        program = Program(self.device)
+    def _stages(self, *, projected: bool) -> Iterator[CycleStage]:
+        """Yield a cycle on each hierarchy, the first from x = 0; linear ones forth and back, which is symmetric."""
+        parts = [*self.companions, self, *(() if projected else self.companions[::-1])]
         for place, part in enumerate(parts):
-            program.extend(part._descent(0, projected=projected, from_zero=place == 0))
-        return program
+            yield from part.cycles[projected].stages(from_zero=place == 0)
 
 
 def make_hierarchy(stencil: PaddedStencil, real: Any, **options: Any) -> Hierarchy:
-    """Return the hierarchy of a stencil, of all processes where it is shared; options as of `Hierarchy`."""
-    if stencil.ghosts is not None:
-        return stencil.ghosts.hierarchy(stencil, real, **options)
-    strengths = turns(stencil)
-    return TurningHierarchy(stencil, real, strengths, **options) if strengths else Hierarchy(stencil, real, **options)
+    """Return the hierarchy of a stencil; options as of `Hierarchy`."""
+    strengths = turns(stencil) if stencil.ghosts is None else []
+    return MultipleSemicoarsening(stencil, real, strengths, **options) if strengths else Hierarchy(stencil, real, **options)
 
 
 def turns(stencil: PaddedStencil) -> list[Strength]:

@@ -68,7 +68,7 @@ class Ghosts(Protocol):
     Attributes:
         whole: cells (nz, ny, nx) of the grid that this process has a box of.
         cuts: sides with ghost cells that others have: the axis, 0, 1, 2 for x, y, z, and 0 for the lower, 1 for the upper side.
-        hierarchy: the class of multigrid hierarchies on such grids.
+        gathering: collects fields of all processes' boxes on every process.
     """
 
     @property
@@ -76,7 +76,7 @@ class Ghosts(Protocol):
     @property
     def cuts(self) -> list[tuple[int, int]]: ...  # noqa: D102
     @property
-    def hierarchy(self) -> Any: ...  # noqa: D102
+    def gathering(self) -> Any: ...  # noqa: D102
 
     def fill(self, field: wp.array[Any]) -> None:
         """Fill those of a stored field."""

@@ -14,7 +14,6 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import KernelFile, Wave
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros_like
-from warp_lcp.rows.program import Program
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, NORM, SIZE, STEP
@@ -69,10 +68,7 @@ class GridConjugateGradient:
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=device)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         sums = Reduction(r.size, device, self._scalars, columns=4, threads=s.rows.places)
-        program = self._program = Program(device)
-        assert hierarchy.open_cycle is not None
-        program.extend(hierarchy.open_cycle)
-        engine.CLIMB.launch(*hierarchy.last_leg(), engine.measuring(finest, self._p, sums.partials), launch=program.launch)
+        program = self._program = hierarchy.cycle_with(engine.CLIMB, engine.measuring(finest, self._p, sums.partials))
         sums.add_up(int(engine.ZAZ), columns=4, launch=program.launch)
         program.launch(engine.plan_step_kernel, 1, [self._scalars], device=device)
         direct = DIRECT.bind(s.rows, z=finest.x, q=self._p, scalars=self._scalars)

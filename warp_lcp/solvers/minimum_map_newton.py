@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
+from warp_lcp.multigrid.aggregates import MonotoneAggregation, suits_multigrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.sparse import SparseOperator
@@ -158,7 +158,7 @@ class NewtonWorkspace(IterateMemory):
         self._sums = Sums(rows_of(self.x), 4, slots=SLOTS, across=layout.across)
         helped = self.bounded and settings.safeguard
         cycled = helped and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
-        self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
+        self.aggregates = MonotoneAggregation(problem.A) if cycled else None  # type: ignore[arg-type]
         self.coarse = CoarseProblem(problem.A, settings) if cycled else None
         if helped and isinstance(self.system, LineSystem):
             self.coarse = CoarseStencilProblem(problem.A, self.system, settings)  # type: ignore[arg-type]

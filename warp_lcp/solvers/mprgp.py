@@ -12,8 +12,8 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
@@ -173,7 +173,7 @@ class SplitResidual(NaturalResidual):
         self.norm, self.current, self.active, self.moved = float(np.sqrt(square)), True, int(active), self.moved or moved > 0
         return self.norm
 
-    def measure(self, finest: Level, p: wp.array[Any]) -> list[float]:
+    def measure(self, finest: StencilLevel, p: wp.array[Any]) -> list[float]:
         """Return z'Az, z'Ap, r'z and r'p, on a grid's finest level with its x = z and b = r."""
         engine.measuring(finest, p, self._split.partials).launch(wp.launch)
         self._split.add_up(0, columns=4)

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import Level
+from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.rows import KernelFile, RowPass, Rows, Wave
@@ -206,7 +206,7 @@ class NonsmoothMap:
         self._numbers = replace(self._numbers, seed=seed)
         return MapSystem(D, r, free, scale, LEAST_Q, self._drops)
 
-    def step(self, x: wp.array[Any], e: wp.array[Any], length: float, finest: Level, scale: float, turn: int) -> float:
+    def step(self, x: wp.array[Any], e: wp.array[Any], length: float, finest: StencilLevel, scale: float, turn: int) -> float:
         """Move x by length e, set the residual's norm, and condense the next system there, for one CPU thread and no periodic axes.
 
         Args:

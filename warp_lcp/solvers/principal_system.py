@@ -21,7 +21,7 @@ from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.multigrid.line_hierarchy import LineHierarchy, needs_lines
+from warp_lcp.multigrid.line_hierarchy import BlackBoxMultigrid, needs_lines
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.banded_matrix import NARROW, BandedMatrix, bands_of
 from warp_lcp.operators.dense import DenseOperator
@@ -101,7 +101,7 @@ class GridSystem(GuardedSystem):
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = zeros_like(self.r) if shifted else None
         # one CPU thread, no ghost cells to fill
-        self.fused = self.hierarchy.open_cycle is not None and A.symmetric and A.stencil.ghosts is None
+        self.fused = self.hierarchy.ends_in_wave and A.symmetric and A.stencil.ghosts is None
         self._iterate_by(self._krylov_method(), self._weight)
         if not A.symmetric and A.stencil.ghosts is None:
             self._guard(partial(MatrixSystem, A, shifted=shifted))
@@ -158,7 +158,7 @@ class LineSystem(GuardedSystem):
 
     def __init__(self, A: HasStencil, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False) -> None:
         self._A = A
-        self.hierarchy = LineHierarchy(A.stencil, real, symmetric=A.symmetric, settings=settings)
+        self.hierarchy = BlackBoxMultigrid(A.stencil, real, symmetric=A.symmetric, settings=settings)
         finest = self.hierarchy.finest
         self.r, self.z = finest.b, finest.x
         self._weight = zeros_like(self.r) if shifted else None

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.multigrid.cycle_passes import ASCEND
-from warp_lcp.multigrid.hierarchy import Level
+from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.rows import Bound, KernelFile, Wave
 from warp_lcp.rows.compiler import forward_kernel
 
@@ -47,7 +47,7 @@ MASK = KERNELS["projected_multigrid.mask"]
 UNDO = KERNELS["projected_multigrid.undo"]
 
 
-def measuring(finest: Level, direction: Any, out: Any) -> Bound:
+def measuring(finest: StencilLevel, direction: Any, out: Any) -> Bound:
     """Return the measuring of a cycle's correction along a direction."""
     return MEASURE.bind(finest.stencil.rows, stencil=finest.stencil, z=finest.x, q=direction, g=finest.b, out=out)
 

@@ -11,8 +11,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.cycle_passes import CLEAR
+from warp_lcp.multigrid.halo_levels import beside_cuts
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.multigrid.shared_levels import beside_cuts
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
@@ -475,20 +475,18 @@ class MultigridWorkspace(IterateMemory):
     def _correct(self, program: Program) -> None:
         """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
         hierarchy = self.hierarchy
-        if hierarchy.open_cycle is None:
+        if not hierarchy.ends_in_wave:
             program.extend(hierarchy.cycle)
             self._measure(launch=program.launch)
             return
-        program.extend(hierarchy.open_cycle)
-        self._climb(program.launch)
+        measuring = kernels.measuring(hierarchy.finest, self._p, self.residual.sums.partials)
+        program.extend(hierarchy.cycle_with(kernels.CLIMB, measuring))
+        self._measure_beside_cuts(program.launch)
         self._plan(program.launch)
 
-    def _climb(self, launch: Launch) -> None:
-        """Take a cycle's last leg, and measure the correction while it is in the cache; again beside others' cells."""
-        hierarchy, finest, sums = self.hierarchy, self.hierarchy.finest, self.residual.sums.partials
-        hierarchy.begin_climb(0, launch)
-        kernels.CLIMB.launch(*hierarchy.last_leg(), kernels.measuring(finest, self._p, sums), launch=launch)
-        hierarchy.end_climb(0, launch)
+    def _measure_beside_cuts(self, launch: Launch) -> None:
+        """Measure the correction again beside cells of other processes, whose part of it has come since."""
+        finest, sums = self.hierarchy.finest, self.residual.sums.partials
         s = finest.stencil
         if s.ghosts is not None:
             s.wrap(finest.x, launch=launch)

@@ -1,0 +1,168 @@
+"""Multigrid: one cycle for all kinds of levels, for linear systems and for problems with bounds.
+
+Every level holds the same problem on fewer unknowns. If A is symmetric positive definite, it is
+
+    minimize  x'Ax / 2 - b'x   over   lower <= x <= upper,                                (1)
+
+without bounds A x = b. `Cycle` knows no matrix, grid or device: it takes the stages of Algorithm 1
+from the levels, in order. They are recorded once, in one `Program`. With bounds the method is
+monotone multigrid (Kornhuber 1994): no iterate leaves its bounds.
+
+Algorithm 1, one cycle on level l; P maps coarse to fine vectors, alpha is the over-correction.
+    1  smooth          x <- clip(x + omega D^-1 (b - A x)), or sweeps over lines or faces
+    2  restrict        b_c = P'(b - A x),  x_c = 0
+    3  coarsen bounds  lower_c = max of (lower - x) / alpha over an aggregate; upper_c = min ...
+    4  recurse         visits of level l + 1: gamma, or 1; on the coarsest level, solve for x
+    5  correct         x <- x + alpha P x_c
+    6  smooth          as step 1, in reverse order: the cycle is symmetric
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
+
+import warp as wp
+
+from warp_lcp.rows import Bound, Wave
+from warp_lcp.rows.program import Launch, Program, launch_now
+
+
+class CycleStage(Protocol):
+    """Launches of a cycle, now or recorded: a bound kernel, a wave of them, an exchange."""
+
+    def launch(self, launch: Launch = ...) -> None:
+        """Launch now, or record by `Program.launch`."""
+
+
+class CycleLevel(Protocol):
+    """Problem (1) on one level, and its transfers from and to the next coarser one.
+
+    Smoothing and transfer come together, since a CPU passes through memory once for both.
+    """
+
+    @property
+    def visits(self) -> int:
+        """Cycles on this level in each cycle on the next finer one; see `CoarsestSolver` for the coarsest."""
+
+    def descend(self, coarse: Any, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
+        """Return steps 1 and 2; x is taken for 0 if `from_zero`."""
+
+    def coarsen_bounds(self, coarse: Any) -> Iterable[CycleStage]:
+        """Return step 3, if it is no part of step 2."""
+
+    def ascend(self, coarse: Any, *, projected: bool) -> Iterable[CycleStage]:
+        """Return steps 5 and 6."""
+
+
+class CoarsestSolver(Protocol):
+    """Step 4 on the coarsest level: a dense inverse, sweeps, or a hierarchy of its own."""
+
+    def __call__(self, visits: int, *, projected: bool, from_zero: bool) -> Iterable[CycleStage]:
+        """Return what solves for x; what only approximates the solution does so `visits` times."""
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """Algorithm 1.
+
+    Args:
+        levels: from the finest to the coarsest.
+        solve: coarsest solver.
+        projected: whether x has bounds.
+    """
+
+    levels: Sequence[CycleLevel]
+    solve: CoarsestSolver
+    projected: bool = False
+
+    def stages(self, depth: int = 0, *, visits: int = 1, from_zero: bool = True) -> Iterator[CycleStage]:
+        """Yield consecutive cycles on level `depth`; the numbers are steps of Algorithm 1."""
+        if depth == len(self.levels) - 1:
+            yield from self.solve(visits, projected=self.projected, from_zero=from_zero)  # 4, coarsest level
+            return
+        fine, coarse = self.levels[depth], self.levels[depth + 1]
+        for visit in range(visits):
+            yield from fine.descend(coarse, projected=self.projected, from_zero=from_zero and visit == 0)  # 1, 2
+            if self.projected:
+                yield from fine.coarsen_bounds(coarse)  # 3
+            yield from self.stages(depth + 1, visits=coarse.visits)  # 4
+            yield from fine.ascend(coarse, projected=self.projected)  # 5, 6
+
+
+def recorded(device: wp.Device, stages: Iterable[CycleStage]) -> Program:
+    """Return the launches of stages; one that comes again, as in a W-cycle, is prepared once."""
+    program, prepared = Program(device), dict[int, tuple[CycleStage, Program]]()
+    for stage in stages:
+        known = prepared.get(id(stage))
+        if known is None:
+            known = prepared[id(stage)] = stage, Program(device)
+            stage.launch(known[1].launch)
+        program.extend(known[1])
+    return program
+
+
+@dataclass(frozen=True)
+class Leg:
+    """Steps 1 and 2, or 5 and 6, in one pass through memory.
+
+    Attributes:
+        wave: of the kernels.
+        passes: its bound kernels.
+    """
+
+    wave: Wave
+    passes: tuple[Bound, ...]
+
+    def launch(self, launch: Launch = launch_now) -> None:
+        """Launch the wave, or record it."""
+        self.wave.launch(*self.passes, launch=launch)
+
+
+@dataclass(frozen=True)
+class Launches:
+    """What a function launches, given `launch=`, as a stage of a cycle."""
+
+    function: Callable[..., object]
+
+    @classmethod
+    def of_kernel(cls, kernel: Any, dim: int, inputs: list[Any], device: wp.Device) -> Launches:
+        """Return the launch of a Warp kernel."""
+        return cls(partial(_launch_kernel, kernel, dim, inputs, device))
+
+    def launch(self, launch: Launch = launch_now) -> None:
+        """Launch it now, or record it."""
+        self.function(launch=launch)
+
+
+def _launch_kernel(kernel: Any, dim: int, inputs: list[Any], device: wp.Device, *, launch: Launch) -> None:
+    launch(kernel, dim, inputs, device=device)
+
+
+@dataclass(frozen=True)
+class GatheredLevel:
+    """Coarsest solver on ranks: gather the problem on every rank, cycle there, take the own part.
+
+    The level has so few cells that exchanges would take longer than all ranks doing the same.
+
+    Args:
+        whole: cycle of the whole problem, projected or not.
+        gather: collects b.
+        gather_bounds: collects the bounds.
+        take: writes this rank's part of x, ghost cells included.
+    """
+
+    whole: Callable[[bool], Cycle]
+    gather: Sequence[CycleStage]
+    gather_bounds: Sequence[CycleStage]
+    take: CycleStage
+
+    def solve(self, visits: int, *, projected: bool, from_zero: bool) -> Iterator[CycleStage]:
+        """Yield the stages of a `CoarsestSolver`."""
+        assert from_zero, "x is not gathered"
+        yield from self.gather
+        yield from self.gather_bounds if projected else ()
+        yield from self.whole(projected).stages(visits=visits)
+        yield self.take

@@ -1,0 +1,55 @@
+"""All small levels of a hierarchy in one launch: one block of threads goes through a list of stages."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence as Listed
+from typing import TYPE_CHECKING, Any
+
+from warp_lcp.multigrid.cycle import CoarsestSolver, Cycle
+from warp_lcp.rows import Sequence
+
+if TYPE_CHECKING:
+    from warp_lcp.multigrid.stencil_level import StencilLevel
+
+
+class FusedCoarseLevels:
+    """Coarsest solver: the last levels of a hierarchy, which one block of a GPU (one thread of a CPU) cycles through.
+
+    The cycle's stages are unrolled into a table on the device. Results are those of one launch a stage, to rounding.
+
+    Args:
+        levels: the levels, stored alike.
+        solve: the coarsest solver of the last one.
+    """
+
+    def __init__(self, levels: Listed[StencilLevel], solve: CoarsestSolver) -> None:
+        self.levels, self._solve = levels, solve
+        self._sequences = dict[tuple[int, bool, bool], Sequence]()
+        for level in levels:
+            level.in_one_launch = True
+
+    @functools.cached_property
+    def coarsening(self) -> Sequence:
+        """The making of all levels from the first one."""
+        stages: list[Any] = [s for fine, coarse in itertools.pairwise(self.levels) for s in fine.coarsened(coarse)]
+        return Sequence("small_levels.coarsen", stages)
+
+    def solve(self, visits: int, *, projected: bool, from_zero: bool) -> tuple[Sequence]:
+        """Return the stages of a `CoarsestSolver`: one launch."""
+        key = visits, projected, from_zero
+        if key not in self._sequences:
+            cycle = Cycle(self.levels, self._solve, projected)
+            stages: list[Any] = list(cycle.stages(visits=visits, from_zero=from_zero))
+            self._sequences[key] = Sequence("small_levels.projected" if projected else "small_levels.cycle", stages)
+        return (self._sequences[key],)
+
+
+def first_small(levels: Listed[StencilLevel], cells: int) -> int:
+    """Return the index of the first of the last levels that have at most so many cells each and are stored alike."""
+    first = len(levels)
+    while first > 0 and math.prod(levels[first - 1].stencil.padding.counts) <= cells and levels[first - 1].form == levels[-1].form:
+        first -= 1
+    return first

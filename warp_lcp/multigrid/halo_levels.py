@@ -1,0 +1,137 @@
+"""Legs of a cycle on a level of which other processes have parts: ghost cells, and cells beside cuts.
+
+A leg streams through memory once, as in one process, and waits for one exchange: cells beside
+those of others are computed again, or ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from warp_lcp.multigrid import cycle_passes as passes
+from warp_lcp.multigrid.cycle import CycleStage, Leg
+from warp_lcp.operators.padded_stencil import PaddedStencil
+from warp_lcp.rows import Bound, Rows
+from warp_lcp.rows.vectors import CONVERT
+
+if TYPE_CHECKING:
+    from warp_lcp.multigrid.stencil_level import StencilLevel
+
+Corner = list[int]  # k, j, i
+GATHERED = 32_768  # cells at which a level is gathered: exchanges would take as long as its cells
+BESIDE = 4  # cells from a cut corrected ahead: two are swept, the next one, and its aggregate's other
+
+
+def whole_counts(stencil: PaddedStencil) -> tuple[int, int, int]:
+    """Return the cells (nz, ny, nx) of a stencil's grid, also of those that other processes have."""
+    return stencil.padding.counts if stencil.ghosts is None else stencil.ghosts.whole
+
+
+def share_changes(level: StencilLevel) -> None:
+    """Fill the diagonal's ghost cells; mark rows beside those that changed: their faces depend on them."""
+    s, inner = level.stencil, slice(1, -1)
+    assert s.ghosts is not None
+    sides = []
+    for axis, end in s.ghosts.cuts:
+        place: list[Any] = [inner] * 3
+        place[2 - axis] = -end
+        sides.append((tuple(place), axis, -end))
+    shape = s.padding.shape
+    known = [s.d.numpy().reshape(shape)[side].copy() for side, _, _ in sides]
+    s.ghosts.fill(s.d)
+    d, changed = s.d.numpy().reshape(shape), level.changed.numpy()
+    for (side, axis, end), old in zip(sides, known, strict=True):
+        differs = d[side] != old
+        if axis == 0:
+            changed |= differs
+        elif axis == 1:
+            changed[:, end] |= differs.any(axis=1)
+        else:
+            changed[end] |= differs.any(axis=1)
+    if s.device.is_cuda:
+        level.changed.assign(changed)
+
+
+def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[Corner, Corner]]:
+    """Return the cells of a box within `depth` of others', as boxes low <= (k, j, i) < high that do not overlap."""
+    low, high, found = [0, 0, 0], list(stencil.padding.counts), list[tuple[Corner, Corner]]()
+    for axis, end in stencil.ghosts.cuts if stencil.ghosts is not None else ():
+        a, first, last = 2 - axis, low.copy(), high.copy()
+        if end:
+            high[a] = max(high[a] - depth, low[a])
+            first[a] = high[a]
+        else:
+            low[a] = min(low[a] + depth, high[a])
+            last[a] = low[a]
+        found.append((first, last))
+    return found
+
+
+def descent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Iterator[CycleStage]:
+    """Yield steps 1 and 2 of a cycle from x = 0.
+
+    The first sweep is made in ghost cells, too, where it needs their right-hand side alone; the
+    residual beside others' cells is found again when ghost cells are filled.
+    """
+    for field in (level.b, level.lower, level.upper)[: 3 if projected and level.upper.size else 1 + projected]:
+        yield from level.stencil.fillings(field)
+    s, (first, second) = level.stencil, level.settings.weights
+    everywhere, inside = Rows.stored(s.padding, s.device), s.rows.after_ghosts()
+    into_ring = level.sweeping(
+        level.t, level.x, first, projected=projected, from_zero=True, kind=passes.SWEEP_INTO_RING, rows=everywhere
+    )  # fmt: skip
+    out_of_ring = level.sweeping(level.x, level.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING, rows=inside)
+    yield Leg(passes.DESCEND_FROM_GHOSTS, (into_ring, out_of_ring, level.restricting(coarse)))
+    yield from level.filling("x")
+    for low, high in beside_cuts(coarse.stencil, 1):
+        yield level.restricting(coarse, _coarser_part(level, coarse, low, high))
+
+
+def ascent(level: StencilLevel, coarse: StencilLevel, *, projected: bool) -> Iterator[CycleStage]:
+    """Yield steps 5 and 6: cells beside cuts are corrected and swept ahead, and exchanged."""
+    s, near, scale = level.stencil, level.near, level.settings.over_correction
+    assert s.ghosts is not None
+    if not coarse.gathered:  # then its ghost cells have been taken with its part
+        yield from coarse.stencil.fillings(coarse.x)
+    for axis, end in s.ghosts.cuts:  # those of x are filled since the restriction
+        ours, theirs = (Rows.beyond(v.stencil.padding, s.device, axis, end) for v in (level, coarse))
+        factors = [1 if a == axis else f for a, f in enumerate(coarse.factors)]
+        rows = ours.beside(theirs, (-factors[0], -factors[1], -factors[2]))
+        yield level.correcting(coarse, scale, projected=projected, rows=rows)
+        yield CONVERT.bind(ours, a=level.x, b=near)
+    for low, high in beside_cuts(s, BESIDE):
+        yield CONVERT.bind(Rows.part(s.padding, s.device, low, high), a=level.x, b=near)
+        yield level.correcting(coarse, scale, projected=projected, rows=_finer_part(level, coarse, low, high), x=near)
+    yield from _sweeps_beside(level, level.t, near, 2, projected=projected)
+    # the ring takes that for what is above the last plane, too
+    yield passes.CLEAR.bind(Rows.beyond(s.padding, s.device, 2, 0), x=near)
+    yield from level.filling("t")
+    correcting = level.correcting(coarse, scale, projected=projected)
+    yield Leg(passes.ASCEND, (correcting, *level.ring_pair(level.settings.weights[::-1], projected=projected, ring=near)))
+    yield from _sweeps_beside(level, level.x, level.t, 1, projected=projected)
+
+
+def _sweeps_beside(level: StencilLevel, y: Any, x: Any, depth: int, *, projected: bool) -> Iterator[Bound]:
+    """Yield one of a leg's sweeps, from x to y, in cells within `depth` of others'."""
+    for low, high in beside_cuts(level.stencil, depth):
+        rows = Rows.part(level.stencil.padding, level.stencil.device, low, high)
+        yield level.sweeping(y, x, level.settings.weights[depth - 1], projected=projected, rows=rows)
+
+
+def _coarser_part(level: StencilLevel, coarse: StencilLevel, low: Corner, high: Corner) -> Rows:
+    """Return cells of the coarser level with those that they stand for."""
+    factors, s = coarse.factors[::-1], level.stencil
+    first = [n * f for n, f in zip(low, factors, strict=True)]
+    last = [min(n * f, most) for n, f, most in zip(high, factors, s.padding.counts, strict=True)]
+    finer = Rows.part(s.padding, s.device, first, last)
+    return Rows.part(coarse.stencil.padding, s.device, low, high).beside(finer, coarse.factors)
+
+
+def _finer_part(level: StencilLevel, coarse: StencilLevel, low: Corner, high: Corner) -> Rows:
+    """Return cells with those of the coarser level that stand for them."""
+    (fx, fy, fz), s = coarse.factors, level.stencil
+    first = [n // f for n, f in zip(low, (fz, fy, fx), strict=True)]
+    last = [-(-n // f) for n, f in zip(high, (fz, fy, fx), strict=True)]
+    coarser = Rows.part(coarse.stencil.padding, s.device, first, last)
+    return Rows.part(s.padding, s.device, low, high).beside(coarser, (-fx, -fy, -fz))
