@@ -20,10 +20,10 @@ import warp as wp
 
 from warp_lcp.benchmarks.harness.machine import cpu_model, forget_peak, resident_bytes
 from warp_lcp.distributed.halo import Gathering, Halo
-from warp_lcp.distributed.particles import MpiPost
+from warp_lcp.distributed.messages import MpiMailbox
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
-from warp_lcp.fluids.distributed import create
+from warp_lcp.fluids.simulator import FluidsSimulator
 from warp_lcp.rows.program import LaunchGraph, Program
 from warp_lcp.scene.scene_file import load_scene
 
@@ -44,7 +44,7 @@ class Traffic:
         self._listen(Halo, "fill", lambda halo, field: _ghosts(halo) * _item(field))
         self._listen(Gathering, "collect", lambda gathering, mine, whole: (whole.size - mine.size) * _item(whole))
         self._listen(Ranks, "gather", lambda ranks, values: (ranks.size - 1) * np.asarray(values).nbytes)
-        self._listen(MpiPost, "swap", lambda post, outgoing: sum(array.nbytes for array in outgoing.values()))  # sent; as much comes
+        self._listen(MpiMailbox, "swap", lambda post, outgoing: sum(array.nbytes for array in outgoing.values()))  # sent; as much comes
         self._listen_to_programs()
 
     def _listen(self, kind: type, name: str, size: Callable[..., int]) -> None:
@@ -97,7 +97,7 @@ def main() -> None:
     """Measure on the ranks there are."""
     wp.config.log_level = wp.LOG_ERROR
     ranks, (name, *overrides) = Ranks.world(), sys.argv[1:]
-    traffic, make = Traffic(), partial(create, ranks=ranks, device="cpu", folder=Path())
+    traffic, make = Traffic(), partial(FluidsSimulator().create, ranks=ranks, device="cpu", folder=Path())
     warm = make(load_scene(name, [*overrides, SMALL]))
     for _ in range(2):
         warm.step(warm.stable_dt())
@@ -111,7 +111,8 @@ def main() -> None:
     traffic.times.clear()
     begun = time.process_time()
     rows = [simulation.step(simulation.stable_dt()) for _ in range(STEPS)]
-    part, box = simulation.part, simulation.part.box.counts
+    part: Any = simulation.grid.part
+    box = part.box.counts
     cut = sum(box[0] * box[1] * box[2] // box[axis] for axis in range(3) for side in range(2) if part.cuts >> 2 * axis + side & 1)
     seconds = (time.process_time() - begun) / STEPS
     found = {

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids.forces import SolidForces, WallSums
 from warp_lcp.fluids.models import make_pressure, make_surface, make_tension, make_viscosity
-from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
-from warp_lcp.fluids.surface import FreeSurface
-from warp_lcp.fluids.surface_tension import REACH, SurfaceTension
+from warp_lcp.fluids.surface_tension import REACH
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
 from warp_lcp.fluids.wall_drag import WallDrag
-from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.part import ONE_PROCESS
+from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import particles_to_faces
 from warp_lcp.grid.voxelize import PlacedSolid
@@ -47,9 +47,9 @@ from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
-    from warp_lcp.fluids.distributed import DistributedLiquid
 
 
+METHODS_ON_RANKS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks
 MOST_PARTS = 8  # of the viscous solve in a step that is much shorter than the last one
 
 
@@ -100,33 +100,18 @@ class LiquidSimulation(ParticleSimulation):
     def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
-        self.surface = self._surface()
-        self._surface_graph = LaunchGraph(grid.device, self._launch_surface, at_once=self.shared and grid.device.is_cuda)
-        self.tension = self._tension()
-        self.projection = self._pressure()
-        self.probes = self._probes()
+        self.surface = make_surface(self.scene, grid, self.boundary, self._fill_density())
+        self._surface_graph = LaunchGraph(grid.device, self._launch_surface, at_once=grid.part.at_once)
+        self.tension = make_tension(self.scene, grid, self.boundary, self.surface)
+        self.projection = make_pressure(self.scene, grid, self.boundary, self.surface, self.weights, self.bodies)
+        self.probes = Probes(self.scene.probe, self.gravity, grid) if self.scene.probe else None
         drags, physics = self.scene.drags, self.scene.physics
         asked = self.forces is not None or drags is not None
         self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
         self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
-        self.viscosity = self._viscosity()
+        self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
         if self.tension is not None:
             self.projection.jump, self.projection.adhesion = self.tension.jump, self.tension.adhesion
-
-    def _surface(self) -> FreeSurface:
-        return make_surface(self.scene, self.grid, self.boundary, self._fill_density())
-
-    def _tension(self) -> SurfaceTension | None:
-        return make_tension(self.scene, self.grid, self.boundary, self.surface)
-
-    def _viscosity(self) -> Viscosity | None:
-        return make_viscosity(self.scene, self.grid, self.boundary, self.surface, self.bodies)
-
-    def _pressure(self) -> PressureProjection:
-        return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
-
-    def _probes(self) -> Probes | None:
-        return Probes(self.scene.probe, self.gravity, self.grid) if self.scene.probe else None
 
     def particles_to_grid(self, window: Window) -> None:
         """Transfer velocity (and viscosity) of particles to the faces; apply gravity."""
@@ -142,10 +127,11 @@ class LiquidSimulation(ParticleSimulation):
         return dt if self.tension is None else min(dt, self.tension.longest_step())
 
     def mark(self) -> None:
-        """Mark the liquid cells."""
-        self.surface.begin(self.grid.everywhere)
-        self._mark_cells(self.grid.everywhere)
-        self.projection.show()
+        """Mark the liquid cells; collective."""
+        with self.particles.exchange.with_ghosts(SORTED):
+            self.surface.begin(self.grid.everywhere)
+            self._mark_cells(self.grid.everywhere)
+            self.projection.show()
 
     def step(self, dt: float) -> Row:
         """Advance by dt [s].
@@ -157,7 +143,7 @@ class LiquidSimulation(ParticleSimulation):
             SimulationFailed: something is not finite, a particle has left the domain, or enclosed liquid would have to change its volume.
             ValueError: dt is not positive.
         """
-        with joined(self.grid.device):
+        with self.attempt(), joined(self.grid.device):
             return self._step(dt)
 
     def _step(self, dt: float) -> Row:
@@ -169,8 +155,8 @@ class LiquidSimulation(ParticleSimulation):
         self.particles_to_grid(window)
         speed = self.top_speed(before)
         self._find_surface(window)
-        if self.grid.device.is_cuda and self.known_density() is not None:
-            self.monitor_density(window)  # so that it is read with the solve
+        if self.grid.device.is_cuda and self.surface.density is not None:
+            self.monitor_density(window, self.surface.density)  # so that it is read with the solve
         viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
         projected = self._project(window, dt, speed)
         if self.scene.output.diagnostics:
@@ -180,7 +166,7 @@ class LiquidSimulation(ParticleSimulation):
                     self.tension.measure(window, self.projection.kind)
         walls = self._meet_walls(window, dt)
         self.solve_contacts()
-        self.extrapolate_velocity(window, self.projection.known, self.projection.kind, self.projection.contact)
+        self.extrapolate_velocity(window, self.projection.known, self.projection.kind, self.projection.contact, dt)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self._measure()
@@ -188,7 +174,7 @@ class LiquidSimulation(ParticleSimulation):
         self.grid_to_particles(window, self.projection.kind, dt)
         if self.tension is not None:
             self.tension.calm(self.particles, dt)
-        row = self.move(dt, window) | self.solve_row(projected.result) | viscous | walls
+        row = self.move(dt, window, self.surface.density, self.projection.contact) | self.solve_row(projected.result) | viscous | walls
         if self.scene.output.diagnostics:
             row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
             if self.tension is not None:
@@ -243,14 +229,6 @@ class LiquidSimulation(ParticleSimulation):
                 part.fill(*self.velocity)
         return {name: float(part.ranks.sum(value)) for name, value in row.items()}
 
-    def known_density(self) -> wp.array | None:
-        """Return the density from which the surface was computed, or None."""
-        return self.surface.density
-
-    def known_contact(self) -> wp.array | None:
-        """Return where the liquid was held at walls and where it separated."""
-        return self.projection.contact
-
     def own_columns(self) -> tuple[str, ...]:
         """Return the log columns of pressure and volume.
 
@@ -287,7 +265,7 @@ class LiquidSimulation(ParticleSimulation):
             points.fields["viscosity"] = self.scene.viscosity.value * self._particle_arrays()["kept"][:, 0]
         return [
             points,
-            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, self.image_counts),
+            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, self.image_counts, grid.part.corners),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -344,7 +322,6 @@ class LiquidSimulation(ParticleSimulation):
                 given = self.velocity, window, projection.kind, projection.contact, self.kick_dt / parts, speed
                 found = viscosity.solve(*given, last=part + 1 == parts)
             if not found.converged:
-                self.restore_bodies()
                 residual = f"relative residual of {found.relative_residual:.2e} (tolerance {viscosity.tolerance})"
                 raise missed_by_far("viscous", found.status, found.iterations, residual, "a shorter step is less stiff")
             if self.forces is not None and self.scene.output.forces:
@@ -390,7 +367,6 @@ class LiquidSimulation(ParticleSimulation):
         if projection.counted() == 0:  # which a GPU has not waited for
             return self._held(projection.leave())
         if not result:
-            self.restore_bodies()
             self._explain(result)
         if self.bodies is not None:
             with watch.stage("bodies"):
@@ -434,27 +410,31 @@ class FluidsSimulator:
     summary = "liquids that separate from walls"
     scene_model = LiquidScene
 
-    def create(self, scene: Scene, *, device: str, folder: Path, wall_velocity: np.ndarray | None = None) -> LiquidSimulation:
-        """Build the simulation of a scene.
+    def create(
+        self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None
+    ) -> LiquidSimulation:  # fmt: skip
+        """Build the simulation of a scene, on several ranks this rank's part of it; then collective.
 
         Args:
             scene: a LiquidScene.
             device: a Warp device's name.
             folder: folder of the files that the scene names.
+            ranks: that share it, for which the scene is the same; None: one process.
             wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the solids' cells stay
                 fixed. None: all are at rest.
 
         Raises:
-            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed. On all ranks.
         """
         if not isinstance(scene, LiquidScene):
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
         solids = placed_solids(scene, folder)
-        return self.assemble(scene, solids, make_bodies(scene, solids), device=device, folder=folder, wall_velocity=wall_velocity)
+        bodies = make_bodies(scene, solids, partial(RigidBodies, ranks=ranks or ONE_PROCESS))
+        return self.assemble(scene, solids, bodies, device=device, folder=folder, ranks=ranks, wall_velocity=wall_velocity)
 
     def assemble(
         self, scene: LiquidScene, solids: Sequence[PlacedSolid], bodies: RigidBodies | None, *, device: str, folder: Path,
-        wall_velocity: np.ndarray | None = None,
+        ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None,
     ) -> LiquidSimulation:  # fmt: skip
         """Build the simulation of a scene from placed solids and bodies.
 
@@ -468,18 +448,17 @@ class FluidsSimulator:
             boundary, warnings[:] = make_boundary(scene, grid, folder, wall_velocity, solids=solids)
             return Parts(boundary, make_sources(scene, grid, boundary, folder), make_narrow_band(scene, grid, boundary, folder))
 
-        coverage, grid = start_of(scene, device, make_parts)
+        if ranks is None:
+            coverage, grid = start_of(scene, device)
+        else:
+            from warp_lcp.distributed.particle_assembly import part_of  # what it needs is an extra
+
+            coverage, grid = None, part_of(scene, ranks, device, methods=METHODS_ON_RANKS, smoothing=scene.pressure.smoothing).grid
         parts = make_parts(grid)
         without = start_band(scene, grid, parts.boundary, folder, parts.band)
         particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
         outlets, spray = make_outlets(scene, grid, folder), make_spray(scene, coverage, solids)
         return LiquidSimulation(
-            scene, grid, parts, particles, solids=solids, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray,
-            notes=[*warnings, *notes],
+            scene, grid, parts, particles, make_parts=make_parts, solids=solids, outlets=outlets, bodies=bodies, coverage=coverage,
+            spray=spray, notes=[*warnings, *notes],
         )  # fmt: skip
-
-    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
-        """Build this rank's part of a simulation; see `fluids.distributed.create`."""
-        from warp_lcp.fluids.distributed import create  # what it needs is an extra
-
-        return create(scene, ranks, device=device, folder=folder)

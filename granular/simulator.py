@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,8 @@ from warp_lcp.granular.solids import SandSolids
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import particle_density
-from warp_lcp.grid.particles import Particles, ParticleTotals
+from warp_lcp.grid.part import ONE_PROCESS
+from warp_lcp.grid.particles import SORTED, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.coverage import start_of
 from warp_lcp.material.particle_assembly import (
@@ -38,6 +40,7 @@ from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.material.wall import Join, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.rows.joined import joined
 from warp_lcp.rows.program import LaunchGraph, copy
@@ -46,8 +49,9 @@ from warp_lcp.simulation import Cells, Part, SimulationFailed, StepFailed, misse
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
-    from warp_lcp.granular.distributed import DistributedSand
 
+METHODS_ON_RANKS = ("accelerated-projection",)  # that solve problems of several ranks
+STEP_WORK = 1 << 9  # cells full of sand whose work is that which a step takes however little there is of it
 FRONT = 99.0  # percentile of the particles that runout and height are of
 FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step
 JAMMED = "solids or a source may enclose sand: move them less or slower; deep sand may need more solver.max_iterations"
@@ -82,19 +86,21 @@ class SandSimulation(ParticleSimulation):
         """Allocate the fields and find the sand's cells."""
         self.method = METHODS[scene.solver.method]()
         self._at_rest = scene.particles.per_axis**grid.dimension
-        self._percentiles = Front(grid.device) if grid.device.is_cuda and not self.shared else None
+        self._percentiles = Front(grid.device) if grid.device.is_cuda and not grid.part.shared else None
         super().__init__(scene, grid, parts, particles, **more)
-        self.measure_particles()
+        if self._percentiles is not None:
+            self.diagnostics.append(self._measure_front)
+            self._measure_front()
         self._start = self._front()[0]
         self.mark()
 
     def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate the fields of a grid."""
         super().allocate(grid, parts)
-        scene, self.solids, self.sides = self.scene, parts.solids, parts.boundary.sides
+        scene, self.solids = self.scene, parts.solids
         self._base, self.density = grid.field(wp.int8), grid.field()
         self._completion, self._density_to_grid = (
-            LaunchGraph(grid.device, record, at_once=self.shared) for record in (self._launch_completion, self._launch_density)
+            LaunchGraph(grid.device, record, at_once=grid.part.shared) for record in (self._launch_completion, self._launch_density)
         )
         self.packing = Packing(grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
         self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
@@ -113,11 +119,12 @@ class SandSimulation(ParticleSimulation):
         wp.copy(self._base, self.solids.base)
 
     def mark(self) -> None:
-        """Mark the cells that hold sand, for frames before the first step."""
-        self._place_solids()
-        wp.copy(self._base, self.solids.base)
-        self._find_density(self.grid.everywhere)
-        self.packing.update(self.density, self.velocity, 1.0)
+        """Mark the cells that hold sand, for frames before the first step; collective."""
+        with self.particles.exchange.with_ghosts(SORTED):
+            self._place_solids()
+            wp.copy(self._base, self.solids.base)
+            self._find_density(self.grid.everywhere)
+            self.packing.update(self.density, self.velocity, 1.0)
 
     def _reached(self, totals: ParticleTotals) -> Window:
         """Return the window of cells that particles can reach in a step."""
@@ -153,7 +160,7 @@ class SandSimulation(ParticleSimulation):
             SimulationFailed: something is not finite, or a particle has left the domain.
             ValueError: dt is not positive.
         """
-        with joined(self.grid.device):
+        with self.attempt(), joined(self.grid.device):
             return self._step(dt)
 
     def _step(self, dt: float) -> Row:
@@ -163,12 +170,16 @@ class SandSimulation(ParticleSimulation):
         self.particles_to_grid(window)
         solved = self._solve(window, dt)
         self._measure_stresses()
-        self.extrapolate_velocity(window, self.outcome.known, self.packing.kind, self.outcome.contact)
+        try:
+            self.extrapolate_velocity(window, self.outcome.known, self.packing.kind, self.outcome.contact, dt)
+        except StepFailed:
+            self.stress.roll_back()
+            raise
         if self.sources is not None:
             self.sources.hold(self.velocity, [], self.packing.kind)
         self.grid_to_particles(window, self.packing.kind, dt)
         below, most = self._mass_below(), self._most()
-        row = self.move(dt, window) | self._measured()
+        row = self.move(dt, window, self.density) | self._measured()
         self._place_solids()
         runout, height = self._front()
         rate = self._flow_rate(below, row, dt)
@@ -186,14 +197,10 @@ class SandSimulation(ParticleSimulation):
             return {}
         return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
 
-    def measure_particles(self) -> None:
+    def _measure_front(self) -> None:
         """Launch the percentiles of runout and height, on CUDA."""
         if self._percentiles is not None:
             self._percentiles.find(self.particles, percentile_place(self.particles.count))
-
-    def known_density(self) -> wp.array | None:
-        """Return the density from which the packing was computed."""
-        return self.density
 
     def own_columns(self) -> tuple[str, ...]:
         """Return the log columns of stresses and shape of the sand.
@@ -227,7 +234,7 @@ class SandSimulation(ParticleSimulation):
         shown = {name: field[at] for name, field in fields.items()}
         return [
             points,
-            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, shown, self.image_counts),
+            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, shown, self.image_counts, grid.part.corners),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -269,13 +276,9 @@ class SandSimulation(ParticleSimulation):
         self.grid.part.fill(self.packing.kind, self.packing.fraction, self.outcome.ratio)
         self._start = float(state["front_at_start"])
 
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restore `state`.
-
-        Raises:
-            ValueError: the arrays do not belong to this scene.
-        """
-        super().restore(state)
+    def _take_clock(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on at the time of a state, with its bodies, and solids where they are then."""
+        super()._take_clock(state)
         self._place_solids()
 
     def _place_solids(self) -> None:
@@ -327,7 +330,7 @@ class SandSimulation(ParticleSimulation):
                 self.sources.hold(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()
-        if self.grid.device.is_cuda and self.flights is not None and self.sources is None and not self.shared:
+        if self.grid.device.is_cuda and self.flights is not None and self.sources is None and not self.grid.part.shared:
             with self.watch.stage("bodies in flight", packing.kind):  # whose number comes with what the solve has to tell
                 self.flights.find(window, self.weights, packing.kind)
         impulse = self.kick_dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
@@ -340,10 +343,8 @@ class SandSimulation(ParticleSimulation):
             solved = self.solve_stress(scale)
         residual, first = math.hypot(*(part / scale for part in stress.last_residual)), solved.history[0].residual / scale
         if solved.status is wl.SolveStatus.NON_FINITE:
-            self.restore_bodies()
             raise SimulationFailed(f"step {self.step_count}: the stresses are not finite after {solved.iterations} iterations")
         if solved.status is not wl.SolveStatus.CONVERGED and residual > FAR and self._gains(scale):
-            self.restore_bodies()
             stress.roll_back()
             left = f"residual of {residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and would add energy to the sand"
             raise missed_by_far("stress", solved.status, solved.iterations, left, JAMMED)
@@ -403,17 +404,6 @@ class SandSimulation(ParticleSimulation):
         else:
             walls = s.index, s.separating, s.velocity
             extend_velocity(window, self.velocity, self.weights, known, kind, contact, *walls, self.layers, join=join)
-
-    def _layer_filled(self) -> Join | None:
-        others, sides = super()._layer_filled(), self.sides
-        if others is None or sides is None:
-            return others if sides is None else sides.wrap
-
-        def join(marks: wp.array, field: wp.array) -> None:
-            others(marks, field)
-            sides.wrap(marks, field)
-
-        return join
 
     def _front(self) -> tuple[float, float]:
         """Return the 99th percentile of x and of y [m]."""
@@ -476,21 +466,22 @@ class GranularSimulator:
     summary = "sand that flows, piles up and comes to rest"
     scene_model = SandScene
 
-    def create(self, scene: Scene, *, device: str, folder: Path) -> SandSimulation:
-        """Build the simulation of a scene.
+    def create(self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None) -> SandSimulation:
+        """Build the simulation of a scene, on several ranks this rank's part of it; then collective.
 
         Args:
             scene: a SandScene.
             device: a Warp device's name.
             folder: folder of the files that the scene names.
+            ranks: that share it, for which the scene is the same; None: one process.
 
         Raises:
-            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed. On all ranks.
         """
         if not isinstance(scene, SandScene):
             raise ValueError("scene.simulator: granular needs a scene of sand")
         placed = placed_solids(scene, folder)
-        bodies = make_bodies(scene, placed)
+        bodies = make_bodies(scene, placed, partial(RigidBodies, ranks=ranks or ONE_PROCESS))
         cuts = scene.solver.method == "accelerated-projection"
         warnings: list[str] = []
 
@@ -500,16 +491,20 @@ class GranularSimulator:
             warnings[:] = [*notes, *solids.notes]
             return Parts(boundary, make_sources(scene, grid, boundary, folder), solids=solids)
 
-        coverage, grid = start_of(scene, device, make_parts)
+        if ranks is None:
+            coverage, grid = start_of(scene, device)
+        else:
+            from warp_lcp.distributed.balance import Balance  # what it needs is an extra
+            from warp_lcp.distributed.particle_assembly import part_of
+
+            shown = [key for key in ("surface", "volume") if scene.endless and getattr(scene.output, key)]
+            refused = [f"output.{key} where an axis is periodic" for key in shown]  # they end at sides that ranks do not have
+            balance = Balance(fixed=STEP_WORK)
+            coverage, grid = None, part_of(scene, ranks, device, methods=METHODS_ON_RANKS, refused=refused, balance=balance).grid
         parts = make_parts(grid)
         particles, notes = make_particles(scene, grid, parts.boundary, folder)
         outlets, spray = make_outlets(scene, grid, folder), make_spray(scene, coverage, placed)
         return SandSimulation(
-            scene, grid, parts, particles, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray, notes=(*warnings, *notes)
+            scene, grid, parts, particles, make_parts=make_parts, outlets=outlets, bodies=bodies, coverage=coverage, spray=spray,
+            notes=(*warnings, *notes),
         )  # fmt: skip
-
-    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSand:
-        """Build this rank's part of a simulation; see `granular.distributed.create`."""
-        from warp_lcp.granular.distributed import create  # what it needs is an extra
-
-        return create(scene, ranks, device=device, folder=folder)

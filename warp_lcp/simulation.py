@@ -234,8 +234,14 @@ class Resampled(Protocol):
 
 
 @runtime_checkable
-class Joined(Protocol):
-    """What a Simulation may also be: one that can go on where several MPI ranks ended."""
+class Joined(Simulation, Protocol):
+    """What a Simulation may also be: one that several MPI ranks share, or that can go on where several ended.
+
+    On several ranks it is a rank's part: `stable_dt`, `step`, `frame`, `restore` (the state of one process) and `restore_pieces` are
+    collective. Times, rows of the log and columns are those of the whole simulation, the same on all ranks, which also raise the same kind
+    of error. `frame` returns what this rank has, in coordinates of the whole domain; `state` returns this rank's piece of the state, whose
+    `box`, int (2, 3), is its part's first cell and the one behind the last.
+    """
 
     def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Continue from the pieces of all ranks of a run, which need not have been as many. An array is read when it is asked for.
@@ -243,15 +249,3 @@ class Joined(Protocol):
         Raises:
             ValueError: the pieces do not belong to this scene.
         """
-
-
-class DistributedSimulation(Simulation, Joined, Protocol):
-    """A rank's part of a simulation that several MPI ranks share.
-
-    `stable_dt`, `step`, `restore` (the state of one process) and `restore_pieces` are collective. Times, rows of the log and columns are
-    those of the whole simulation, the same on all ranks, which also raise the same kind of error. `frame` returns what this rank has, in
-    coordinates of the whole domain.
-    """
-
-    def piece_state(self) -> dict[str, np.ndarray]:
-        """Return this rank's part of the state; `box`, int (2, 3), is its part's first cell and the one behind the last."""

@@ -83,7 +83,7 @@ class Dots:
         fields = {"velocity": np.pad(self.velocity, ((0, 0), (0, 1))), "identity": self.identity}
         return [Points("particles", points, fields), Cells("grid", index, 1.0 / CELLS, 2, {"wall": index[:, 1] == 0}, (CELLS, CELLS, 1))]
 
-    def piece_state(self) -> dict[str, np.ndarray]:
+    def state(self) -> dict[str, np.ndarray]:
         box = np.array([[self.low, 0, 0], [self.high, CELLS, 1]])
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count)}
         return {"box": box, "position": self.position, "velocity": self.velocity, "identity": self.identity, **clock}
@@ -92,8 +92,6 @@ class Dots:
         names = "position", "velocity", "identity"
         self._take(*(np.concatenate([piece[name] for piece in pieces]) for name in names))
         self.time, self.step_count = float(pieces[0]["time"]), int(pieces[0]["step_count"])
-
-    state = piece_state
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         self.restore_pieces([state])
@@ -115,10 +113,9 @@ class DotsSimulator:
     summary = "dots that fall, on ranks too"
     scene_model = Scene
 
-    def create(self, scene: Scene, *, device: str, folder: Path) -> Dots:
-        return Dots(scene, Ranks(SimpleNamespace(rank=0, size=1)))
-
-    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Dots:
+    def create(self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None) -> Dots:
+        if ranks is None:
+            return Dots(scene, Ranks(SimpleNamespace(rank=0, size=1)))
         if os.environ.get("DOTS_REFUSE"):
             raise ValueError(os.environ["DOTS_REFUSE"].format(rank=ranks.rank))
         return Dots(scene, ranks)

@@ -11,13 +11,12 @@ import small_liquids
 import small_sands
 from small_liquids import box
 from warp_lcp.distributed.balance import Balance
-from warp_lcp.distributed.particle_simulation import SharedParticleSimulation
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.fluids import viscosity_multigrid
-from warp_lcp.fluids.distributed import create
 from warp_lcp.frames.pieces import one_mesh
 from warp_lcp.frames.vtu import Mesh
 from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.simulation import SimulationFailed, StepFailed
@@ -155,14 +154,14 @@ def advance(simulation, steps=STEPS):
     return rows
 
 
-def start(ranks: Ranks, name: str, **tables) -> SharedParticleSimulation:
+def start(ranks: Ranks, name: str, **tables) -> ParticleSimulation:
     """Return a simulation on ranks."""
     return on_ranks(ranks, scene(**(SCENES[name] | tables)))
 
 
-def on_ranks(ranks: Ranks, given: ParticleScene) -> SharedParticleSimulation:
+def on_ranks(ranks: Ranks, given: ParticleScene) -> ParticleSimulation:
     """Return the simulation of a scene on ranks."""
-    return simulators()[given.scene.simulator].create_distributed(given, ranks, device="cpu", folder=Path())
+    return simulators()[given.scene.simulator].create(given, device="cpu", folder=Path(), ranks=ranks)
 
 
 def run(ranks: Ranks, folder: Path) -> None:
@@ -170,11 +169,11 @@ def run(ranks: Ranks, folder: Path) -> None:
     moved = []
     for name in SCENES:
         simulation = start(ranks, name)
-        rows, cut = advance(simulation, 3), simulation.part.decomposition.parts
+        rows, cut = advance(simulation, 3), simulation.grid.part.decomposition.parts
         if ranks.size == 4:
-            simulation.balance = EAGER
+            simulation.grid.part.balance = EAGER
         rows += advance(simulation, STEPS - 3)
-        moved += [name] if simulation.part.decomposition.parts != cut else []
+        moved += [name] if simulation.grid.part.decomposition.parts != cut else []
         ranks.agree("the log", rows)
         everyone = ranks.comm.allgather(list(simulation.frame()))
         assert sum(len(points.points) for points, *_ in everyone) == rows[-1]["particles"]
@@ -182,7 +181,7 @@ def run(ranks: Ranks, folder: Path) -> None:
         assert [part.name for part in bodies] == ["bodies"] * (simulation.bodies is not None)  # of one rank
         cells = np.concatenate([cells.index for _, cells, *_ in everyone])
         assert len(np.unique(cells, axis=0)) == len(cells)
-        box_ = simulation.part.box
+        box_ = simulation.grid.part.box
         assert ((everyone[ranks.rank][1].index >= box_.low) & (everyone[ranks.rank][1].index < box_.high)).all()
         assert everyone[ranks.rank][1].box == (box_.low, box_.high)
         pressure = np.concatenate([cells.fields["pressure"] for _, cells, *_ in everyone])
@@ -223,9 +222,9 @@ def keep(ranks: Ranks, folder: Path) -> None:
     """Run in two halves, and keep the pieces of the state between."""
     for name in RESUMED:
         simulation = start(ranks, name)
-        simulation.balance = EAGER
+        simulation.grid.part.balance = EAGER
         first = advance(simulation, 5)
-        np.savez(folder / f"{name}_piece_{ranks.rank}.npz", **simulation.piece_state())
+        np.savez(folder / f"{name}_piece_{ranks.rank}.npz", **simulation.state())
         rows = first + advance(simulation, 5)
         if ranks.is_root:
             (folder / f"{name}_whole.json").write_text(json.dumps(rows))
@@ -237,7 +236,7 @@ def go_on(ranks: Ranks, folder: Path) -> None:
     for name in reversed(RESUMED):
         pieces = [dict(np.load(file)) for file in sorted(folder.glob(f"{name}_piece_*.npz"))]
         simulation = start(ranks, name)
-        simulation.balance = EAGER
+        simulation.grid.part.balance = EAGER
         simulation.restore_pieces(pieces)
         rows = advance(simulation, 5)
         if ranks.is_root:
@@ -251,10 +250,10 @@ def go_on(ranks: Ranks, folder: Path) -> None:
 def fail(ranks: Ranks, folder: Path) -> None:
     """Fail on all ranks alike, with the state as it was, and go on after it."""
     simulation = start(ranks, "cut", solver={"tolerance": 1e-9, "max_iterations": 1})
-    before = simulation.piece_state()
+    before = simulation.state()
     with pytest.raises(StepFailed, match="MAX_ITERATIONS"):
         simulation.step(DT)
-    after = simulation.piece_state()
+    after = simulation.state()
     assert simulation.step_count == 0
     assert (np.sort(before["place"]) == np.sort(after["place"])).all()
     sand = start(ranks, "sand", sand=[box([0.0, 0.1, 0.0], [0.5, 0.4, 0.5], velocity=[0.5, 0.0, 0.5])])
@@ -281,7 +280,7 @@ def fail(ranks: Ranks, folder: Path) -> None:
 
 def dam(ranks: Ranks, folder: Path) -> None:
     """Run the scene that comes with the package."""
-    simulation = create(load_scene("dam-break"), ranks, device="cpu", folder=Path())
+    simulation = on_ranks(ranks, load_scene("dam-break"))
     rows = advance(simulation, DAM_STEPS)
     if ranks.is_root:
         (folder / "dam.json").write_text(json.dumps(rows))

@@ -65,7 +65,7 @@ def single(model_) -> ParticleSimulation:
 
 def alone(model_, **options):
     """Return a simulation on one rank, for which no MPI is needed."""
-    return simulators()[model_.scene.simulator].create_distributed(model_, Ranks(Seat(0, 1)), device="cpu", folder=Path(), **options)
+    return simulators()[model_.scene.simulator].create(model_, device="cpu", folder=Path(), ranks=Ranks(Seat(0, 1)), **options)
 
 
 ONE_RANK = (
@@ -91,7 +91,7 @@ ONE_RANK = (
 def test_one_rank_is_one_process_bit_for_bit(name):
     one, shared = single(model(name)), alone(model(name))
     assert advance(shared, 6) == advance(one, 6)
-    state, piece = one.state(), shared.piece_state()
+    state, piece = one.state(), shared.state()
     for array in shared.particles.arrays():
         np.testing.assert_array_equal(piece[array], state[array])
     for array, field in fields_of(state).items():
@@ -191,7 +191,7 @@ def test_failures_are_those_of_all_ranks(mpi, tmp_path):
 def test_pieces_of_any_boxes_can_be_read():
     simulation = alone(model("flat"))
     advance(simulation, 3)
-    whole = simulation.piece_state()
+    whole = simulation.state()
     pieces = []
     for low, high in ((0, 13), (13, 32)):
         mine = (whole["position"][:, 0] < 0.55) if low == 0 else (whole["position"][:, 0] >= 0.55)  # some have not moved on yet
@@ -200,7 +200,7 @@ def test_pieces_of_any_boxes_can_be_read():
         pieces.append(whole | part | fields | {"box": np.array([[low, 0, 0], [high, 16, 1]])})
     again = alone(model("flat"))
     again.restore_pieces(pieces[::-1])
-    for name, values in again.piece_state().items():
+    for name, values in again.state().items():
         np.testing.assert_array_equal(values, whole[name])
     assert advance(again, 3) == advance(simulation, 3)
 
@@ -211,7 +211,7 @@ def test_a_source_keeps_its_cells_in_other_boxes_wherever_bodies_are():
     simulation = alone(scene(**(HEAP | {"solid": [falling], "source": [source]})))
     advance(simulation, 10)
     cells, bodies = simulation.sources._cells, simulation.bodies.state()["bodies"]
-    simulation._work_on(simulation.part.repartition(simulation.part.decomposition))
+    simulation._work_on(simulation.grid.part.repartition(simulation.grid.part.decomposition))
     np.testing.assert_array_equal(simulation.sources._cells, cells)
     np.testing.assert_array_equal(simulation.bodies.state()["bodies"], bodies)
 
@@ -237,7 +237,7 @@ def damaged(name, change):
     """Return a piece of which something is changed."""
     simulation = alone(model(name))
     advance(simulation, 1)
-    piece = dict(simulation.piece_state())
+    piece = dict(simulation.state())
     change(piece)
     return simulation, piece
 

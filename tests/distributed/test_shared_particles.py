@@ -7,7 +7,7 @@ import pytest
 from turns import Seat, on_ranks
 
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.particles import REACH, SharedParticles
+from warp_lcp.distributed.particles import REACH
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import SORT_EVERY, Particles
@@ -20,7 +20,7 @@ SPACING = 0.03
 def part_of(seat: Seat, counts: tuple[int, int, int], periodic: tuple[int, ...] = ()) -> Subdomain:
     """Return a rank's part of a grid."""
     dimension, boxes = 2 if counts[2] == 1 else 3, Decomposition(counts, Ranks(seat), periodic=periodic)
-    return Subdomain(boxes, spacing=SPACING, dimension=dimension, device="cpu", layers=LAYERS)
+    return Subdomain(boxes, spacing=SPACING, dimension=dimension, device="cpu", layers=LAYERS, mailbox=seat)
 
 
 def cells_of(position: np.ndarray) -> np.ndarray:
@@ -49,9 +49,9 @@ def moved(position: np.ndarray, counts: tuple[int, int, int], step: int) -> np.n
     return result
 
 
-def in_order(particles: SharedParticles) -> tuple[np.ndarray, np.ndarray]:
+def in_order(particles: Particles) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities in the order in which sums take them."""
-    order = np.argsort(particles.place)
+    order = np.argsort(particles.exchange.place)
     return particles.position.numpy()[order], particles.velocity.numpy()[order]
 
 
@@ -73,7 +73,7 @@ def test_particles_go_to_the_rank_of_their_cell_in_the_order_of_one_process(coun
     def work(seat: Seat) -> list[tuple[np.ndarray, np.ndarray]]:
         part = part_of(seat, counts)
         mine = part.owners(cells_of(position)) == seat.rank
-        particles = SharedParticles(part, position[mine], velocity[mine], affine=True, post=seat)
+        particles = Particles(part.grid, position[mine], velocity[mine], affine=True)
         particles.sort()
         rows = []
         for step in range(steps):
@@ -81,7 +81,7 @@ def test_particles_go_to_the_rank_of_their_cell_in_the_order_of_one_process(coun
             with_ghosts = in_order(particles)
             if particles.runs is not None:
                 order = [np.arange(*run) for run in particles.runs.numpy().reshape(-1, 2)]
-                assert (np.diff(particles.place[np.concatenate(order)]) > 0).all()
+                assert (np.diff(particles.exchange.place[np.concatenate(order)]) > 0).all()
             particles.drop_ghosts()
             rows.append((*with_ghosts, *in_order(particles)))
             particles.position.assign(moved(particles.position.numpy(), counts, step))
@@ -110,14 +110,14 @@ def test_particles_go_around(counts, size, periodic):
         part = part_of(seat, counts, periodic)
         low, high = ((np.array(corner) - 0.5) * SPACING for corner in (part.box.low, part.box.high))
         mine = part.owners(cells_of(position)) == seat.rank
-        particles = SharedParticles(part, position[mine], velocity[mine], affine=True, post=seat)
+        particles = Particles(part.grid, position[mine], velocity[mine], affine=True)
         particles.sort()
         for step in range(SORT_EVERY + 3):
             everyone = np.concatenate(seat.allgather(particles.position.numpy().astype(float)))
             assert len(everyone) == len(position)
             particles.arrange(step)
             found = particles.position.numpy().astype(float)
-            assert len(np.unique(particles.place)) == len(found)
+            assert len(np.unique(particles.exchange.place)) == len(found)
             images = [x + np.array(shift) * SPACING for shift in part.decomposition.shifts for x in everyone]
             near = np.array([x for x in images if within(x, low, high)])
             seen = found[within(found, low, high)]
@@ -143,7 +143,7 @@ def test_gradients_travel_with_their_particles():
     def work(seat: Seat) -> bool:
         part = part_of(seat, counts)
         mine = part.owners(cells_of(position)) == seat.rank
-        particles = SharedParticles(part, position[mine], velocity[mine], affine=True, post=seat)
+        particles = Particles(part.grid, position[mine], velocity[mine], affine=True)
         particles.sort()
         for step in range(3):
             for n, gradient in enumerate(particles.affine):
@@ -168,7 +168,7 @@ def test_sums_are_of_all_ranks_and_count_each_particle_once():
         mine = (part.owners(cells_of(position)) == seat.rank) if seat.rank else np.zeros(len(position), dtype=bool)
         if seat.rank == 1:  # that of rank 0 has not moved on yet
             mine |= part.owners(cells_of(position)) == 0
-        particles = SharedParticles(part, position[mine], velocity[mine], affine=False, post=seat)
+        particles = Particles(part.grid, position[mine], velocity[mine], affine=False)
         return particles.totals()
 
     for totals in on_ranks(8, work):
@@ -187,7 +187,7 @@ def test_particles_that_are_not_finite_are_counted_on_all_ranks():
     def work(seat: Seat) -> Any:
         part = part_of(seat, counts)
         half = slice(0, 20) if seat.rank == 0 else slice(20, 40)
-        return SharedParticles(part, position[half], velocity[half], affine=False, post=seat).totals()
+        return Particles(part.grid, position[half], velocity[half], affine=False).totals()
 
     for totals in on_ranks(2, work):
         assert (totals.count, totals.bad_positions, totals.bad_velocities, totals.finite) == (40, 1, 1, False)
@@ -200,7 +200,7 @@ def test_a_rank_may_have_no_particle():
     def work(seat: Seat) -> int:
         part = part_of(seat, counts)
         n = 1 - seat.rank
-        particles = SharedParticles(part, position[:n], np.ones((n, 3), dtype=np.float32), affine=True, post=seat)
+        particles = Particles(part.grid, position[:n], np.ones((n, 3), dtype=np.float32), affine=True)
         particles.sort()
         for step in range(2):
             particles.arrange(step)

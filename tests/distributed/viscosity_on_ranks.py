@@ -9,8 +9,7 @@ from small_liquids import create as create_alone
 from viscous_scenes import viscous_scene
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.fluids import viscosity_multigrid
-from warp_lcp.fluids.distributed import create
-from warp_lcp.fluids.simulator import LiquidSimulation
+from warp_lcp.fluids.simulator import FluidsSimulator, LiquidSimulation
 
 SEEDS = (10, 21, 27)  # 3-D and 2-D, cut along rows and across, with two to four shared levels and cores that lie in one box or in both
 ROUNDING = 1e-6  # where a cut lies in a row, other cells of it are computed together
@@ -20,7 +19,7 @@ STIFF = {"value": 300.0}
 def applied(simulation: LiquidSimulation, whole: np.ndarray) -> list[np.ndarray]:
     """Return z = M r and A z on the cells of a simulation, shape (d, nz, ny, nx), of r as it is on the whole grid."""
     multigrid, grid = simulation.viscosity.multigrid, simulation.grid
-    own = simulation.part.owned if simulation.shared else grid.domain
+    own = grid.part.owned
     inside = tuple(slice(low, high) for low, high in zip(own.low, own.high, strict=True))
     place = tuple(slice(s.start - 1 + o, s.stop - 1 + o) for s, o in zip(inside, grid.origin[::-1], strict=True))
     r, q = np.zeros((grid.dimension, *grid.shape), dtype=np.float32), wp.zeros_like(multigrid.r)
@@ -39,15 +38,15 @@ def main() -> None:
     for seed in SEEDS:
         scene = viscous_scene(seed)
         scene = scene.model_copy(update={"viscosity": scene.viscosity.model_copy(update=STIFF)})
-        shared, alone = create(scene, ranks, device="cpu", folder=Path()), create_alone(scene)
+        shared, alone = FluidsSimulator().create(scene, device="cpu", folder=Path(), ranks=ranks), create_alone(scene)
         for simulation in (shared, alone):
             simulation.step(0.01)
         assert len(shared.viscosity.multigrid.levels) > 1
         whole = np.random.default_rng(7 * seed).standard_normal((scene.dimension, *scene.cell_counts[::-1])).astype(np.float32)
-        box = (slice(None), *shared.part.box.slices)
+        box = (slice(None), *shared.grid.part.box.slices)
         for found, expected in zip(applied(shared, whole), applied(alone, whole), strict=True):
             error, largest = float(ranks.max(np.abs(found - expected[box]).max())), float(np.abs(expected).max())
-            assert error <= ROUNDING * largest * bool(shared.part.decomposition.processes[0] > 1), f"seed {seed}: {error} of {largest}"
+            assert error <= ROUNDING * largest * bool(shared.grid.part.decomposition.processes[0] > 1), f"seed {seed}: {error} of {largest}"
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from warp_lcp.granular.scene import SandScene
 from warp_lcp.grid import vicinity
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material import coverage as module
-from warp_lcp.material.coverage import Coverage, box_of, carry_over
+from warp_lcp.material.coverage import Coverage, carry_over
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.scene import MOST_CELLS
 from warp_lcp.scene.table import SceneError
@@ -133,7 +133,7 @@ def test_it_pays_for_what_there_is() -> None:
 
 
 def test_grids_are_laid_where_the_material_leaves_them() -> None:
-    laid = Coverage(DOMAIN, lambda grid: None)
+    laid = Coverage(DOMAIN)
     first = laid.around([40, 40, 20], [70, 60, 40])
     assert all(low % module.ALIGNED == 0 for low in first.origin)
     moving = laid.around([40, 40, 20], [70, 60, 40], pace=(np.zeros(3), np.array([0.25, 9.0, 0.0])))
@@ -144,11 +144,11 @@ def test_grids_are_laid_where_the_material_leaves_them() -> None:
     assert laid.around([50, 40, 20], [51, 41, 21], first).size < first.size / module.LOOSE
     assert laid.around([0, 0, 0], [150, 90, 60]) is DOMAIN  # more than half of it
     assert laid.around([-50, 200, 0], [-40, 300, 9]).domain_counts == DOMAIN.counts  # beyond it
-    assert Coverage(DOMAIN, lambda grid: None, follows=False).around([40, 40, 20], [41, 41, 21]) is DOMAIN
-    always = Coverage(DOMAIN, lambda grid: None, always=(([90, 90, 60], [91, 91, 61]),), endless=[2])
+    assert Coverage(DOMAIN, follows=False).around([40, 40, 20], [41, 41, 21]) is DOMAIN
+    always = Coverage(DOMAIN, always=(([90, 90, 60], [91, 91, 61]),), endless=[2])
     kept = always.around([40, 40, 20], [50, 50, 30])
     assert kept.covers([40, 40, 0], [91, 91, 63])
-    assert laid.at(box_of(first)["box"]) == first
+    assert laid.at(first.part.where()["box"]) == first
     assert laid.at(None) is DOMAIN
     with pytest.raises(ValueError, match=r"not in this scene's \(200, 96, 64\)"):
         laid.at(np.array([[0, 0, 0], [201, 9, 9]]))

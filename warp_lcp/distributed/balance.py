@@ -5,13 +5,16 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warp_lcp.distributed.decomposition import OPEN, Decomposition, Triple, cuttings, parts, seen_by
-from warp_lcp.distributed.particles import SharedParticles
-from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.grid.particles import Particles
 from warp_lcp.multigrid.halo_levels import GATHERED
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.subdomain import Subdomain
 
 STEP = 1 << 13  # cells full of material whose work is that which a step takes however little there is of it
 BLOCKS = 128  # of a rank, five along an axis
@@ -131,11 +134,11 @@ class Balance:
     bound: float = 1.25
     fixed: float = STEP
 
-    def due(self, part: Subdomain, step: int) -> bool:
+    def should_rebalance(self, part: Subdomain, step: int) -> bool:
         """Return whether a step looks for other cuts."""
         return part.ranks.size > 1 and step % self.every == 0
 
-    def better(self, part: Subdomain, particles: SharedParticles, a_cell: int) -> Decomposition | None:
+    def rebalance(self, part: Subdomain, particles: Particles, a_cell: int) -> Decomposition | None:
         """Return boxes that are so much better that the ranks should have them; collective. None: those they have will do.
 
         Args:
@@ -145,7 +148,8 @@ class Balance:
         """
         now, layers, fixed = part.decomposition, part.layers, self.fixed
         work = [
-            n / a_cell + OPEN * seen for n, seen in zip(particles.counts, seen_by(now.counts, now.parts, layers).ravel("F"), strict=True)
+            n / a_cell + OPEN * seen
+            for n, seen in zip(particles.exchange.counts, seen_by(now.counts, now.parts, layers).ravel("F"), strict=True)
         ]
         if max(work) + fixed <= self.bound * (math.fsum(work) / len(work) + fixed):  # the same on all ranks
             return None
@@ -165,7 +169,7 @@ def edge_of_blocks(counts: Triple, ranks: int) -> int:
     return edge
 
 
-def blocks(part: Subdomain, particles: SharedParticles, edge: int) -> np.ndarray:
+def blocks(part: Subdomain, particles: Particles, edge: int) -> np.ndarray:
     """Return how many of all ranks' particles each block of cells has; collective."""
     counts = part.decomposition.counts
     shape = [-(-n // edge) for n in counts]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.subdomain import Subdomain
+if TYPE_CHECKING:
+    from warp_lcp.distributed.subdomain import Subdomain
 
 LEAST_RIGHT = 2  # layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so far
 

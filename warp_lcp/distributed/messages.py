@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import warp as wp
@@ -17,6 +17,48 @@ from warp_lcp.rows.team import Operation, launched_alone
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.halo import StarForest
+
+COUNT, DATA = 7101, 7102  # tags of messages
+
+
+class Mailbox(Protocol):
+    """Carries messages from each rank to its neighbors."""
+
+    def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+        """Return what the neighbors have sent, in the order of their ranks.
+
+        Args:
+            outgoing: an array of one type for every neighbor, of any length.
+        """
+
+
+class MpiMailbox:
+    """Messages of MPI.
+
+    Args:
+        comm: of mpi4py.
+    """
+
+    def __init__(self, comm: Any) -> None:
+        self._comm = comm
+
+    def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+        """Send lengths, then what is not empty."""
+        from mpi4py import MPI
+
+        neighbors, comm = sorted(outgoing), self._comm
+        sizes = np.array([[len(outgoing[rank]) for rank in neighbors], [0] * len(neighbors)], dtype=np.int64)
+        requests = [comm.Irecv(sizes[1, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
+        requests += [comm.Isend(sizes[0, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
+        with waiting("counts of migrating particles"):
+            MPI.Request.Waitall(requests)
+        kind = outgoing[neighbors[0]].dtype if neighbors else np.dtype(np.int64)
+        incoming = [np.empty(int(size), dtype=kind) for size in sizes[1]]
+        requests = [comm.Irecv([a.view(np.uint8), MPI.BYTE], rank, DATA) for a, rank in zip(incoming, neighbors, strict=True) if a.size]
+        requests += [comm.Isend([outgoing[rank].view(np.uint8), MPI.BYTE], rank, DATA) for rank in neighbors if outgoing[rank].size]
+        with waiting("particles"):
+            MPI.Request.Waitall(requests)
+        return incoming
 
 
 @wp.func_native("""

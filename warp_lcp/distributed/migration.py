@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.particle_pieces import cells_of
-from warp_lcp.distributed.particles import Post
-from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.material.particle_pieces import Piece, fields_of
 
+if TYPE_CHECKING:
+    from warp_lcp.distributed.subdomain import Subdomain
 
-def handed_over(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subdomain, post: Post) -> Piece:
+
+def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subdomain) -> Piece:
     """Send each rank what of this one's piece lies in the box that it has now, and return the piece of this rank's box; collective.
 
     Args:
@@ -22,7 +24,6 @@ def handed_over(piece: Piece, particles: Sequence[str], before: Subdomain, now: 
         particles: names of the particles' arrays.
         before: the part that the piece is of.
         now: that of other boxes of the same ranks.
-        post: carries messages.
     """
     mine, old, new = now.ranks.rank, before.decomposition.boxes, now.decomposition.boxes
 
@@ -34,12 +35,12 @@ def handed_over(piece: Piece, particles: Sequence[str], before: Subdomain, now: 
     taken = {**piece, "box": np.array([now.box.low, now.box.high])}
     for name in (*particles, "place"):
         values = np.asarray(piece[name])
-        come = post.swap({rank: values[owner == rank].ravel() for rank in others})
+        come = now.mailbox.swap({rank: values[owner == rank].ravel() for rank in others})
         taken[name] = np.concatenate([values[owner == mine], *(found.reshape(-1, *values.shape[1:]) for found in come)])
     for name, values in fields_of(piece).items():
         taken[name] = np.zeros((*values.shape[:-3], *now.box.counts[::-1]), dtype=values.dtype)
         sent = {rank: _cut_out(values, old[mine], new[rank]) for rank in (mine, *others)}
-        for rank, found in zip((mine, *others), [sent.pop(mine), *post.swap(sent)], strict=True):
+        for rank, found in zip((mine, *others), [sent.pop(mine), *now.mailbox.swap(sent)], strict=True):
             box = old[rank].common(new[mine])
             if box.cells:
                 taken[name][..., *box.moved(now.box.low, -1).slices] = found.reshape(*values.shape[:-3], *box.counts[::-1])

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.distributed.decomposition import CellBox
-from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.material.particle_pieces import LATER, Piece, fields_of
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.subdomain import Subdomain
 
 CLOCK = ("time", "step_count", "last_dt")
 
 
 def take_pieces(
     part: Subdomain, particles: Sequence[str], like: Mapping[str, np.ndarray], signature: np.ndarray, pieces: Sequence[Piece],
-    base: wp.array | None,
+    solids: np.ndarray | None,
 ) -> tuple[Piece, Piece, Piece]:  # fmt: skip
     """Take from pieces what lies in this rank's box; collective.
 
@@ -27,7 +29,7 @@ def take_pieces(
         like: what else there is of the part: its fields, `cells` among them, and numbers, which all pieces have alike.
         signature: numbers that tell this scene's state from another's.
         pieces: of all ranks of a run.
-        base: int8, SOLID in cells without material, of the part; None: solids move.
+        solids: int8, SOLID in cells without material, of the part; None: solids move.
 
     Returns:
         By name: the particles with their `place`, the cells of this rank's box, shape (..., nz, ny, nx), and numbers that all pieces have
@@ -59,7 +61,7 @@ def take_pieces(
             raise ValueError("the pieces do not cover the domain: some are missing or duplicated")
         if any(values.dtype.kind == "f" and not np.isfinite(values).all() for values in (*own.values(), *cells.values())):
             raise ValueError("the pieces hold values that are not finite")
-        if base is not None and not np.array_equal(cells["cells"] == wl.SOLID, part.box_of(base.numpy()) == wl.SOLID):
+        if solids is not None and not np.array_equal(cells["cells"] == wl.SOLID, part.box_of(solids) == wl.SOLID):
             raise ValueError("the state's solids are not this scene's")
         return own, cells, numbers
 

@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.extension import Refill, too_far
+from warp_lcp.distributed.flight import TreesAtCuts
 from warp_lcp.distributed.halo import StarForest, star_forest
-from warp_lcp.distributed.messages import exchange_all, exchanging_all
+from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchanging_all
+from warp_lcp.distributed.migration import cuts_of, migrate
+from warp_lcp.distributed.particle_pieces import take_pieces
+from warp_lcp.distributed.particles import ParticleMigration
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.cell_box import CellBox
-from warp_lcp.grid.part import GridPart
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.part import BodyNumbers, Corner, GridPart
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
+from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.particle_pieces import Piece, fields_of
+from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import is_recording, launch, perform
 from warp_lcp.rows.vectors import Across, convert
 
+DEFAULT_BALANCE = Balance()
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
 
 
@@ -73,6 +85,8 @@ class Subdomain(GridPart):
         dimension: 2 or 3.
         device: a Warp device or its name.
         layers: ghost cells at cuts, the ring included.
+        mailbox: carries messages between neighbors; None: MPI's.
+        balance: when ranks look for other boxes.
 
     Attributes:
         grid: the part as a grid, whose coordinates and positions are those of the whole domain.
@@ -85,11 +99,17 @@ class Subdomain(GridPart):
 
     shared = True
 
-    def __init__(self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int) -> None:
+    def __init__(
+        self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int, mailbox: Mailbox | None = None,
+        balance: Balance = DEFAULT_BALANCE,
+    ) -> None:  # fmt: skip
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box, self.joined = decomposition.ranks, decomposition.box, tuple(decomposition.joined)
+        self.balance, self.mailbox = balance, mailbox or MpiMailbox(self.ranks.comm)
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
+        self._trees: TreesAtCuts | None = None
+        self._near: dict[int, tuple[Window, ActiveWindow]] = {}  # by the layers around the box
         for axis in decomposition.cut_axes:
             least, most = min(decomposition.parts[axis]), max(decomposition.counts[axis] // layers, 1)
             if least < layers:
@@ -144,8 +164,66 @@ class Subdomain(GridPart):
 
     def repartition(self, decomposition: Decomposition) -> Subdomain:
         """Return the part that this rank works on with other boxes."""
-        grid = self.grid
-        return Subdomain(decomposition, spacing=grid.spacing, dimension=self.dimension, device=grid.device, layers=self.layers)
+        return Subdomain(
+            decomposition, spacing=self.grid.spacing, dimension=self.dimension, device=self.grid.device, layers=self.layers,
+            mailbox=self.mailbox, balance=self.balance,
+        )  # fmt: skip
+
+    def should_rebalance(self, step: int) -> bool:
+        """Return whether the ranks look for better boxes in a step."""
+        return self.balance.should_rebalance(self, step)
+
+    def rebalance(self, particles: Particles, a_cell: int) -> Subdomain | None:
+        """Return the part with better boxes, see `Balance.rebalance`; None: those there are will do. Collective."""
+        better = self.balance.rebalance(self, particles, a_cell)
+        return None if better is None else self.repartition(better)
+
+    def migrate(self, piece: Piece, particles: Sequence[str], before: Subdomain) -> Piece:
+        """Return the piece of a state that lies in this box, given that of the box before, as all ranks do; collective."""
+        return migrate(piece, particles, before, self)
+
+    def of_pieces(self, pieces: Sequence[Piece]) -> Subdomain | None:
+        """Return the part with the boxes of pieces of a state, this one if they are the same; None: ranks cannot have them. Collective."""
+        with self.decomposition.collective.led():
+            cuts = cuts_of(pieces, self)
+        if cuts is None or cuts == self.decomposition.parts:
+            return None if cuts is None else self
+        return self.repartition(self.decomposition.repartition(cuts))
+
+    def take_pieces(
+        self, pieces: Sequence[Piece], particles: Sequence[str], like: Mapping[str, np.ndarray], signature: np.ndarray,
+        solids: np.ndarray | None,
+    ) -> tuple[Piece, Piece, Piece]:  # fmt: skip
+        """Return what of pieces lies in this box; collective. See `warp_lcp.distributed.particle_pieces.take_pieces`."""
+        return take_pieces(self, particles, like, signature, pieces, solids)
+
+    @property
+    def corners(self) -> tuple[Corner, Corner]:
+        """The first cell (x, y, z) of the box and the one behind its last."""
+        return self.box.low, self.box.high
+
+    def where(self) -> dict[str, np.ndarray]:
+        """Return `box`, int64 (2, 3), the box's first cell and the one behind its last, and `counts`, int64 (3,), the whole grid's."""
+        return {"box": np.array(self.corners), "counts": np.array(self.decomposition.counts)}
+
+    def kept(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return what fields have in the box, shape (..., nz, ny, nx), and numbers among them as they are."""
+        cells = fields_of(fields)
+        return {name: np.ascontiguousarray(self.box_of(values)) if name in cells else values for name, values in fields.items()}
+
+    def refill(self) -> Refill:
+        """Return what fills ghost cells again while velocities are continued, before what is wrong in them comes near the box."""
+        return Refill(self)
+
+    def cells_too_far(self, velocity: Sequence[wp.array], dt: float) -> float:
+        """Return how many cells velocities of any rank move particles out of its ghost layers in a time step; 0: none does."""
+        return float(self.ranks.max(too_far(self, velocity, dt)))
+
+    def notes(self) -> list[str]:
+        """Return how many ranks there are, and how large their boxes."""
+        boxes = self.decomposition.boxes
+        largest = " x ".join(map(str, max(boxes, key=lambda box: box.cells).counts[: self.dimension]))
+        return [f"{len(boxes)} ranks, boxes of up to {largest} cells and {self.layers} layers of ghost cells"]
 
     def coarser(self, layers: int) -> StaggeredGrid | None:
         """Return this rank's part of the grid of cells of twice the edge; None if a cut lies in one, or a box is thinner than `layers`."""
@@ -287,11 +365,21 @@ class Subdomain(GridPart):
         copy_cells(self.box_of(field), x.reshape((nz + 2, ny + 2, nx + 2))[1:-1, 1:-1, 1:-1])
         self.fill(field)
 
-    def gathered(self, box: np.ndarray) -> np.ndarray | None:
-        """Return what all ranks have of their boxes, shape (nz, ny, nx), as an array of the whole grid on the root rank; None elsewhere.
+    @property
+    def gathered_from(self) -> Corner:
+        """The first cell of what `gathered` returns: of the whole domain."""
+        return 0, 0, 0
+
+    def gathered(self, values: np.ndarray) -> np.ndarray | None:
+        """Return what all ranks have of a field in their boxes as an array of the whole grid on the root rank; None elsewhere.
 
         Collective.
+
+        Args:
+            values: of this part without its ring.
         """
+        first = [low - before for low, before in zip(self.box.low, self.grid.origin, strict=True)]
+        box = np.ascontiguousarray(values[CellBox((0, 0, 0), self.box.counts).moved(first).slices])
         with waiting("a gather"):
             everyone = [box] if self.ranks.size == 1 else self.ranks.comm.gather(box)
         if everyone is None:
@@ -300,6 +388,50 @@ class Subdomain(GridPart):
         for part, values in zip(self.decomposition.boxes, everyone, strict=True):
             whole[part.slices] = values
         return whole
+
+    def keep_own(self, cells: np.ndarray) -> None:
+        """Set a mask of the part's cells to False outside the box."""
+        own = tuple(slice(low - 1, high - 1) for low, high in zip(self.owned.low, self.owned.high, strict=True))
+        inside = cells[own].copy()
+        cells[...] = False
+        cells[own] = inside
+
+    def make_boundary(self, scene: ParticleScene, solids: Sequence[PlacedSolid]) -> tuple[Boundary, list[str]]:
+        """Return solids and walls of the part as the whole grid would have them, and warnings; collective."""
+        from warp_lcp.distributed.solids import boundary_of_part  # which knows parts
+
+        return boundary_of_part(scene, self, solids)
+
+    def exchange_of(self, particles: Particles) -> ParticleMigration:
+        """Return what particles on this part have to do with those of other ranks."""
+        return ParticleMigration(self, particles)
+
+    def nearest(self, cells: np.ndarray) -> np.ndarray:
+        """Return cells (x, y, z) of the part, shape (n, 3), along axes without an end those images that are nearest to the box."""
+        for axis in self.joined:
+            count = self.decomposition.counts[axis]
+            first = self.owned.low[2 - axis] - 1 - (count - self.box.counts[axis]) // 2
+            cells[:, axis] = (cells[:, axis] - first) % count + first
+        return cells
+
+    def near(self, window: Window, layers: int) -> Window | None:
+        """Return the cells of a window in the box and some layers around it: a window that moves there, for recorded launches."""
+        if layers not in self._near:
+            low, high = self.owned.low[::-1], [h - 1 for h in self.owned.high[::-1]]
+            around = self.grid.window(low, high, grow=layers)
+            self._near[layers] = around, ActiveWindow(around)
+        around, active = self._near[layers]
+        common = window.common(around)
+        if common is None:
+            return None
+        active.move_to(common)
+        return active
+
+    def join_trees(self, trees: int, seen: Window | None, parent: wp.array, number: wp.array, held: wp.array) -> BodyNumbers:
+        """Join the trees of cells that reach over several ranks' boxes to bodies; collective."""
+        if self._trees is None:
+            self._trees = TreesAtCuts(self)
+        return self._trees.join(trees, seen, parent, number, held)
 
     def owners(self, cells: np.ndarray) -> np.ndarray:
         """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""

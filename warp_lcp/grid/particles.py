@@ -159,13 +159,13 @@ class Particles:
         key: number of the stored cell of each particle when last numbered or sorted, shape (2 capacity,), the first `count` in use.
         offsets: first particle of each stored cell, int32, shape (cells + 1,), at the last sort; None unless `indexed`.
         runs: begin and end of each run of particles that lie in the order in which sums take them, int32, shape (2 runs,); None: all do.
+        exchange: knows the particles of other processes, see `warp_lcp.grid.part.ParticleExchange`.
 
     Raises:
         ValueError: the shapes do not match.
     """
 
     runs: wp.array | None = None
-    room = 1.0  # of the storage over the particles that it is made for
     _order: wp.array  # scratch memory, as large as `key`
     _spare: Column  # where the next reordered column goes
 
@@ -199,6 +199,7 @@ class Particles:
         self._known: ParticleTotals | None = None  # that are right
         self._columns: dict[str, Column] = {}
         self._memory = ListMemory(grid.device)
+        self.exchange = grid.part.exchange_of(self)
         self._grow(0)
         self._publish()
         self.append(position, velocity, kept)
@@ -256,13 +257,14 @@ class Particles:
         if len(position) == 0:
             return
         before = self.count
-        self._resize(before + len(position))
+        self.resize(before + len(position))
         for name, column in self._columns.items():
             if name == "kept":
                 numbers = np.broadcast_to(np.float32(1.0) if kept is None else np.asarray(kept, dtype=np.float32), len(position))
                 column.set_from(before, np.repeat(numbers[:, None], 3, axis=1))
             else:  # sorting may have left anything behind the particles in use
                 column.set_from(before, {"position": position, "velocity": velocity}.get(name, 0.0))
+        self.exchange.appended(len(position))
 
     def make_room(self, count: int) -> int:
         """Add particles at the end and return the index of the first.
@@ -270,7 +272,7 @@ class Particles:
         The caller sets their position, velocity and gradient.
         """
         before = self.count
-        self._resize(before + count)
+        self.resize(before + count)
         return before
 
     @property
@@ -337,12 +339,38 @@ class Particles:
                     inputs = [marks, stay, column.view, self._spare.view]
                     wp.launch(kernels.close_ranks_kernel, self.count, inputs, device=self.grid.device)
                     self._columns[name], self._spare = self._spare, column
-            self._resize(self.count - first - others)
+            self.exchange.removing(marks)
+            self.resize(self.count - first - others)
         return first, others
+
+    def move(self, sources: np.ndarray, targets: np.ndarray) -> None:
+        """Copy the particles with some numbers to where others are.
+
+        Args:
+            sources: their numbers, shape (n,).
+            targets: numbers of those that are overwritten, shape (n,), none among `sources`.
+        """
+        device = self.grid.device
+        if len(sources):
+            of, to = (wp.array(numbers, dtype=wp.int32, device=device) for numbers in (sources, targets))
+            for column in self._columns.values():
+                launch_list(kernels.reorder_kernel, len(sources), [of, column.view, self._spare.view], device=device, cost=4)
+                launch_list(kernels.put_kernel, len(targets), [to, self._spare.view, column.view], device=device, cost=4)
+
+    def take(self, order: np.ndarray) -> None:
+        """Keep the particles with these numbers, in this order."""
+        device, count = self.grid.device, len(order)
+        if count:
+            numbers = wp.array(order.astype(np.int32, copy=False), dtype=wp.int32, device=device, copy=device.is_cuda)
+            for name, column in self._columns.items():
+                launch_list(kernels.reorder_kernel, count, [numbers, column.view, self._spare.view], device=device, cost=4)
+                self._columns[name], self._spare = self._spare, column
+        self.resize(count)
 
     def move_to(self, grid: StaggeredGrid) -> None:
         """Sort the particles by the cells of another grid from now on."""
         self.grid = grid
+        self.exchange.move_to(grid.part)
         for graph in (self._totals, self._numbering, self._sorting):
             graph.forget()
         if self.offsets is not None:
@@ -354,12 +382,17 @@ class Particles:
         Args:
             arrays: float32 of shape (n, 3) for every name of `arrays`.
         """
-        self._resize(len(arrays["position"]))
+        self.resize(len(arrays["position"]))
         for name, view in self.arrays().items():
             view.assign(arrays[name])
 
-    def _resize(self, count: int) -> None:
-        """Use `count` places; those beyond the particles there were hold anything."""
+    def set_runs(self, runs: wp.array) -> None:
+        """Have sums take the particles in the order of `runs`."""
+        self.runs = runs
+        self._memory.take(self.count, {"runs": runs})
+
+    def resize(self, count: int) -> None:
+        """Have this many particles; those beyond the particles there were hold anything."""
         before, self.count, self._known, self._totals_launched = self.count, count, None, False
         if count > self._capacity:
             self._grow(before)
@@ -383,7 +416,7 @@ class Particles:
     def _grow(self, before: int) -> None:
         """Make room for `count` particles and more, and keep those there were `before`."""
         device = self.grid.device
-        self._capacity = max(int(self.room * self.count), int(GROWTH * self._capacity), 1)
+        self._capacity = max(int(self.exchange.room * self.count), int(GROWTH * self._capacity), 1)
         for name in self._names:
             column = Column(self._capacity, self.count, device)
             if before:
@@ -395,28 +428,22 @@ class Particles:
         self._sorting.forget()  # which knows the halves of both
 
     def arrange(self, step: int) -> None:
-        """Number the particles by cell; sort every SORT_EVERY-th step if order allows.
-
-        Sorts in each step where the order is needed.
+        """Take in ghosts and number the particles by cell; sort in every SORT_EVERY-th step, or where the order is needed; collective.
 
         It depends on nothing but the step, so that a run that was interrupted does the same.
 
         Args:
             step: number of the step.
         """
-        if self.offsets is not None or step % SORT_EVERY == 0:
-            self.sort()
-        else:
-            self.number()
+        self.exchange.arrange(sort=self.offsets is not None or step % SORT_EVERY == 0)
 
     def look_around(self) -> None:
-        """Take in the particles within a cell of this process's as ghosts; collective.
-
-        Ghosts have positions alone. One process has all particles already.
-        """
+        """Take in the particles within a cell of this process's as ghosts, with positions alone; collective."""
+        self.exchange.look_around()
 
     def drop_ghosts(self) -> None:
         """Remove the ghosts of other processes."""
+        self.exchange.drop_ghosts()
 
     def number(self) -> None:
         """Find the cell of each particle."""
@@ -429,6 +456,11 @@ class Particles:
 
     def sort(self) -> None:
         """Sort the particles by cell (stable, so that runs are repeatable)."""
+        self.exchange.begin_sort()
+        self._sort_cells()
+        self.exchange.end_sort()
+
+    def _sort_cells(self) -> None:
         grid = self.grid
         if self.count == 0:
             if self.offsets is not None:
@@ -478,7 +510,10 @@ class Particles:
             launch_list(kernels.reorder_kernel, self.count, [self._order, source, target], device=device, cost=4)
 
     def totals(self) -> ParticleTotals:
-        """Return sums over the particles; bitwise reproducible, 0 without particles."""
+        """Return sums over the particles of all processes; bitwise reproducible, 0 without particles. Collective; ghosts are gone."""
+        return self.exchange.joined_totals(self._own_totals())
+
+    def _own_totals(self) -> ParticleTotals:
         if self._known is not None:
             return self._known
         if self.count == 0:
@@ -543,7 +578,7 @@ class Particles:
         """
         grid = self.grid
         cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / grid.spacing)
-        return np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin)
+        return grid.part.nearest(np.clip(cells, 0, np.array(grid.domain_counts) - 1).astype(int) - np.array(grid.origin))
 
     def cell_of(self, position: typing.Sequence[float] | np.ndarray) -> tuple[int, int, int]:
         """Return the interior cell (x, y, z), counted from 0, of one position [m].

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -40,14 +40,12 @@ class Coverage:
 
     Args:
         domain: the grid of the whole domain.
-        make_parts: makes what of a simulation belongs to a grid.
         follows: whether a grid may cover a part of it.
         always: cells that are covered whatever the material does, as low and high corners (both included), shape (n, 2, 3).
         endless: axes without an end, along which all cells are covered.
     """
 
     domain: StaggeredGrid
-    make_parts: Callable[[StaggeredGrid], Any]
     follows: bool = True
     always: tuple[tuple[Corner, Corner], ...] = ()
     endless: Sequence[int] = ()
@@ -122,21 +120,15 @@ class Coverage:
         return StaggeredGrid((nx, ny, nz), domain.spacing, domain.dimension, domain.device, origin=(x, y, z), whole=domain.counts)
 
 
-def start_of(scene: ParticleScene, device: Any, make_parts: Callable[[StaggeredGrid], Any]) -> tuple[Coverage, StaggeredGrid]:
+def start_of(scene: ParticleScene, device: Any) -> tuple[Coverage, StaggeredGrid]:
     """Return what lays a scene's grids, and the first one, around its materials at the start and its sources."""
     whole = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
     boxes = [shape.bounds(scene.dimension) for shape in (*scene.source, *scene.materials()[1])]
     corners = [cells_between(box[0], box[1], whole.spacing, START) for box in boxes if box is not None]
     follows = scene.domain.follow and bool(corners) and len(corners) == len(boxes)
-    coverage = Coverage(whole, make_parts, follows, tuple(corners[: len(scene.source)]), scene.endless)
+    coverage = Coverage(whole, follows, tuple(corners[: len(scene.source)]), scene.endless)
     low, high = zip(*corners, strict=True) if follows else ([0], [0])
     return coverage, coverage.around(np.min(low, axis=0), np.max(high, axis=0))
-
-
-def box_of(grid: StaggeredGrid) -> dict[str, np.ndarray]:
-    """Return `box`, int64 (2, 3), the first cell of a part of a grid and the one behind its last; nothing of a whole one."""
-    low = np.array(grid.origin)
-    return {} if grid.whole is None else {"box": np.array([low, low + grid.counts])}
 
 
 def carry_over(

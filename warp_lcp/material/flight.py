@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.part import BodyNumbers
 from warp_lcp.grid.particle_loops import PARTICLE, ListMemory
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
@@ -59,6 +60,8 @@ class Flights:
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
         self._flight.origin = wp.vec3i(*grid.origin)
         self._before: Sums = NOTHING
+        self._seen: Window | None = None  # of the last search; None: nothing near this process's cells
+        self._numbers = BodyNumbers(0)
         self._growing = LaunchGraph(grid.device, self._launch_growth)
         self._rate, self._quanta = Scalar(), Scalar()  # see `flight_kernels.add_up`
         self._list = ListMemory(grid.device)  # of the bodies' particles
@@ -67,14 +70,17 @@ class Flights:
         self._boarding, self._lifting, self._flying, self._landing = (LaunchGraph(grid.device, launch) for launch in launches)
 
     def find(self, window: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
-        """Look for bodies, without waiting for their number; arguments as of `begin`, which does it where nobody has."""
-        self._grow(window, window, weights, kind)
+        """Look for bodies, without waiting for their number; arguments as of `begin`, which does it where nobody has.
 
-    def _grow(self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
-        """Grow the trees of a window's cells, and of those `around` it below whose faces they are."""
-        self._growing.run(window, around, weights, kind, variant=window.near is None)
+        Grow the trees of the window's cells and of those below it whose faces they are: of a part of the grid beside its own cells.
+        """
+        part, self._found = self.grid.part, True
+        self._seen, around = part.near(window, 1), part.near(window, 2)
+        if self._seen is None or around is None:
+            self._count.array.zero_()
+        else:
+            self._growing.run(self._seen, around, weights, kind, variant=window.near is None)
         self._count.changed()
-        self._found = True
 
     def _launch_growth(self, window: Window, around: Window, weights: Sequence[wp.array], kind: wp.array) -> None:
         """Launch what grows the trees, and numbers the bodies."""
@@ -101,7 +107,9 @@ class Flights:
         """
         if not self._found:
             self.find(window, weights, kind)
-        self._found, bodies = False, self._bodies()
+        self._found, trees = False, int(self._count.numpy()[0])
+        self._numbers = self.grid.part.join_trees(trees, self._seen, self._parent, self._number, self._held)
+        bodies = self._numbers.count
         self._before = np.zeros((bodies, kernels.COLUMNS)) if bodies else NOTHING
         if bodies == 0:
             return 0
@@ -110,7 +118,7 @@ class Flights:
         self._rate.value = dt / self.grid.spacing
         # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
         longest = max(self.grid.domain_counts)
-        self._quanta.value = 2.0 ** math.floor(60.0 - math.log2(self._everyone(particles) * longest**2))
+        self._quanta.value = 2.0 ** math.floor(60.0 - math.log2(sum(particles.exchange.counts) * longest**2))
         self._lifting.run(particles)
         self._before = self._sums(bodies)
         self._change = change * self._rate.value
@@ -186,27 +194,28 @@ class Flights:
         self._tell(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
         self._landing.run(particles)
 
-    def _bodies(self) -> int:
-        """Return how many bodies were found."""
-        return int(self._count.numpy()[0])
-
     def _board(self, particles: Particles) -> int:
         """List the bodies' particles, and the body of each; return how many there are."""
         self._boarding.run(particles)
         self._count.changed()
-        return int(self._count.numpy()[1])
-
-    def _everyone(self, particles: Particles) -> int:
-        """Return how many particles the material has."""
-        return particles.count
-
-    def _of_all(self, sums: np.ndarray) -> np.ndarray:
-        """Return sums over all particles of the bodies, int64 as given."""
-        return sums
+        count, body_of_tree = int(self._count.numpy()[1]), self._numbers.of_tree
+        if body_of_tree is None:
+            return count
+        who, tree = (found.numpy() for found in (self._who, self._body))
+        body = body_of_tree[tree[:count]]
+        flying = np.flatnonzero(body >= 0)
+        who[: len(flying)], tree[: len(flying)] = who[flying], body[flying]
+        if self.grid.device.is_cuda:
+            self._who.assign(who)
+            self._body.assign(tree)
+        return len(flying)
 
     def _sums(self, bodies: int) -> Sums:
-        """Return the sums over each body of the last launch."""
-        sums = self._of_all(self._flight.sums.numpy()[:bodies]).astype(np.float64)
+        """Return the sums over each body of the last launch, of all processes' particles: whole numbers, in quanta."""
+        whole, several = self._flight.sums.numpy()[:bodies], self._numbers.several
+        if several:  # the same on all ranks
+            whole = np.concatenate([self.grid.part.ranks.sum(whole[:several]), whole[several:]])
+        sums = whole.astype(np.float64)
         sums[:, 1 : kernels.LEAVES] /= self._quanta.value
         return sums
 

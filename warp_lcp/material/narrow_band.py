@@ -37,7 +37,7 @@ import warp as wp
 
 from warp_lcp.grid.advection import CENTERS, carry_field
 from warp_lcp.grid.cell_kernel import launch_list, scan
-from warp_lcp.grid.particles import MOST_A_CELL, NEW, Particles, ParticleTotals
+from warp_lcp.grid.particles import MOST_A_CELL, Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.grid.transfer import faces_to_particles
 from warp_lcp.material import narrow_band_kernels as kernels
@@ -207,7 +207,7 @@ class NarrowBand:
             step: number of the step, which the random part of new places depends on.
             saved: velocity as it came from the particles [m/s], for FLIP.
         """
-        first = self._prepare_places(particles)
+        first = particles.exchange.next_place()
         self._move_to(window)
         self._each.value = self.particles_a_cell * self.density
         self._depths.run(kind, phi, contact, variant=phi is None)
@@ -385,15 +385,6 @@ class NarrowBand:
         """Return how many there are on all processes of what this one has so many of."""
         return int(self.grid.part.ranks.sum(count))
 
-    def _prepare_places(self, particles: Any) -> int:
-        """Keep a rank's own particles alone, numbered; return the first place of fresh ones, behind those of all ranks."""
-        part = self.grid.part
-        if not part.shared:
-            return 0
-        particles.drop_ghosts()
-        particles.number()
-        return max(NEW, 1 + int(part.ranks.max(particles.place.max(initial=0))))
-
     def _add_places(self, particles: Any, behind: int) -> None:
         """Tell a rank's fresh particles their places, in the order of the whole domain's cells."""
         counts = np.diff(self._total.numpy(), prepend=0)
@@ -403,7 +394,7 @@ class NarrowBand:
         x, y, z = (cells + before for cells, before in zip((i, j, k), self.grid.origin, strict=True))
         nx, ny, _ = (n + 2 for n in self.grid.domain_counts)
         first = ((z * ny + y) * nx + x) * MOST_A_CELL - np.cumsum(counts) + counts
-        particles.add_places(behind + np.repeat(first, counts) + np.arange(counts.sum()))
+        particles.exchange.add_places(behind + np.repeat(first, counts) + np.arange(counts.sum()))
 
     def _seed(self, particles: Particles, saved: Sequence[wp.array], behind: int) -> None:
         """Put fresh particles behind the others; `behind`: their first place, on ranks."""

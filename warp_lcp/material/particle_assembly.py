@@ -88,7 +88,7 @@ def make_boundary(
     *,
     solids: Sequence[PlacedSolid] | None = None,
 ) -> tuple[Boundary, tuple[str, ...]]:
-    """Return solids and walls as the scene asks for them, and warnings.
+    """Return solids and walls as the scene asks for them, and warnings; collective.
 
     Args:
         scene: the scene.
@@ -102,18 +102,22 @@ def make_boundary(
         ValueError: solids cut cells and there is a `wall_velocity`.
     """
     placed = placed_solids(scene, folder) if solids is None else solids
+    if grid.part.shared:
+        part: Any = grid.part
+        return part.make_boundary(scene, placed)
     around = PeriodicSides(grid, scene.endless) if scene.endless else None
-    separating, sides, part = scene.domain.wall == "separating", open_sides_of(grid, side_bits(scene.domain.open)), grid.whole is not None
+    separating, covered = scene.domain.wall == "separating", grid.whole is not None
+    sides = open_sides_of(grid, side_bits(scene.domain.open))
     shapes: list[Geometry] = []
     if scene.domain.solids == "cut-cell":
         if wall_velocity is not None:
             raise ValueError('wall_velocity: only for solids = "voxel"; with cut cells, give the solid a motion')
-        cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not part)
-        if not cut.whole_cells or (part and placed):  # solids may cut cells elsewhere
+        cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides, remarks=not covered)
+        if not cut.whole_cells or (covered and placed):  # solids may cut cells elsewhere
             return CutBoundary(grid, cut, sides=around), cut.notes
         shapes = [solid.geometry for solid in placed]
     ends = side_bits(periodic_sides(scene.endless))
-    voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not part)
+    voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | ends, remarks=not covered)
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
     return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around, shapes=shapes), voxels.notes
@@ -136,16 +140,16 @@ class Parts:
     solids: Any = None
 
 
-def make_spray(scene: ParticleScene, coverage: Coverage, placed: Sequence[PlacedSolid]) -> Spray | None:
+def make_spray(scene: ParticleScene, coverage: Coverage | None, placed: Sequence[PlacedSolid]) -> Spray | None:
     """Return what carries particles that are alone, if they need no grid: where one follows the material, and no surface is wrapped."""
-    if not (coverage.active and scene.flies) or scene.output.surface or scene.output.volume:
+    if coverage is None or not (coverage.active and scene.flies) or scene.output.surface or scene.output.volume:
         return None
     return Spray(coverage.domain, placed, side_bits(scene.domain.open), keeps=scene.kept(()) is not None)
 
 
-def make_flights(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, make: Callable[..., Flights] = Flights) -> Flights | None:
-    """Return what gives bodies in flight their momenta back, made by what takes the arguments of `Flights`, if any can be told."""
-    return make(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up) if scene.flies else None
+def make_flights(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Flights | None:
+    """Return what gives bodies in flight their momenta back, if any can be told."""
+    return Flights(grid, boundary, coheres=scene.coheres, settles=scene.speeds_up) if scene.flies else None
 
 
 def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:
@@ -168,7 +172,7 @@ def make_particle_volume(scene: ParticleScene, grid: StaggeredGrid, boundary: Bo
 def seed_materials(
     scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, without: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Fill the scene's materials with points.
+    """Fill the scene's materials with points, where this process's cells are; collective.
 
     Args:
         scene: the scene.
@@ -181,7 +185,7 @@ def seed_materials(
         Positions [m], float32, shape (n, 3); the entry of `scene.materials()` that each belongs to, shape (n,); warnings.
 
     Raises:
-        ValueError: a material has no particle.
+        ValueError: a material has no particle on any rank; on all ranks.
     """
     key, materials = scene.materials()
     geometries = [material.to_geometry(folder, scene.dimension) for material in materials]
@@ -194,10 +198,11 @@ def seed_materials(
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
     if without is not None:
         open_cells &= ~without
+    grid.part.keep_own(open_cells)
     position, owner = seed(
         grid, regions, open_cells, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed
     )  # fmt: skip
-    counts = np.bincount(owner, minlength=len(geometries))
+    counts = grid.part.ranks.sum(np.bincount(owner, minlength=len(geometries)))
     for name, count in zip(names, counts, strict=False):
         if count == 0 and without is None:
             raise ValueError(

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.material.coverage import Coverage, box_of, carry_over
+from warp_lcp.material.coverage import Coverage, carry_over
 from warp_lcp.material.narrow_band import without_band
 from warp_lcp.material.particle_frames import ParticleFrames
-from warp_lcp.material.particle_pieces import Piece, state_of
+from warp_lcp.material.particle_pieces import Piece, piece_of, state_of
 from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import check_state, other_spacing, signature
@@ -41,6 +42,14 @@ class ParticleCheckpoints(ParticleFrames):
     @abstractmethod
     def regrid(self, grid: StaggeredGrid, state: Mapping[str, np.ndarray] | None = None) -> None:
         """Go on on another grid of the same domain."""
+
+    @abstractmethod
+    def _lay_anew(self, grid: StaggeredGrid) -> None:
+        """Allocate another grid, whose fields then hold nothing yet."""
+
+    @abstractmethod
+    def rebalance(self) -> None:
+        """Go on in better boxes of ranks, if there are any; collective."""
 
     @abstractmethod
     def admits(self, points: np.ndarray) -> np.ndarray:
@@ -78,20 +87,32 @@ class ParticleCheckpoints(ParticleFrames):
         self._faces_know = False
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too."""
-        flying = self.spray.particles.count
+        """Return what `restore` needs to continue bit for bit on the CPU; of a grid that covers a part of the domain its `box`, too.
+
+        On several ranks it is this rank's piece of the state, in the whole domain's coordinates, without pickles. Names and shapes: `box`
+        int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's; `time`, `step_count`,
+        `last_dt`, `signature`; particles: `position`, `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; of the
+        box, shape (..., nz, ny, nx): `cells` int8, the other fields of `own_state` and those of a narrow band, and once particles were
+        moved apart `density_correction` float64; the numbers of `own_state`, of a band and of bodies, the same on all ranks.
+        """
+        part, flying = self.grid.part, self.spray.particles.count
         counts = {"spray": flying, "added": self.added}
         particles = self._particle_arrays() | {name: np.array(count) for name, count in counts.items() if count}
+        particles |= self.particles.exchange.state()
         clock = {name: np.array(getattr(self, name)) for name in ("time", "step_count", "last_dt")}
         bodies = self.bodies.state() if self.bodies is not None else {}
-        return clock | {"signature": signature(self.scene, self.grid)} | particles | self._fields() | bodies | box_of(self.grid)
+        known = {"signature": signature(self.scene, self.grid)}
+        return clock | known | particles | part.kept(self._fields()) | bodies | part.where()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from `state`.
+        """Continue from `state`, which on several ranks is that of one process; collective.
 
         Raises:
-            ValueError: the arrays do not belong to this scene.
+            ValueError: the arrays do not belong to this scene; on all ranks.
         """
+        if self.grid.part.shared:
+            self.restore_pieces([state if "box" in state else piece_of(state)])
+            return
         state = self._on_this_grid(state)
         self.rearrangement.expect(state)
         expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
@@ -100,20 +121,79 @@ class ParticleCheckpoints(ParticleFrames):
         check_state(state, expected, changing=[*self.particles.arrays()] if varies else [], solids_move=self.boundary.moves)
         self._assign(state, int(state.get("spray", 0)))
         self._take_fields(state)
+        self._take_clock(state)
+
+    def _take_clock(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on at the time of a state, with its bodies, and solids where they are then."""
         self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
         if self.bodies is not None:
             self.bodies.restore(state)
         self.boundary.place(self.time)
 
     def restore_pieces(self, pieces: Sequence[Piece]) -> None:
-        """Continue from the pieces of all ranks of a run on several, see `warp_lcp.distributed.particle_simulation`.
+        """Continue from the pieces of all ranks of a run on any number of ranks; each rank takes what lies in its box. Collective.
+
+        Args:
+            pieces: of `state`, of all ranks, in any order. Of a piece that has nothing in this rank's box grown by some cells the arrays of
+                particles and cells are not read.
 
         Raises:
-            ValueError: the pieces do not belong to this scene.
+            ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
-        if self.grid.whole is not None and self._coverage is not None:
-            self.regrid(self._coverage.domain)
-        self.restore(state_of(pieces, self.state()))
+        part: Any = self.grid.part  # `Subdomain` where there are several ranks
+        if not part.shared:
+            if self.grid.whole is not None and self._coverage is not None:
+                self.regrid(self._coverage.domain)
+            self.restore(state_of(pieces, self.state()))
+            return
+        expected, found = self._everyone(), part.of_pieces(pieces)
+        if found is not None and found is not part:
+            self._work_on(found)
+        self._take_pieces(pieces, expected)
+        if found is None:  # in boxes that were laid for the start
+            self.particles.totals()
+            self.rebalance()
+
+    def repartition(self, part: Any) -> None:
+        """Go on in other boxes of the same ranks; collective."""
+        before, piece, expected = self.grid.part, self.state(), self._everyone()
+        self._work_on(part)
+        self._take_pieces([part.migrate(piece, list(self.particles.arrays()), before)], expected)
+
+    def _everyone(self) -> int:
+        """Return how many particles all ranks have, with those that a narrow band stands for."""
+        return sum(self.particles.exchange.counts) + (self.band.held if self.band is not None else 0)
+
+    def _work_on(self, part: Any) -> None:
+        """Allocate what belongs to another part of the grid; its particles and fields are still to come."""
+        self._lay_anew(part.grid)
+        part.ranks.free_ended()
+
+    def _take_pieces(self, pieces: Sequence[Piece], expected: int) -> None:
+        """Continue from what pieces have in this rank's box; collective.
+
+        Args:
+            pieces: of all ranks, or that of this box.
+            expected: how many particles they must have if none come in or leave.
+        """
+        part: Any = self.grid.part
+        names, bodies = list(self.particles.arrays()), self.bodies.state() if self.bodies is not None else {}
+        band = self.band.state() if self.band is not None else {}
+        own = self.own_state() | band
+        solids = None if self.boundary.moves else own["cells"]
+        particles, cells, numbers = part.take_pieces(pieces, names, own | bodies, signature(self.scene, self.grid), solids)
+        interior = int(numbers["interior"][0]) if self.band is not None else 0
+        everyone = int(part.ranks.sum(len(particles["place"]))) + interior
+        if everyone != expected and not (self.sources or self.outlets):
+            raise ValueError(f"the pieces have {everyone} particles: this scene has {expected}")
+        self.particles.exchange.assign(particles, particles["place"])
+        self._faces_know = False
+        self.rearrangement.expect(cells)
+        state = own | self.rearrangement.state()
+        for name, values in cells.items():
+            part.box_of(state[name])[...] = values
+        self._take_fields(state | {name: numbers[name] for name in own.keys() & numbers.keys()})
+        self._take_clock(numbers)
 
     def _on_this_grid(self, state: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Lay the grid of a state if the scene allows that, else bring the state to this one's.
@@ -137,12 +217,9 @@ class ParticleCheckpoints(ParticleFrames):
             ValueError: the state differs in more than the grid, or no particle is left.
         """
         spacing = other_spacing(state, self.scene, self.grid)
-        self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
-        if self.bodies is not None:
-            if "bodies" not in state:
-                raise ValueError("the state has no bodies: it does not belong to this scene")
-            self.bodies.restore(state)
-        self.boundary.place(self.time)
+        if self.bodies is not None and "bodies" not in state:
+            raise ValueError("the state has no bodies: it does not belong to this scene")
+        self._take_clock(state)
         settings, wanted = self.scene.particles, self.particles.arrays().keys()
         state = without_band(state, spacing, settings.seed)
         arrays, moved = resampled(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid.level_set import Fill
-from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.particles import UNSORTED, Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, SurfaceMesh, faces_from_particles, sample
 from warp_lcp.material.boundary import Boundary
@@ -30,7 +31,6 @@ class ParticleFrames(ABC):
     particle_volume: ParticleVolume | None
     velocity: list[wp.array]
     weights: list[wp.array]
-    shared: bool
     _faces_know: bool
 
     @abstractmethod
@@ -40,7 +40,7 @@ class ParticleFrames(ABC):
     @property
     def image_counts(self) -> tuple[int, int, int] | None:
         """Return the cells of the image that a frame of cells is; None: of a grid that follows the material those that hold some."""
-        return self.grid.domain_counts if self.shared or self.grid.whole is None else None
+        return self.grid.domain_counts if self.grid.part.shared or self.grid.whole is None else None
 
     def points(self) -> Points:
         """Return the particles as a frame shows them, with velocity and speed [m/s]."""
@@ -48,20 +48,38 @@ class ParticleFrames(ABC):
         return Points("particles", position, {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))})
 
     def surfaces(self) -> list[Surface]:
-        """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it."""
+        """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it.
+
+        Of ranks in their boxes; collective.
+        """
         if self.surface_mesh is None:
             return []
+        with self.particles.exchange.with_ghosts(UNSORTED):
+            return [self._wrap(self.surface_mesh)]
+
+    def _wrap(self, surface: SurfaceMesh) -> Surface:
+        """Return the surface around the particles and their ghosts."""
         position = self.particles.position
         band = self.band
-        mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
+        mesh = surface.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
         if not self._faces_know:  # the next step overwrites what the faces are given here
             faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
         velocity = sample(self.grid, self.velocity, mesh.points)
-        return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
+        return Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})
 
     def volumes(self) -> list[Volume]:
-        """Return the material's level set and density as a frame shows them, if the scene wants them."""
-        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles, fill=self._fill_density())
+        """Return the material's level set and density as a frame shows them, if the scene wants them; of all ranks on the root.
+
+        No reader makes one volume of several. Collective.
+        """
+        if self.particle_volume is None:
+            return []
+        part = self.grid.part
+        with self.particles.exchange.with_ghosts(UNSORTED):
+            found = self.particle_volume.measure(self.particles, fill=self._fill_density())
+        whole = [part.gathered(volume.values) for volume in found]
+        first = part.gathered_from
+        return [replace(v, values=values, origin=first) for v, values in zip(found, whole, strict=True) if values is not None]
 
     def _fill_density(self) -> Fill | None:
         """Return what adds to the particles' density in a window what none of them stands for, as a surface sees it; None: nothing does."""
@@ -77,8 +95,8 @@ class ParticleFrames(ABC):
         return fill
 
     def body_surfaces(self) -> list[Surface]:
-        """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""
-        if self.bodies is None:
+        """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]; of the root."""
+        if self.bodies is None or not self.grid.part.ranks.is_root:
             return []
         surface = self.bodies.surfaces()
         return [Surface("bodies", surface.points, surface.corners, surface.fields)]

@@ -349,7 +349,7 @@ class ParticleScene(Scene):
     @property
     def covered_counts(self) -> tuple[int, int, int]:
         """Return the cells along x, y and z that the grid covers at the start; it grows with what the material reaches."""
-        return start_of(self, "cpu", lambda grid: None)[1].counts
+        return start_of(self, "cpu")[1].counts
 
     @property
     def counted_cells(self) -> int:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import warp as wp
@@ -15,7 +16,6 @@ from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.grid.vicinity import Vicinity
 from warp_lcp.material.coverage import Coverage, carry_over, cells_between, pace_of, travel
-from warp_lcp.material.flight import Flights
 from warp_lcp.material.particle_assembly import Parts, make_flights, make_particle_volume, make_surface_mesh
 from warp_lcp.material.particle_checkpoints import ParticleCheckpoints
 from warp_lcp.material.particle_log import Moved, Row, columns, solve_row, totals_row
@@ -40,12 +40,20 @@ class ParticleSimulation(ParticleCheckpoints):
     the last step and half of this one, and then particles move for all of it (the leapfrog of Verlet). One solve a step so makes a scheme
     that is its own inverse in time, whatever the steps' lengths: what flies goes along its parabola.
 
+    The grid's part says what of it this process works on. On several ranks making a simulation, `stable_dt`, `step`, `mark`, `frame` and
+    `restore_pieces` are collective and give every rank the same numbers, or raise the same error on all: rows of the log are of the whole
+    material; a frame shows this rank's particles and cells. What another rank knows comes in where the chain of dependence needs it:
+    particles a cell from the cut before they are brought to the faces; velocities and weights of the faces; what a material finds of its
+    cells; the solve, which is one of all ranks; the velocity that it leaves, and again while that is continued into air and walls. All of
+    it is computed by the same kernels from the same numbers in the same order as by one process, so that runs on any number of ranks
+    differ by the rounding in the solver and in sums over all particles alone.
+
     A step calls `begin_step`, `window` and `particles_to_grid`; changes `velocity` by the laws of its material; then calls
     `extrapolate_velocity`, `grid_to_particles` and `move`, and returns the log columns of `logged`. Until `move` the state is
-    unchanged except for the order of the particles, so that a solve may fail.
+    unchanged except for the order of the particles, so that a solve may fail: all of it is in the context `attempt`.
 
     Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
-    of its solve and calls `solve_contacts`, or calls `restore_bodies` if it fails.
+    of its solve and calls `solve_contacts`.
 
     With `parts`, `particles`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's clock, time
     step, checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
@@ -54,10 +62,11 @@ class ParticleSimulation(ParticleCheckpoints):
         scene: what to simulate.
         grid: the one that it starts on.
         parts: what of it belongs to that grid: walls and solids, sources, a narrow band.
-        particles: the material at the start.
+        particles: the material at the start, this process's.
+        make_parts: makes the parts of another grid; None: this one is kept.
         outlets: where it leaves.
         bodies: solids of the boundary that the material moves.
-        coverage: lays other grids when the material needs one; None: this one is kept.
+        coverage: says when the material needs another grid; None: this one is kept.
         spray: carries particles that need no grid; None: none does.
         notes: facts for the start of a run.
 
@@ -75,10 +84,11 @@ class ParticleSimulation(ParticleCheckpoints):
         last_dt: length of the last step [s], 0 before the first.
         kick_dt: how long forces act in the step that has begun [s].
         watch: what the stages of a step are measured with.
+        sides: joins the ends of axes without an end; None: there are none.
+        diagnostics: are called before the totals of particles that have moved, to launch what is read with them.
         vicinity: finds the cells that a step must visit; None: all around the particles.
     """
 
-    shared = False  # whether others have parts of the grid
     vicinity: Vicinity | None = None
 
     def __init__(
@@ -88,6 +98,7 @@ class ParticleSimulation(ParticleCheckpoints):
         parts: Parts,
         particles: Particles,
         *,
+        make_parts: Callable[[StaggeredGrid], Parts] | None = None,
         outlets: Outlets | None = None,
         bodies: RigidBodies | None = None,
         coverage: Coverage | None = None,
@@ -98,6 +109,8 @@ class ParticleSimulation(ParticleCheckpoints):
         self.scene, self.particles, self.outlets, self.bodies = scene, particles, outlets, bodies
         self._bodies_at_start = [body.state() for body in bodies.bodies] if bodies is not None else []
         self.time, self.step_count, self.last_dt, self.kick_dt = 0.0, 0, 0.0, 0.0
+        self._make_parts = make_parts
+        self.diagnostics: list[Callable[[], None]] = []
         self._velocity_before = np.zeros(3)  # mean of the particles at the start of the step [m/s]
         self.watch: Stopwatch = NoStopwatch()
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
@@ -111,6 +124,7 @@ class ParticleSimulation(ParticleCheckpoints):
         if self.sources is not None:
             self.sources.emit(particles, None, self.time)
         particles.sort()
+        particles.exchange.count()
 
     def allocate(self, grid: StaggeredGrid, parts: Parts) -> None:
         """Allocate what belongs to a grid. Subclasses add theirs."""
@@ -120,29 +134,18 @@ class ParticleSimulation(ParticleCheckpoints):
         self._columns: tuple[str, ...] | None = None  # of the log, once they are asked for
         self._ends = grid.extent - 0.5 * MARGIN * grid.spacing  # [m]; a tent at the very end would reach beyond what is stored
         self.active, self.kicks = ActiveWindow(grid.everywhere), [Scalar() for _ in range(3)]
-        at_once = self.shared and grid.device.is_cuda  # ranks exchange halos through the host
+        self.sides, at_once = parts.boundary.sides, grid.part.at_once
         self._transfer_to_grid = LaunchGraph(grid.device, self._launch_particles_to_grid, at_once=at_once)
         self._extrapolation = LaunchGraph(grid.device, self._launch_extrapolation, at_once=at_once)
         self._transfer_to_particles = LaunchGraph(grid.device, self._launch_grid_to_particles, at_once=at_once)
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
-        if not (self.shared or self.band is not None or scene.endless):  # without an interior, and ends where the grid does
+        if not (grid.part.shared or self.band is not None or scene.endless):  # without an interior, and ends where the grid does
             self.vicinity = Vicinity(grid, self.vicinity)
-        self.flights = self._flights()
+        self.flights = make_flights(scene, grid, self.boundary)
         self.rearrangement = Rearrangement(scene, grid, self.boundary)
         self.surface_mesh = make_surface_mesh(scene, grid, self.boundary)
         self.particle_volume = make_particle_volume(scene, grid, self.boundary)
-
-    def _flights(self) -> Flights | None:
-        return make_flights(self.scene, self.grid, self.boundary)
-
-    def known_density(self) -> wp.array | None:
-        """Return the particles' density in units of that at rest, if a step has found it before anything moves."""
-        return None
-
-    def known_contact(self) -> wp.array | None:
-        """Return uint8 of TOUCHES_NOTHING, HELD, RELEASED where walls held the material in the step or let go of it, if a step finds it."""
-        return None
 
     @abstractmethod
     def own_columns(self) -> tuple[str, ...]:
@@ -155,29 +158,31 @@ class ParticleSimulation(ParticleCheckpoints):
             grid: the other one.
             state: what to go on from; None: as it is.
         """
-        assert self._coverage is not None, "a grid that is kept covers what it must"
         before, kept = self.grid, self._fields() if state is None else state
-        self._lay_anew(grid, self._coverage.make_parts)
+        self._lay_anew(grid)
         if state is None:
             self.rearrangement.expect(kept)
             self._take_fields(carry_over(kept, before, grid, self._fields()))
 
-    def _lay_anew(self, grid: StaggeredGrid, make_parts: Callable[[StaggeredGrid], Parts]) -> None:
-        """Lay another grid, whose fields then hold nothing yet."""
+    def _lay_anew(self, grid: StaggeredGrid) -> None:
+        """Allocate another grid, whose fields then hold nothing yet."""
+        assert self._make_parts is not None, "this grid is kept"
         for name in self._laid - {"vicinity"}:  # so that their memory is there for what comes
             delattr(self, name)
         bodies = self.bodies.bodies if self.bodies is not None else []
         now = [body.state() for body in bodies]
         for body, state in zip(bodies, self._bodies_at_start, strict=True):
             body.restore(state)  # the cells of a source are those that are open at the start
-        self.allocate(grid, make_parts(grid))
+        self.allocate(grid, self._make_parts(grid))
         for body, state in zip(bodies, now, strict=True):
             body.restore(state)
         self.particles.move_to(grid)
         self.boundary.place(self.time)
 
     def _follow(self, totals: ParticleTotals, dt: float) -> None:
-        """Lay another grid if the material leaves this one in a step, or has become much smaller."""
+        """Go on on another grid if the material leaves this one in a step or is much smaller, or in other boxes of ranks."""
+        if self.grid.part.should_rebalance(self.step_count):
+            self.rebalance()
         if self._coverage is None or (self._coverage.domain == self.grid and not self._coverage.active and not self.scene.domain.boundless):
             return
         way = travel(totals.max_speed, float(np.linalg.norm(self.gravity)), dt, self.grid.spacing)
@@ -206,6 +211,24 @@ class ParticleSimulation(ParticleCheckpoints):
         timed: list[Source | Drain] = [*(self.sources.sources if self.sources else ()), *(self.outlets.drains if self.outlets else ())]
         times = (*self.boundary.kinks, *(time for part in timed for time in (part.start, part.stop)))
         return [time for time in times if self.time < time <= until]
+
+    def rebalance(self) -> None:
+        """Go on in the boxes of ranks in which the busiest has least to do, if they are much better than those there are; collective."""
+        with self.watch.stage("repartitioning", self.particles.position):
+            part = self.grid.part.rebalance(self.particles, self.scene.particles.per_axis**self.grid.dimension)
+            if part is not None:
+                self.repartition(part)
+
+    @contextmanager
+    def attempt(self) -> Iterator[None]:
+        """Return a context for a step: if it fails, bodies are where they were, and particles of other ranks are gone."""
+        try:
+            yield
+        except (StepFailed, SimulationFailed):
+            self.particles.drop_ghosts()
+            if self.bodies is not None:
+                self.bodies.restore_step()
+            raise
 
     def begin_step(self, dt: float) -> ParticleTotals:
         """Check time step and particles, bring the particles into order, and return sums over them.
@@ -250,16 +273,10 @@ class ParticleSimulation(ParticleCheckpoints):
         assert self.bodies is not None
         residual = self.bodies.contact_residual
         if residual > CONTACTS_MISSED:
-            self.restore_bodies()
             raise StepFailed(
                 f"the rigid bodies' contacts are solved to a relative residual of {residual:.2e} only (allowed: {CONTACTS_MISSED}): "
                 "bodies of very different masses press on each other"
             )
-
-    def restore_bodies(self) -> None:
-        """Put the rigid bodies back to where they were before `begin_step`, as a solve has failed."""
-        if self.bodies is not None:
-            self.bodies.restore_step()
 
     def window(self, totals: ParticleTotals) -> Window:
         """Return the cells that the particles can touch in a step: the step's `active` window, which is moved there."""
@@ -296,7 +313,9 @@ class ParticleSimulation(ParticleCheckpoints):
         accelerate(window, self.velocity, self.weights, self.kicks)
         self.grid.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
 
-    def extrapolate_velocity(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
+    def extrapolate_velocity(
+        self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array, dt: float = 0.0
+    ) -> None:  # fmt: skip
         """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
 
         Args:
@@ -304,9 +323,19 @@ class ParticleSimulation(ParticleCheckpoints):
             known: int8 of each component (updated): 1 on valid faces, 0 on others, -1 inside solids of whole cells.
             kind: int8 of AIR, FLUID, SOLID.
             contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.boundary_kernels`.
+            dt: time step [s] that particles then move by.
+
+        Raises:
+            StepFailed: it is so fast that particles would leave the ghost cells of a rank.
         """
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
             self._extrapolation.run(window, list(known), kind, contact, variant=window.near is None)
+        cells = self.grid.part.cells_too_far(self.velocity, dt)
+        if cells > 0.0:
+            material, layers = self.scene.materials()[0], self.grid.part.layers - 1
+            raise StepFailed(
+                f"step {self.step_count}: {material} would move {cells:.1f} cells, more than the ghost layers of a rank, {layers}"
+            )
 
     def _launch_extrapolation(self, window: Window, known: list[wp.array], kind: wp.array, contact: wp.array) -> None:
         self._continue(window, known, kind, contact, self._layer_filled())
@@ -319,8 +348,16 @@ class ParticleSimulation(ParticleCheckpoints):
         self.boundary.extrapolate_velocity(window, self.velocity, self.weights, known, kind, contact, self.layers, join)
 
     def _layer_filled(self) -> Join | None:
-        """Return what is called with marks and field of a component when a layer of faces is filled."""
-        return None
+        """Return what is called with marks and field of a component when a layer of faces is filled: ghost cells, and ends, follow."""
+        refill, sides = self.grid.part.refill(), self.sides
+        if refill is None or sides is None:
+            return refill if sides is None else sides.wrap
+
+        def join(marks: wp.array, field: wp.array) -> None:
+            refill(marks, field)
+            sides.wrap(marks, field)
+
+        return join
 
     def exchange(self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
         """Exchange particles with the interior, if there is one; arguments as of `warp_lcp.material.narrow_band.NarrowBand`."""
@@ -349,12 +386,14 @@ class ParticleSimulation(ParticleCheckpoints):
         p, flip = self.particles, self.scene.particles.flip_ratio if self._saved else 0.0
         faces_to_particles(self.grid, self.velocity, p.position, p.velocity, p.affine, saved=self._saved, flip=flip)
 
-    def move(self, dt: float, window: Window) -> Row:
+    def move(self, dt: float, window: Window, density: wp.array | None = None, contact: wp.array | None = None) -> Row:
         """Move particles and solids by dt [s], exchange particles with sources and outlets, even them out, and advance the clock.
 
         Args:
             dt: time step [s].
             window: of the step.
+            density: of the particles before they move, in units of that at rest; None: no step has found it yet.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED where walls held the material in the step or let go of it; None: not known.
 
         Returns:
             What the log says of it and of the particles.
@@ -363,7 +402,7 @@ class ParticleSimulation(ParticleCheckpoints):
             SimulationFailed: something is not finite, or a particle has left the domain.
         """
         early = self._monitored and self.rearrangement.corrects_alone(self.step_count)
-        self.monitor_density(window)
+        self.monitor_density(window, density)
         with self.watch.stage("advection", self.particles.position, *self.velocity):
             self.carry(dt)
         if self.band is not None:
@@ -371,36 +410,39 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.band.carry(self.velocity, dt)
         exchanged = self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
         if not early:
-            self.measure_particles()
-            after = self.checked_totals("after")
+            after = self._totals_after_move("after")
             stopped, pushed, stuck = self.met()
         rearranged: Row = {"max_density": self.rearrangement.max_density}
         if self.rearrangement.due(self.step_count):
             fill = self.band.fill_interior if self.band is not None else None
-            window, contact = self._everywhere() if early else self.window(after), self.known_contact()
+            window = self._everywhere() if early else self.window(after)
             rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, dt, self.watch, fill, contact)
             if self.outlets is not None:  # the density correction may push particles out through open sides
-                exchanged["departed"] += self._remove_departed(self.outlets)
+                exchanged["departed"] += int(self.grid.part.ranks.sum(self.outlets.remove_departed(self.particles)))
             if early:
                 stopped, pushed, stuck = self.met()  # as read with the solve, before particles have been displaced
-            if early or self.rearrangement.moved or self.outlets is not None or self.shared:
-                self.measure_particles()
-                after = self.checked_totals("after the density correction of")
+            if early or self.rearrangement.moved or self.outlets is not None or self.grid.part.shared:
+                after = self._totals_after_move("after the density correction of")
         self.particles.totals_stay(True)
         self.time += dt
         self.step_count += 1
         self.last_dt = dt
         return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
 
-    def monitor_density(self, window: Window) -> None:
-        """Measure the density at the start of a step, before anything moves, if that has not been done."""
+    def monitor_density(self, window: Window, density: wp.array | None) -> None:
+        """Measure the density at the start of a step, before anything moves, if that has not been done.
+
+        Args:
+            window: around the particles.
+            density: of the particles, in units of that at rest, where it is known.
+        """
         with self.watch.stage("density monitor", self.particles.position):
-            self.rearrangement.look(self.step_count, self.known_density(), self.particles, window)
+            self.rearrangement.look(self.step_count, density, self.particles, window)
 
     @property
     def _monitored(self) -> bool:
         """Whether a GPU knows what a density correction is decided by before particles move, and need not measure them in between."""
-        kept = self.shared or self.band is not None or self.outlets is not None or self.sources is not None or self.spray.active
+        kept = self.grid.part.shared or self.band is not None or self.outlets is not None or self.sources is not None or self.spray.active
         return self.grid.device.is_cuda and not kept and self.rearrangement.has_looked(self.step_count)
 
     def _everywhere(self) -> Window:
@@ -408,8 +450,10 @@ class ParticleSimulation(ParticleCheckpoints):
         self.active.move_to(self.grid.everywhere)
         return self.active
 
-    def measure_particles(self) -> None:
-        """Launch what the log wants to know of the particles besides their totals, with which it is read."""
+    def _totals_after_move(self, when: str) -> ParticleTotals:
+        for launch in self.diagnostics:
+            launch()
+        return self.checked_totals(when)
 
     def carry(self, dt: float) -> None:
         """Move particles and solids by dt [s]; bodies in flight keep their momenta."""
@@ -456,8 +500,10 @@ class ParticleSimulation(ParticleCheckpoints):
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
         cells, covered = (" x ".join(map(str, n[: self.grid.dimension])) for n in (self.grid.domain_counts, self.grid.counts))
-        part = f", of which the grid covers {covered} around the material" if self.grid.whole is not None else ""
-        return [f"{self.particles.count} particles, {cells} cells of {self.grid.spacing:.4g} m{part}", *self.scene.notes(), *self._notes]
+        follows = self.grid.whole is not None and not self.grid.part.shared
+        part = f", of which the grid covers {covered} around the material" if follows else ""
+        first = f"{sum(self.particles.exchange.counts)} particles, {cells} cells of {self.grid.spacing:.4g} m{part}"
+        return [first, *self.grid.part.notes(), *self.scene.notes(), *self._notes]
 
     def checked_totals(self, when: str) -> ParticleTotals:
         """Return sums over the particles.
@@ -466,7 +512,7 @@ class ParticleSimulation(ParticleCheckpoints):
             when: where in the step, such as `after`, for the message.
 
         Raises:
-            SimulationFailed: a value is not finite or a particle lies outside the domain.
+            SimulationFailed: a value is not finite, a particle lies outside the domain, or not all are there; on all ranks.
         """
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = self.particles.totals()
@@ -474,16 +520,16 @@ class ParticleSimulation(ParticleCheckpoints):
         inside = all(
             low >= 0.0 and high <= most for low, high, most in zip(totals.low[: self.grid.dimension], totals.high, end, strict=False)
         )
-        if totals.finite and inside:
-            return totals if self.band is None else self.band.with_interior(totals)
-        raise SimulationFailed(f"{when} step {self.step_count}: {self._trouble(totals, end)}")
-
-    def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
-        """Say which particles are not finite, or outside the domain, which ends at `end` [m]; "" if there are none."""
-        return particle_trouble(self.particles, self.grid, totals, end)
+        if not (totals.finite and inside):
+            told = self.grid.part.ranks.collect(particle_trouble(self.particles, self.grid, totals, end))
+            raise SimulationFailed(f"{when} step {self.step_count}: {next((text for text in told if text), '')}")
+        if totals.count != self.particles.exchange.expected:
+            expected = self.particles.exchange.expected
+            raise SimulationFailed(f"{when} step {self.step_count}: {totals.count} particles are left of {expected}")
+        return totals if self.band is None else self.band.with_interior(totals)
 
     def _exchange(self, dt: float) -> dict[str, int]:
-        """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
+        """Remove the particles that have left in the step and add those that have come in; return how many all ranks have."""
         span, drained, departed = (self.time, self.time + dt), 0, 0
         with self.watch.stage("sources and outlets", self.particles.position):
             for outlets in [] if self.outlets is None else [self.outlets]:
@@ -491,16 +537,13 @@ class ParticleSimulation(ParticleCheckpoints):
                     swallowed, gone = outlets.apply(particles, *span)
                     drained, departed = drained + swallowed, departed + gone
             emitted = self.sources.emit(self.particles, *span) if self.sources is not None else 0
+        emitted, drained, departed = self.grid.part.ranks.sum(np.array([emitted, drained, departed])).tolist()
         return {"emitted": emitted, "drained": drained, "departed": departed}
-
-    def _remove_departed(self, outlets: Outlets) -> int:
-        """Remove the particles that have crossed an open side, and return how many."""
-        return outlets.remove_departed(self.particles)
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
         moved = Moved(self.particle_mass, self.gravity, self._velocity_before, dt, self.kick_dt)
         density, flying = self.band.mean_density if self.band is not None else None, self.spray.particles.count
-        row = totals_row(self.spray.with_own(totals), moved, self.particles.count + flying, self.grid.spacing)
+        row = totals_row(self.spray.with_own(totals), moved, sum(self.particles.exchange.counts) + flying, self.grid.spacing)
         return row | {"interior_density": density, "spray": flying}
 
     def admits(self, points: np.ndarray) -> np.ndarray:

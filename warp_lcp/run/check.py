@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.files.claims import one_line
@@ -11,7 +12,7 @@ from warp_lcp.frames.meshio_format import Dress, holds
 from warp_lcp.run.devices import free_memory
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
-from warp_lcp.scene.simulator import DistributedSimulator, simulators
+from warp_lcp.scene.simulator import runs_on_ranks, simulators
 from warp_lcp.scene.table import KeyFault, SceneError, written
 from warp_lcp.simulation import Cells, Points, Simulation, Surface
 
@@ -67,7 +68,7 @@ def check_ranks(scene: Scene) -> None:
     """
     name = scene.scene.simulator
     problems = []
-    if not isinstance(simulators()[name], DistributedSimulator):
+    if not runs_on_ranks(simulators()[name]):
         problems.append(KeyFault("scene.simulator", "runs on one process only; leave out --engine petsc", written(name)))
     if scene.output.format != "vtu":
         problems.append(KeyFault("output.format", "--engine petsc writes only .vtu pieces", written(scene.output.format)))
@@ -134,9 +135,8 @@ def start(scene: Scene, device: str, ranks: Ranks | None = None) -> Simulation:
     """
     simulator = simulators()[scene.scene.simulator]
     try:
-        if ranks is not None and isinstance(simulator, DistributedSimulator):
-            return simulator.create_distributed(scene, ranks, device=device, folder=Path.cwd())
-        return simulator.create(scene, device=device, folder=Path.cwd())
+        shared: dict[str, Any] = {"ranks": ranks} if ranks is not None and runs_on_ranks(simulator) else {}
+        return simulator.create(scene, device=device, folder=Path.cwd(), **shared)
     except ValueError as error:
         check_shapes(scene, scene.scene.name)  # whose message names the shape
         raise SceneError(scene.scene.name, [KeyFault("", str(error))]) from error

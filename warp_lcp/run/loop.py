@@ -31,7 +31,6 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import (
     Cells,
-    DistributedSimulation,
     Joined,
     Measured,
     NoStopwatch,
@@ -183,7 +182,7 @@ def _simulation(
     notes = simulation.notes() + notes
     if collective is None:
         return simulation, notes
-    return RankSimulation(cast(DistributedSimulation, simulation), collective), notes
+    return RankSimulation(cast(Joined, simulation), collective), notes
 
 
 def _go_on(simulation: Simulation, folder: RunFolder, continued: Continuation, *, on_ranks: bool) -> list[str]:

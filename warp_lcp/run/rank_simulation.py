@@ -10,18 +10,7 @@ import numpy as np
 
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.run.log import Value
-from warp_lcp.simulation import (
-    Cells,
-    DistributedSimulation,
-    Measured,
-    NoStopwatch,
-    Part,
-    Profiled,
-    Scheduled,
-    SimulationFailed,
-    StepFailed,
-    Stopwatch,
-)
+from warp_lcp.simulation import Cells, Joined, Measured, NoStopwatch, Part, Profiled, Scheduled, SimulationFailed, StepFailed, Stopwatch
 
 Corners = tuple[tuple[int, int, int], tuple[int, int, int]]
 
@@ -38,7 +27,7 @@ class RankSimulation:
         step_count: steps done.
     """
 
-    def __init__(self, simulation: DistributedSimulation, collective: Collective) -> None:
+    def __init__(self, simulation: Joined, collective: Collective) -> None:
         self._simulation, self._collective = simulation, collective
         self.time, self.step_count = simulation.time, simulation.step_count
         self._watch: Stopwatch = NoStopwatch()
@@ -104,7 +93,7 @@ class RankSimulation:
     def state(self) -> dict[str, np.ndarray]:
         """Return this rank's piece of the state."""
         with self._collective.together():
-            return self._simulation.piece_state()
+            return self._simulation.state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from the only piece of a state."""
@@ -118,5 +107,5 @@ class RankSimulation:
     @cached_property
     def _box(self) -> Corners:
         """The box of a simulation that keeps it; parts of another one tell theirs."""
-        (x0, y0, z0), (x1, y1, z1) = self._simulation.piece_state()["box"].tolist()
+        (x0, y0, z0), (x1, y1, z1) = self._simulation.state()["box"].tolist()
         return (x0, y0, z0), (x1, y1, z1)

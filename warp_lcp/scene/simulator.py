@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from warp_lcp.simulation import DistributedSimulation, Simulation
+from warp_lcp.simulation import Simulation
 
 if TYPE_CHECKING:
-    from warp_lcp.distributed.ranks import Ranks
     from warp_lcp.scene.scene import Scene
 
 
@@ -32,16 +32,12 @@ class Simulator(Protocol):
         """
 
 
-@runtime_checkable
-class DistributedSimulator(Protocol):
-    """Simulator whose simulations can run on several MPI ranks."""
+def runs_on_ranks(simulator: Simulator) -> bool:
+    """Return whether the simulations of a plug-in run on several MPI ranks: its `create` takes `ranks`.
 
-    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSimulation:
-        """Build this rank's part of a simulation of `scene`; collective.
-
-        Raises:
-            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed.
-        """
+    They are then `warp_lcp.simulation.Joined`. `create` is collective, with the same scene on all ranks, and returns this rank's part.
+    """
+    return "ranks" in inspect.signature(simulator.create).parameters
 
 
 @functools.cache
