@@ -12,7 +12,6 @@ PACKAGES = {"warp_lcp": "warp_lcp", "warp_lcp.fluids": "fluids", "warp_lcp.granu
 ALLOWED = {
     ("warp_lcp.fluids.simulator", "warp_lcp.fluids.distributed"): "needs MPI, so that it is imported when a run starts on ranks",
     ("warp_lcp.granular.simulator", "warp_lcp.granular.distributed"): "likewise",
-    ("warp_lcp.fluids.viscosity_multigrid", "warp_lcp.fluids.distributed.viscosity_multigrid"): "likewise",
     ("warp_lcp.distributed.halo", "warp_lcp.distributed.hierarchy"): "levels on ranks are asked of what fills their ghost cells",
 }
 

@@ -68,8 +68,8 @@ def lend(problem: LCP, solver: Solver) -> SpareWorkspace | None:
         problem: whose data it takes.
         solver: the method, with its settings.
     """
-    form = problem.form if problem.layout.size <= MOST_CELLS and team() is not None else None
-    if form is None:
+    form = problem.form if problem.layout.size <= MOST_CELLS else None
+    if form is None or team() is None:
         return None
     form = form, type(solver), solver, get_threads()
     found, again = KEPT.take(form)
