@@ -100,8 +100,12 @@ class BodyCoupling:
         if self._low is not None:
             self._low.update(self._weights(), symmetric=True)
 
-    def makes_room(self) -> bool:
-        """Enter again what a GPU had no room for in the last `take`; return whether a solve that has read it is to be repeated."""
+    def grow_entries(self) -> bool:
+        """Enter again what a GPU had no room for in the last `take`.
+
+        Returns:
+            Whether there was some, so that a solve must be repeated.
+        """
         kind, self._pending = self._pending, None
         if kind is None or self.columns.wanted() <= self.columns.capacity:
             return False
@@ -111,7 +115,7 @@ class BodyCoupling:
         return True
 
     def _enter(self, kind: wp.array) -> None:
-        """Write the entries of U for the cells of the window; a GPU does not wait for their number, see `makes_room`."""
+        """Write the entries of U for the cells of the window; a GPU does not wait for their number, see `grow_entries`."""
         columns = self.columns
         self._counting.run(kind, variant=columns.capacity)
         columns.counting()

@@ -305,7 +305,7 @@ class PressureProjection:
         mean = self._criteria(speed)
         assert self._problem is not None, "prepare comes first"
         result = wl.solve(self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work)
-        if self.coupling is not None and self.coupling.makes_room():
+        if self.coupling is not None and self.coupling.grow_entries():
             result = wl.solve(self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work)
         criteria = mean.known()
         if self.automatic is not None and result:

@@ -220,7 +220,7 @@ class SandBodies:
         return np.asarray((force + layer) * self._scale)
 
     def changed(self) -> None:
-        """Say that a solve has been launched, whose `impulses` are read with what else it leaves."""
+        """Say that a solve has been launched, which changes `impulses`."""
         for reading in self._left:
             reading.changed()
 

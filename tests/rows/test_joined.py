@@ -1,6 +1,7 @@
 """Recorded stretches whose graphs are joined run in order with all that stands between them; only with the plugin `emulated_cuda`."""
 
 import gc
+import itertools
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ import pytest
 import warp as wp
 
 from warp_lcp.rows import joined as module
+from warp_lcp.rows.host_array import HostArray
 from warp_lcp.rows.joined import joined
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import LaunchGraph, launch
@@ -27,6 +29,13 @@ def affine_kernel(x: wp.array(dtype=wp.float64), factor: wp.float64, shift: wp.f
     """x = factor x + shift: two of them do not commute."""
     i = wp.tid()
     x[i] = factor * x[i] + shift
+
+
+@wp.kernel(enable_backward=False, module="test_joined")
+def add_kernel(x: wp.array(dtype=wp.float64), more: wp.array(dtype=wp.float64)):  # type: ignore[valid-type]
+    """x += more."""
+    i = wp.tid()
+    x[i] += more[i]
 
 
 class Chain:
@@ -74,6 +83,43 @@ def calls_of(step: Callable[[], None]) -> int:
     meter.clear()
     step()
     return meter["calls"]
+
+
+@emulated
+def test_arrays_of_the_host_are_sent_in_order(chain: Chain) -> None:
+    """A stretch reads what was sent last before it, also where the same array is sent several times in a step; sending is no launch."""
+    sent = HostArray(3, wp.float64, DEVICE)
+    adding = LaunchGraph(DEVICE, lambda: launch(add_kernel, 3, [chain.x, sent.array], device=DEVICE))
+
+    def add(value: float) -> None:
+        sent.host[:] = value, 2.0 * value, -value
+        sent.send()
+        adding.run()
+        chain.reading.changed()
+        chain.expected = chain.expected + sent.host
+
+    def step() -> None:
+        with joined(DEVICE):
+            chain.take(0, 0.5)
+            for value in (3.0, 3.0, -7.0):  # the second time there is nothing to copy
+                chain.take(1, 0.25)
+                add(value + chain.expected[0] % 5)
+            chain.take(2, 1.0)
+        np.testing.assert_array_equal(chain.reading.numpy(), chain.expected)
+
+    for _ in range(4):
+        step()
+
+    numbers = itertools.count(1)
+
+    def once() -> None:
+        with joined(DEVICE):
+            chain.take(0, 0.5)
+            add(float(next(numbers)))
+            chain.take(1, 0.25)
+        assert chain.reading.numpy().tolist() == chain.expected.tolist()
+
+    assert calls_of(once) <= 2
 
 
 @emulated

@@ -277,3 +277,48 @@ def test_what_is_not_finite_is_found_by_both(wrong: float, both: Any) -> None:
     problem.b.assign(np.where(np.arange(guess.size) == inside[0], wrong, problem.b.numpy()))
     one, other = outcomes(problem, (alone, ahead), x0=guess)
     assert one[2] is other[2] is wl.SolveStatus.NON_FINITE
+
+
+def liquid_below_air(least: float) -> tuple[wl.LCP, wp.array[Any]]:
+    """Return a problem of cells with air above, with one lower bound, and its right-hand side."""
+    cells = np.full((14, 20), FLUID)
+    cells[-1] = AIR
+    A = wl.GridPoisson(cells, device="cpu")
+    b = A.layout.zeros(wp.float64)
+    stored = A.layout.stored_shape
+    return wl.LCP(A, b.reshape(stored), least, np.inf), b
+
+
+@emulated
+@pytest.mark.parametrize("least", [-np.inf, 0.0])
+def test_a_solve_waits_once(least: float) -> None:
+    """A GPU takes all steps that nothing is to be decided about, with bounds or without, before the host looks."""
+    from benchmarks.emulated_cuda import meter
+
+    problem, b = liquid_below_air(least)
+    work, guess, waits = SOLVER.init(problem), problem.layout.zeros(wp.float64), []
+    inside = problem.unknown.numpy() == 1
+    for n in range(4):
+        smooth = -np.sin(0.01 * (n + 1) * np.arange(b.size))
+        b.assign(np.where(inside, np.minimum(smooth, -0.1), 0.0))  # all unknowns stay off the bound
+        meter.clear()
+        result = wl.solve(problem, SOLVER, stopping=wl.StoppingCriteria(rtol=1e-5), x0=guess, workspace=work)
+        assert result.status is wl.SolveStatus.CONVERGED
+        assert result.iterations > 1
+        waits.append(meter["readbacks"])
+        wp.copy(guess, work.x)
+    assert waits[-1] == 1
+
+
+@emulated
+def test_nothing_is_solved_where_no_unknown_counts() -> None:
+    """Criteria by the mean over no unknowns: the iterate is left alone."""
+    problem, b = liquid_below_air(-np.inf)
+    work, guess = SOLVER.init(problem), problem.layout.zeros(wp.float64)
+    b.assign(-1.0 * (problem.unknown.numpy() == 1))
+    for count in (1.0, 1.0, 0.0, 1.0):
+        counted = wp.array([count], dtype=wp.float64, device="cpu")
+        criteria = MeanCriteria(rtol=1e-6, atol=0.0, max_iterations=50, count=lambda count=count: count, counted=counted)
+        result = wl.solve(problem, SOLVER, stopping=criteria, x0=guess, workspace=work)
+        assert bool(result)
+        assert (result.iterations == 0) == (count == 0.0)

@@ -556,7 +556,10 @@ class Particles:
         ).launch()
 
     def launch_totals(self) -> None:
-        """Launch on a GPU what the next `totals` returns, unless particles come or go before, so that others are read with it."""
+        """Launch the next `totals` on a GPU, so that others are read with it.
+
+        They are launched again if particles come or go before.
+        """
         if self._tally is not None and self._known is None and self.count:
             self._totals.run()
             self._tally.changed()

@@ -146,7 +146,10 @@ class ConjugateGradient:
         return self.found()
 
     def start(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> None:
-        """Launch what `solve` does, with its arguments; `found` then returns the result."""
+        """Launch the iterations; `found` then returns the result.
+
+        Arguments as of `solve`.
+        """
         for number, value in zip(self._goal, (tolerance, max_iterations, int(by_error)), strict=True):
             number.value = value
         cycle = getattr(self._preconditioner, "program", None)
@@ -162,7 +165,7 @@ class ConjugateGradient:
         self._scalars.changed()
 
     def found(self) -> tuple[int, float]:
-        """Return iterations and norm of what `start` has launched, as `solve`; waits for the device."""
+        """Return iterations and norm after `start`; waits for the device."""
         scalars = self._scalars.numpy()
         return int(scalars[ITERATIONS]), float(np.sqrt(scalars[RR]))
 

@@ -134,7 +134,10 @@ class BlockColumns:
         self._count.changed()
 
     def wanted(self) -> int:
-        """Return how many entries there were to write at the last `counting`, more than there is room for perhaps; waits for the device."""
+        """Return the number of entries to write; waits for the device.
+
+        As of the last `counting`; there may be room for less.
+        """
         return int(self._count.numpy()[1])
 
     def summed(self) -> np.ndarray:
@@ -364,7 +367,10 @@ class LowRankOperator(Pickled):
         return W
 
     def products_at(self, x: wp.array[Any]) -> np.ndarray | None:
-        """Return U'x of the solution of the last solve, not to be written to; None where no solve has kept it. Waits for the device."""
+        """Return U'x of the last solve's solution; waits for the device.
+
+        Not to be written to; None where no solve has kept it.
+        """
         return self.products.numpy() if self.products_of is not None and self.products_of.ptr == x.ptr else None
 
     def _product(self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]) -> wp.array[Any]:

@@ -195,7 +195,8 @@ class CoupledWorkspace(MultigridWorkspace):
             return
         begins, self._fresh = self._fresh, False
         noted, self.free_set_noted = self.free_set_noted, False
-        if self.correction.renew(begins=begins, noted=noted, made=noted and self._prepared):  # its right-hand side was overwritten
+        made, self._prepared = self._prepared, False  # which has overwritten the right-hand side
+        if self.correction.renew(begins=begins, noted=noted, made=noted and made) or made:  # so has this
             self._evaluation.run(self.x, classify, variant=self.problem_key())
             if self.floating is not None:
                 self._project()
