@@ -18,11 +18,11 @@ def started(precision="mixed", faces=None, closed=False):
     lower = np.where(np.random.default_rng(3).random(cells.shape) < 0.5, 0.0, -np.inf)
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu", **(faces or {})), b - (b.mean() if closed else 0), lower)
     work = solver.init(problem)
-    work.floating = problem.A.floating_components(work.scratch)
+    floating = problem.A.floating_components(work.scratch)
     work.residual.start(work.x, keep=False)
     work.residual.evaluate(work.x)
     work.keep()
-    work.start(warm=False, tolerance=0.0)
+    work.start(warm=False, tolerance=0.0, floating=floating)
     return problem, solver, work
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
 from collections.abc import Callable
@@ -124,10 +125,11 @@ class Workspace(Protocol):
     x: wp.array[Any]
     residual: Any  # a NaturalResidual of an LCP, else a Residual
     precision: Precision
-    floating: Any  # the operator's floating components, set by the loop before `start`; None if there are none
 
     def start(self, *, warm: bool, tolerance: float) -> bool | None:
         """Forget the last solve; return True where steps are wanted even if the start meets the tolerance.
+
+        A workspace that needs the operator's floating components (None if there are none) takes them as an argument `floating`, too.
 
         Args:
             warm: x is a guess better than clip(0, l, u).
@@ -311,6 +313,12 @@ def _workspaces_of(method: type) -> tuple[type, ...]:
     return tuple(kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and kind is not type(None))
 
 
+@cache
+def _takes_floating(workspace: type) -> bool:
+    """Return whether `start` of a kind of workspace takes the operator's floating components."""
+    return "floating" in inspect.signature(workspace.start).parameters  # type: ignore[attr-defined]
+
+
 class _Loop:
     """The state of one solve."""
 
@@ -324,6 +332,7 @@ class _Loop:
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
         self.linear = 0
+        self.floating: Any = None  # components of the operator
         self.best_iteration, self.best_norm, self.progress, self.stopped = 0, math.inf, 0, False
 
     def run(self, x0: Array | None) -> SolveResult:
@@ -333,7 +342,8 @@ class _Loop:
             return self._finish(ended, 0)
         try:
             with self.deadline:
-                wanted = self.work.start(warm=self.warm, tolerance=self.tolerance) and self.stopping.max_iterations > 0
+                given = {"floating": self.floating} if _takes_floating(type(self.work)) else {}
+                wanted = self.work.start(warm=self.warm, tolerance=self.tolerance, **given) and self.stopping.max_iterations > 0
                 return self._iterate(None if wanted and not self.stopped else self._status(0, None))
         except TimeIsUp:  # within a step, of which nothing is left
             self._restore()
@@ -491,7 +501,7 @@ class _LoopInBox(_Loop):
             return SolveStatus.NEGATIVE_CURVATURE
         A = self.problem.A
         floating = A.floating_components(getattr(self.work, "scratch", None)) if has(A, NamesComponents) else None
-        self.work.floating = floating
+        self.floating = floating
         lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else residual.unattainable()
         if guess is not None:
             self._take(guess)

@@ -10,7 +10,7 @@ import math
 import mmap
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -158,9 +158,11 @@ class Layout:
         chunks: (0, its elements) of each chunk of `CPU_CHUNK` elements that has ever been in use, (0, 0) of others, where fields are 0
             and stay untouched: wp.vec2i, shape (chunks, 1); None: all are in use.
         rows: what `warp_lcp.rows.Rows.of_fields` has made of that.
+        inside: index of the part of a stored field that the operator's shape stands for.
     """
 
     across: Any = None
+    inside: ClassVar[Any] = ...
     chunks: wp.array[Any] | None = None
     rows: Any = None
 
@@ -221,7 +223,7 @@ class Layout:
 
     def target(self, stored: np.ndarray, host: np.ndarray) -> np.ndarray:
         """Return the part of a stored field that an array which fits it fills, reshaped to that part's shape."""
-        return self._inner(stored) if host.shape == self.shape else stored
+        return stored[self.inside] if host.shape == self.shape else stored
 
     def places(self, like: np.ndarray | None = None) -> np.ndarray:
         """Return where the elements of an array that fits, of the operator's shape unless one is given, are in a stored field."""
@@ -230,10 +232,6 @@ class Layout:
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape; a copy unless both are the same."""
         return stored.reshape(self.shape)
-
-    def _inner(self, stored: np.ndarray) -> np.ndarray:
-        """Return the part of a stored field that the operator's shape stands for."""
-        return stored
 
 
 @dataclass(frozen=True)
@@ -276,6 +274,8 @@ class Padding:
 
 class PaddedLayout(Layout):
     """Grid fields (nz, ny, nx) or (ny, nx) stored with one layer of ghost cells, so that a stencil needs no bounds tests."""
+
+    inside: ClassVar[Any] = (slice(1, -1),) * 3
 
     def __init__(self, shape: tuple[int, ...], device: wp.Device, across: Any = None) -> None:
         super().__init__(shape, device)
@@ -353,6 +353,3 @@ class PaddedLayout(Layout):
         if self.device.is_cpu:  # NumPy copies strided rows four times as fast
             return wp.array(np.ascontiguousarray(inner.numpy()).reshape(self.shape), dtype=stored.dtype, device=self.device, copy=False)
         return inner.contiguous().reshape(self.shape)
-
-    def _inner(self, stored: np.ndarray) -> np.ndarray:
-        return stored[1:-1, 1:-1, 1:-1]

@@ -88,7 +88,6 @@ class EquilibratedWorkspace(IterateMemory):
                 self._multiply(self.problem.bounds.as_field(k), side, inverse=True)
         inner.bounds.refresh()
         self._multiply(self.x, self.inner.x, inverse=True)
-        self.inner.floating = None
         self.inner.residual.evaluate(self.inner.x)
         self._target = tolerance * float(self._rows.numpy().min())
         self.inner.start(warm=warm, tolerance=self._target)

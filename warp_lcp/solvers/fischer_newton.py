@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
@@ -150,8 +151,9 @@ class FischerWorkspace(IterateMemory):
         self.cycles_left = self.descents_left = self.steps = 0
         self.target = self._scale = self._merit = self._gone = 0.0
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the last solve; the operator may have changed."""
+        self.floating = floating
         s = self.settings
         self.cycles_left = s.monotone_cycles if self.active_set is not None and self.problem.bounded and not warm else 0
         self.descents_left, self.steps, self.target = s.warm_start, 0, tolerance
@@ -160,8 +162,7 @@ class FischerWorkspace(IterateMemory):
         self.map.begin()
         self.system.refresh()
         if self.active_set is not None:
-            self.active_set.floating = self.floating
-            self.active_set.start(warm=warm, tolerance=tolerance)
+            self.active_set.start(warm=warm, tolerance=tolerance, floating=floating)
         if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
             p = self.problem
             free = (p.unknown.numpy() == 1) & np.isinf(p.lower.numpy()) & np.isinf(p.upper.numpy())

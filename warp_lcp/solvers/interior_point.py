@@ -18,6 +18,7 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
@@ -231,8 +232,9 @@ class InteriorPointWorkspace(IterateMemory):
         self.near = self.begun = self.crossed = False
         self.mu = self.target = self.first_norm = self.size = 0.0
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the path; the operator may have changed."""
+        self.floating = floating
         s = self.settings
         cold_grid = self.problem.bounded and self._carries and not warm
         self.cycles_left = s.monotone_cycles if cold_grid else 0
@@ -242,8 +244,7 @@ class InteriorPointWorkspace(IterateMemory):
         self.first_norm = self.residual.norm
         self.system.refresh()
         if self.active_set is not None:
-            self.active_set.floating = self.floating
-            self.active_set.start(warm=not cold_grid, tolerance=tolerance)
+            self.active_set.start(warm=not cold_grid, tolerance=tolerance, floating=floating)
 
     def monotone_step(self, x: wp.array[Any]) -> Step:
         """Projected multigrid cycle on all unknowns."""
@@ -256,7 +257,7 @@ class InteriorPointWorkspace(IterateMemory):
         self.crossed = True
         if isinstance(self.active_set, GridNewtonWorkspace):
             self.active_set.classify()
-        self.active_set.start(warm=True, tolerance=self.target)
+        self.active_set.start(warm=True, tolerance=self.target, floating=self.floating)
 
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Take a step of the active-set method."""

@@ -13,6 +13,7 @@ from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.aggregates import MonotoneAggregation, suits_multigrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
@@ -168,8 +169,9 @@ class NewtonWorkspace(IterateMemory):
         """Return what solves on free sets."""
         return principal_system(self.problem, self.precision.correction, bounded=self.bounded, settings=self.settings.cycle)
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the active set; the operator may have changed."""
+        self.floating = floating
         cold_grid = isinstance(self.system, GridSystem) and self.bounded and self.settings.safeguard and not warm
         self.cycles_left = self.settings.monotone_cycles if cold_grid else 0
         if self.aggregates is not None and not warm and self.settings.monotone_cycles > 0 and self.aggregates.refresh():

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.operators.banded_matrix import NARROW, BandedMatrix, bands_of, bandwidth
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
@@ -191,8 +192,9 @@ class DirectNewtonWorkspace(IterateMemory):
         """Make x the best iterate again."""
         self._write(self.x, self._kept)
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the sets, and read the bounds as they are now."""
+        self.floating = floating
         self._warm, self._target, self.rest = warm, tolerance, None
         residual, bounds, self._b = self.residual, self.problem.bounds, self.problem.b.numpy()
         if isinstance(residual, HostResidual):
@@ -225,8 +227,8 @@ class DirectNewtonWorkspace(IterateMemory):
         self.residual.evaluate(x)
         self.residual.current = False
         self.rest = self.settings.safeguarded(self.problem)
-        self.rest.x, self.rest.residual, self.rest.floating = self.x, self.residual, self.floating
-        self.rest.start(warm=self._warm, tolerance=self._target)
+        self.rest.x, self.rest.residual = self.x, self.residual
+        self.rest.start(warm=self._warm, tolerance=self._target, floating=self.floating)
 
     def _whole_step(self, x: wp.array[Any]) -> Step | None:
         """Classify, solve on the free set, take the whole step; None where that leads nowhere."""

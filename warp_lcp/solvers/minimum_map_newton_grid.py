@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Step
@@ -83,13 +84,13 @@ class GridNewtonWorkspace(MultigridWorkspace):
     def _residual(self, problem: LCP, rounded: bool) -> MinimumMapResidual:
         return MinimumMapResidual(problem, self.A, self.hierarchy, rounded=rounded)
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the search direction and the residuals; the operator may have changed."""
         self._norms, self._target = [], tolerance
         if self._serves:  # who shares the hierarchy may have written its finest diagonal since it was coarsened
             self.hierarchy.finest.changed.fill_(1)
             self.distrust_hierarchy()
-        super().start(warm=warm, tolerance=tolerance)
+        super().start(warm=warm, tolerance=tolerance, floating=floating)
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the start is still cold, or Newton's steps have failed."""

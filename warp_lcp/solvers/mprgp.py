@@ -14,6 +14,7 @@ from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.multigrid.stencil_level import StencilLevel
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
@@ -211,8 +212,9 @@ class MPRGPWorkspace(IterateMemory):
         self._cycles_left, self._cycled, self._released, self._carry, self._curvature = 0, False, False, False, 0.0
         self._descent = Descent(self.precision.epsilon)
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the direction; the operator may have changed."""
+        self.floating = floating
         self._cycles_left = self.settings.monotone_cycles if self.is_grid and self.bounded and not warm else 0
         self._cycled, self._released, self._carry, self._lowest = False, False, False, self.residual.energy
         self._descent.start(self.residual.energy, self.residual.norm)

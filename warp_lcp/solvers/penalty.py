@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
@@ -114,8 +115,9 @@ class PenaltyWorkspace(IterateMemory):
         self._sums = Sums(rows_of(self.x), 3)
         self.rho, self.cycles_left, self.steps, self.target = settings.rho, 0, 0, 0.0
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the set and the last stiffness; the operator may have changed."""
+        self.floating = floating
         s = self.settings
         self.cycles_left = s.monotone_cycles if self.active_set is not None and self.problem.bounded and not warm else 0
         self.rho, self.steps, self.target = s.rho, 0, tolerance
@@ -123,8 +125,7 @@ class PenaltyWorkspace(IterateMemory):
         self.side.zero_()
         self.system.refresh()
         if self.active_set is not None:
-            self.active_set.floating = self.floating
-            self.active_set.start(warm=warm, tolerance=tolerance)
+            self.active_set.start(warm=warm, tolerance=tolerance, floating=floating)
 
     def monotone_step(self) -> Step:
         """Projected multigrid cycle on all unknowns."""

@@ -12,6 +12,7 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.multigrid.aggregates import coarse_points, suits_multigrid
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.stencil import AROUND, StoredStencil
@@ -95,12 +96,12 @@ class Inner:
     def __init__(self, method: Any, problem: LCP, work: Any = None) -> None:
         self.method, self.problem, self.work = method, problem, method.init(problem) if work is None else work
 
-    def begin(self, x: Any, tolerance: float, *, warm: bool = True) -> None:
-        """Start from a stored field."""
+    def begin(self, x: Any, tolerance: float, *, warm: bool = True, floating: FloatingComponents | None = None) -> None:
+        """Start from a stored field; arguments as of a workspace's `start`."""
         work = self.work
         work.x.assign(x)
         work.residual.evaluate(work.x)
-        work.start(warm=warm, tolerance=tolerance)
+        work.start(warm=warm, tolerance=tolerance, **({} if floating is None else {"floating": floating}))
 
     def step(self, x: wp.array[Any] | None = None) -> Step:
         """Take a step, from another iterate than the last one if x is given; the residual is that of its end."""
@@ -193,9 +194,8 @@ class GradientPhase:
     def start(self, x: wp.array[Any], floating: Any, tolerance: float) -> None:
         """Begin at x; `floating` are the operator's floating components."""
         work, self._tolerance = self._inner.work, tolerance
-        work.floating = floating
         work.residual.start(work.x, keep=False)
-        self._inner.begin(x, tolerance)
+        self._inner.begin(x, tolerance, floating=floating)
 
     def step(self, x: wp.array[Any], factor: float, most: int) -> Step | None:
         """Iterate until the residual is `factor` times what it was, at most so often; move x there.

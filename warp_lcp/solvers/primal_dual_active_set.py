@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.lcp import LCP
@@ -95,9 +96,9 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
     places: np.ndarray | None = None
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the sets; the operator may have changed."""
-        super().start(warm=warm, tolerance=tolerance)
+        super().start(warm=warm, tolerance=tolerance, floating=floating)
         self._seen: dict[bytes, float] = {}  # residuals at the sets met
         self._last, self._moved, self._stuck, self._pivots = b"", True, 0, 0
         self.cycled, self.places, self.first = False, None, 0.0

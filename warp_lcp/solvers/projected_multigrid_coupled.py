@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
@@ -96,9 +97,9 @@ class CoupledWorkspace(MultigridWorkspace):
     def _residual(self, problem: LCP, rounded: bool) -> CoupledResidual:
         return CoupledResidual(problem, self.A, self._low, self.hierarchy, rounded=rounded)
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the search direction; operator and bodies may have changed."""
-        super().start(warm=warm, tolerance=tolerance)
+        super().start(warm=warm, tolerance=tolerance, floating=floating)
         self._fresh, self._searches = True, False
 
     def begin_ahead(self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int) -> float | None:
@@ -177,8 +178,8 @@ class CoupledWorkspace(MultigridWorkspace):
         newton = self._newton = self._newton or Inner(settings, p)
         if not self._searches:
             self.restore()
-            self._searches, newton.work.floating = True, self.floating
-            newton.begin(self.x, self._tolerance)
+            self._searches = True
+            newton.begin(self.x, self._tolerance, floating=self.floating)
         self._store()
         self._past += 1
         self.free_set_noted = False

@@ -14,6 +14,7 @@ from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.halo_levels import beside_cuts
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.residual import NaturalResidual
@@ -319,8 +320,9 @@ class MultigridWorkspace(IterateMemory):
             wp.launch
         )
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the search direction; the operator may have changed."""
+        self.floating = floating
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self.descent.start(self.residual.energy, self.residual.norm)
         self._tolerance, self._pace, self._algebraic = tolerance, Pace(tolerance), None

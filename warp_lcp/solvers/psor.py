@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import warp as wp
 
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, Relaxes, check_taken, has, version_of
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
@@ -125,11 +126,11 @@ class SORWorkspace(SweepWorkspace):
         self._advised = settings.omega is None and has_advised_omega(problem)
         self._relax_by(BOOK if settings.omega is None else settings.omega)
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Look at the operator again; of a grid that has changed find omega."""
         version = version_of(self.problem.A)
         if self._advised and self._version != version:
-            self._relax_by(grid_omega(self.problem, singular=self.floating is not None))
+            self._relax_by(grid_omega(self.problem, singular=floating is not None))
             self._version = version  # last: time may be up before
         super().start(warm=warm, tolerance=tolerance)
 

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.solve import PrecisionName, Step
@@ -110,9 +111,10 @@ class SubspaceWorkspace(SweepWorkspace):
         self._sums = Sums(rows_of(self.x), 2)
         self._stale, self._target = True, 0.0
 
-    def start(self, *, warm: bool, tolerance: float) -> None:
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the free set; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance)
+        self.floating = floating
         self._stale, self._target = True, tolerance
         self.system.refresh()
 

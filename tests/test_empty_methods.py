@@ -1,0 +1,102 @@
+"""Methods of serial classes that do nothing, or return an argument or a constant, for a subclass to override: each has a reason."""
+
+import ast
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+# class, or class and method: why a subclass may replace what does nothing here
+ALLOWED = {
+    "GridPart": "the one place where one process and a rank differ; here nothing is exchanged",
+    "Launcher": "carries a command in one process; that of ranks agrees on arguments first",
+    "Scene": "a scene without particles, sides and joints; the models of its simulators have them",
+    "ParticleScene": "what a material says of itself; sand says it all with constants",
+    "ParticleSimulation.known_density": "what a material knows of its particles beside their state",
+    "ParticleSimulation.known_contact": "likewise",
+    "ParticleSimulation.measure_particles": "a material that evens out its particles measures them in each step",
+    "ParticleSimulation._layer_filled": "whether a layer under the material is filled; liquid has no such layer",
+    "Particles.look_around": "ranks copy particles beyond their boxes",
+    "Particles.drop_ghosts": "likewise",
+    "Flights._of_all": "ranks add up sums of fragments that cross cuts",
+    "Hierarchy.begin_climb": "levels of ranks correct ghost cells first",
+    "Hierarchy.end_climb": "likewise",
+    "VectorLevel.share": "likewise, of velocities",
+    "Sweep": "what sweeps a method that moves x by itself: nothing",
+    "Program.fits": "a recording for a GPU has launch dimensions that may be too small",
+    "_Loop._merits": "merit functions are those of boxes",
+    "_Shape.unit_length": "a mesh counts in units of its size",
+}
+
+
+def is_empty(method: ast.FunctionDef) -> bool:
+    """Return whether the body is a docstring, `pass` or the return of arguments or constants."""
+    arguments = {argument.arg for argument in (*method.args.args, *method.args.kwonlyargs)}
+
+    def plain(value: ast.expr | None) -> bool:
+        if isinstance(value, ast.Tuple | ast.List):
+            return all(map(plain, value.elts))
+        empty = isinstance(value, ast.Dict) and not value.keys
+        return value is None or empty or isinstance(value, ast.Constant) or (isinstance(value, ast.Name) and value.id in arguments)
+
+    def nothing(statement: ast.stmt) -> bool:
+        said = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+        return said or isinstance(statement, ast.Pass) or (isinstance(statement, ast.Return) and plain(statement.value))
+
+    return all(map(nothing, method.body))
+
+
+def overridden(sources: list[str]) -> Iterator[str]:
+    """Yield Class.method of what is empty, is not abstract, is of no protocol, and is overridden by a class below."""
+    methods: dict[str, dict[str, ast.FunctionDef]] = defaultdict(dict)
+    below: dict[str, set[str]] = defaultdict(set)
+    protocols = set()
+    for source in sources:
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ClassDef):
+                bases = [ast.unparse(base).split("[")[0].split(".")[-1] for base in node.bases]
+                methods[node.name] |= {m.name: m for m in node.body if isinstance(m, ast.FunctionDef)}
+                protocols |= {node.name} & ({node.name} if "Protocol" in bases else set())
+                for base in bases:
+                    below[base].add(node.name)
+
+    def descendants(name: str) -> set[str]:
+        return below[name].union(*map(descendants, below[name]))
+
+    for name in list(methods):
+        for method in methods[name].values() if name not in protocols else ():
+            abstract = any("abstractmethod" in ast.unparse(decorator) for decorator in method.decorator_list)
+            if not abstract and is_empty(method) and any(method.name in methods[other] for other in descendants(name)):
+                yield f"{name}.{method.name}"
+
+
+def test_no_method_waits_for_a_subclass_without_a_reason():
+    files = [path for folder in ("warp_lcp", "fluids", "granular") for path in sorted((ROOT / folder).rglob("*.py"))]
+    found = set(overridden([path.read_text() for path in files if "benchmarks" not in path.parts]))
+    assert "GridPart.fill" in found
+    assert not {method for method in found if method not in ALLOWED and method.split(".")[0] not in ALLOWED}
+
+
+def test_what_counts():
+    source = """
+class Base:
+    def a(self): "Do nothing."
+    def b(self, x): return x
+    def c(self): return ()
+    def d(self): return self.x
+    @abstractmethod
+    def e(self): pass
+    def f(self): pass
+class Other(Protocol):
+    def a(self): ...
+class Middle(Base):
+    def a(self): return 1 + 1
+    def d(self): return 2
+    def e(self): return 2
+class Last(Middle):
+    def b(self, x): return 2 * x
+    def c(self): return (1, 2, self)
+class Mine(Other):
+    def a(self): return 3 + 4
+"""
+    assert set(overridden([source])) == {"Base.a", "Base.b", "Base.c"}
