@@ -39,6 +39,7 @@ PROBES = [
     for n, place in enumerate(([0.3, 0.1, 0.2], [0.26, 0.01, 0.4], [0.9, 0.05, 0.1], [0.51, 0.3, 0.25]))
     for what in ("pressure", "velocity", "level")
 ]
+PROBES_2D = [dict(probe, position=probe["position"][:2]) for probe in PROBES]
 THROWN = [  # a body that turns, in the boxes of up to four ranks, and one that it meets
     box([0.35, 0.2, 0.1], [0.5, 0.4, 0.3], velocity=[1.0, 2.0, 0.0]),
     box([0.5, 0.2, 0.1], [0.65, 0.4, 0.3], velocity=[1.0, 0.5, 1.0]),
@@ -131,6 +132,32 @@ SCENES |= {
     "trickling sand": HEAP | TRICKLING | {"particles": {"transfer": "flip"}, "friction": {"model": "box"}},
 }
 
+CORNER = {"size": [1.0, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0], [0.2, 0.2])]}  # all ranks but one have nothing at the start
+PILE = {"size": [1.0, 0.5], "resolution": 32, "sand": CORNER["liquid"]}
+AWAY = DISC | {"center": [0.7, 0.25]}  # a solid in the box of a rank without material
+SHOWN = {"surface": True}
+LATE = box([0.7, 0.3], [0.8, 0.4], velocity=[0.5, 0.0], start=0.02)  # brings material to a rank that had none
+BARE = {  # every stage of a step, with a rank that has no material
+    "viscous": CORNER | {"viscosity": {"value": 5.0}, "wall": "sticky", "solid": [AWAY], "output": SHOWN | {"forces": True}},
+    "tension": CORNER | CAPILLARY | {"solid": [AWAY], "probe": PROBES_2D, "density_correction": {"every": 1}, "output": SHOWN},
+    "dragged bodies": CORNER | {"solid": [AWAY | {"density": 500.0}], "wall_drag": {"coefficient": 0.1}, "output": {"forces": True}},
+    "viscous bodies": CORNER | {"solid": [AWAY | {"density": 500.0}], "viscosity": {"value": 5.0}},
+    "band": CORNER | {"particles": {"narrow_band": {"width": 3.0}, "reseed": {}, "transfer": "flip"}},
+    "unilateral": CORNER | {"pressure": {"model": "unilateral"}, "solid": [AWAY], "domain": OPEN, "source": [LATE]},
+    "whole cells": CORNER | {"solids": "voxel", "pressure": {"surface": "voxel"}, "solid": [AWAY], "solver": {"tolerance": "auto"}},
+    "newton": CORNER | {"solver": {"method": "minimum-map-newton"}, "drain": [box([0.6, 0.0], [0.8, 0.2])]},
+    "deep": {"size": [1.0, 0.4, 0.4], "resolution": 20, "liquid": [box([0.0, 0.0, 0.0], [0.2, 0.2, 0.2])], "output": {"volume": True}},
+    "gone": CORNER | {"drain": [box([0.0, 0.0], [1.0, 0.5], start=0.02)], "density_correction": {"every": 1}},
+    "in flight": CORNER | {"liquid": [box([0.05, 0.25], [0.15, 0.35], velocity=[1.0, 1.0])]},
+    "pile": PILE | {"solid": [AWAY], "density_correction": {"every": 1}, "gauge": {"height": 0.1}, "output": SHOWN},
+    "bodies in a pile": PILE | {"solid": [AWAY | {"density": 500.0}], "particles": {"reseed": {"min": 4, "max": 4}}},
+    "voxel pile": PILE | {"solid": [AWAY], "solids": "voxel", "source": [LATE], "friction": {"model": "box"}},
+    "endless pile": PILE | {"periodic": [True, False], "sand": [box([0.15, 0.0], [0.35, 0.2])]},
+    "no pile": PILE | {"drain": [box([0.0, 0.0], [1.0, 0.5], start=0.02)], "open": ["right"], "particles": {"transfer": "flip"}},
+    "thrown pile": PILE | {"sand": [box([0.05, 0.25], [0.15, 0.35], velocity=[1.0, 1.0])]},
+}
+BARE_STEPS = 4
+
 
 def scene(**tables) -> ParticleScene:
     """Return a scene of liquid, or of sand."""
@@ -190,6 +217,21 @@ def run(ranks: Ranks, folder: Path) -> None:
             np.savez(folder / f"{name}_{ranks.size}.npz", cells=cells[order], pressure=pressure[order])
             (folder / f"{name}_{ranks.size}.json").write_text(json.dumps(rows))
     assert ranks.size != 4 or len(moved) > 9, moved
+
+
+def bare(ranks: Ranks, folder: Path) -> None:
+    """Take every stage of a step and of a frame, and go on in other boxes, where a rank has no material."""
+    for name, tables in BARE.items():
+        simulation = on_ranks(ranks, scene(**tables))
+        assert ranks.size == 1 or ranks.any(simulation.particles.count == 0), name
+        rows = advance(simulation, BARE_STEPS - 1)
+        simulation.frame()
+        boxes = simulation.grid.part.decomposition
+        simulation.repartition(simulation.grid.part.repartition(boxes))
+        rows += advance(simulation, 1)
+        ranks.agree("the log", rows)
+        if ranks.is_root:
+            (folder / f"bare_{name}_{ranks.size}.json").write_text(json.dumps(rows))
 
 
 WRAPPED = {
@@ -295,4 +337,6 @@ def differ(ranks: Ranks, folder: Path) -> None:
 if __name__ == "__main__":
     world = Ranks.world()
     for what in sys.argv[1].split(","):
-        {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ, "dam": dam, "wrap": wrap}[what](world, Path(sys.argv[2]))
+        {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ, "dam": dam, "wrap": wrap, "bare": bare}[what](
+            world, Path(sys.argv[2])
+        )

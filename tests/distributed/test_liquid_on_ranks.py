@@ -6,7 +6,7 @@ from pathlib import Path
 import liquids_on_ranks
 import numpy as np
 import pytest
-from liquids_on_ranks import COLUMN, DAM_STEPS, FLAT, HEAP, RESUMED, SCENES, WRAPPED, advance, model, scene
+from liquids_on_ranks import BARE, BARE_STEPS, COLUMN, DAM_STEPS, FLAT, HEAP, RESUMED, SCENES, WRAPPED, advance, model, scene
 from scipy.spatial import cKDTree
 from turns import Seat
 
@@ -47,7 +47,9 @@ def same(rows, expected, rel):
         scales |= {f"body{n}_v": other["max_speed"] for n in range(3)}
         for name, value in other.items():
             scale = next((scale for begin, scale in scales.items() if name.startswith(begin)), None)
-            if scale is not None and isinstance(value, float) and value == value:
+            if value is None:
+                assert row[name] is None, name
+            elif scale is not None and isinstance(value, float) and value == value:
                 assert abs(row[name] - value) <= max(rel, 1e-7) * scale, name
             elif name in NOISE:
                 last_bit = 1e-7 if rel else 0.0  # of a velocity, in float32
@@ -124,6 +126,14 @@ def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs,
         saved = np.load(tmp_path / f"{name}_{ranks}.npz")
         np.testing.assert_array_equal(saved["cells"], cells)
         np.testing.assert_allclose(saved["pressure"], pressure, atol=1e-5 * np.abs(pressure).max())
+
+
+@pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_rank_without_material_takes_every_stage(mpi, tmp_path, ranks):
+    mpi(ranks, PROGRAM, "bare", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"})
+    for name, tables in BARE.items():
+        rows = advance(single(scene(**tables)), BARE_STEPS)
+        same(json.loads((tmp_path / f"bare_{name}_{ranks}.json").read_text()), rows, 1e-5)
 
 
 @pytest.mark.parametrize("ranks", [3, pytest.param(4, marks=pytest.mark.slow)])
