@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.sides import PeriodicSides, side_bits, with_periodic
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.particle_scene import ParticleScene
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.subdomain import Subdomain
 
 
 def boundary_of_part(scene: ParticleScene, part: Subdomain, solids: Sequence[PlacedSolid]) -> tuple[Boundary, list[str]]:

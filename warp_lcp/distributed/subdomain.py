@@ -18,6 +18,7 @@ from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exc
 from warp_lcp.distributed.migration import cuts_of, migrate
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import ParticleMigration
+from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.waiting import waiting
 from warp_lcp.grid.cell_box import CellBox
 from warp_lcp.grid.part import BodyNumbers, Corner, GridPart
@@ -398,8 +399,6 @@ class Subdomain(GridPart):
 
     def make_boundary(self, scene: ParticleScene, solids: Sequence[PlacedSolid]) -> tuple[Boundary, list[str]]:
         """Return solids and walls of the part as the whole grid would have them, and warnings; collective."""
-        from warp_lcp.distributed.solids import boundary_of_part  # which knows parts
-
         return boundary_of_part(scene, self, solids)
 
     def exchange_of(self, particles: Particles) -> ParticleMigration:
