@@ -120,7 +120,7 @@ def test_graphs_of_a_step_give_the_same_bits_with_few_calls(name: str, most: dic
     states, counts = [], []
     for on_device in (False, True):
         monkeypatch.setattr(LaunchGraph, "on_device", on_device)
-        simulation = made(name.split()[0], 16 if name == "column-collapse" else 32, *name.split()[1:])
+        simulation = made(name.split(maxsplit=1)[0], 16 if name == "column-collapse" else 32, *name.split()[1:])
         for _ in range(4):
             meter.clear()
             row = simulation.step(min(simulation.stable_dt(), DT))

@@ -356,5 +356,7 @@ def _runs(grid: StaggeredGrid, solids: Sequence[tuple[int, Geometry]]) -> Iterat
             continue
         for place in of:
             number, geometry = solids[place]
-            mesh = grid.device.is_cuda and not grid.part.shared and isinstance(geometry, TriangleMesh)
-            yield PlacedMesh(grid, number, geometry, [place]) if mesh else place
+            if isinstance(geometry, TriangleMesh) and grid.device.is_cuda and not grid.part.shared:
+                yield PlacedMesh(grid, number, geometry, [place])
+            else:
+                yield place

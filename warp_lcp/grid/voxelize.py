@@ -65,7 +65,8 @@ class VoxelSolids:
 
 
 def voxelize(
-    grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, open_sides: int = 0, remarks: bool = True, counts: bool = True,
+    grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, open_sides: int = 0, remarks: bool = True,
+    counts: bool = True,
 ) -> VoxelSolids:  # fmt: skip
     """Assign every cell whose center lies inside a solid to the first such solid.
 
