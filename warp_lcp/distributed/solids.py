@@ -13,7 +13,7 @@ from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.motion import Motions
-from warp_lcp.grid.node_distance import NodeDistances, ShapeTable, nodes_near
+from warp_lcp.grid.node_distance import NodeDistances, nodes_near
 from warp_lcp.grid.node_distance_kernels import claim_nodes
 from warp_lcp.grid.sides import PeriodicSides, side_bits, with_periodic
 from warp_lcp.grid.solids import Geometry, TriangleMesh
@@ -47,13 +47,13 @@ class CutCellsOfPart(CutCells):
     def _enter(self) -> None:
         ranks, grid = self._part.ranks, self.grid
         whole = StaggeredGrid(grid.domain_counts, grid.spacing, grid.dimension, grid.device)
-        placed = {place: self._placed(place) for place in self._runs if not isinstance(place, ShapeTable)}
+        placed = {place: self._placed(place) for place in self._runs if isinstance(place, int)}
         meshes = {place: geometry for place, geometry in placed.items() if isinstance(geometry, TriangleMesh) and ranks.size > 1}
         boxes = {place: box for place, geometry in meshes.items() if (box := nodes_near(whole, geometry)) is not None}
         mine = [self._layer(geometry, boxes[place]) for place, geometry in meshes.items() if place in boxes]
         everyone, first = ranks.gather(np.concatenate(mine)) if mine else np.empty((0, 0)), 0
         for run in self._runs:
-            if isinstance(run, ShapeTable):
+            if not isinstance(run, int):
                 run.enter(self._nodes, self._sampler.snap)
             elif run not in meshes:
                 self._sampler.enter(self._nodes, self._moving[run], placed[run])
