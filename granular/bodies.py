@@ -185,10 +185,10 @@ class SandBodies:
         inverse, cell, edge = flat_vector(packing.inverse), found.cell, found.edge
         room = 2 * len(cell.at)  # both in one memory, which is read by one copy
         memory = wp.zeros(room + len(edge.at), dtype=wp.float64, device=device)
-        cells = wp.array(ptr=memory.ptr, dtype=wp.vec2d, shape=len(cell.at), device=device)
+        cells = wp.array(ptr=memory.ptr or 0, dtype=wp.vec2d, shape=len(cell.at), device=device)
         inputs = [self._shape, self._cells, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
         wp.launch(stiffness_kernel, len(cell.at), [*inputs, flat_vector(packing.mass), inverse, numbers, cells], device=device)
-        edges = memory[room:]
+        edges = wp.array(ptr=(memory.ptr or 0) + 8 * room, dtype=wp.float64, shape=len(edge.at), device=device)
         inputs = [self._shape, self._edges, flat_vector(packing.share), inverse, edges]
         wp.launch(lightness_kernel, len(edge.at), inputs, device=device)
         found_cells, found_edges = np.split(memory.numpy(), [room])

@@ -9,6 +9,7 @@ ROOT = Path(__file__).parent.parent
 # class, or class and method: why a subclass may replace what does nothing here
 ALLOWED = {
     "GridPart": "the one place where one process and a rank differ; here nothing is exchanged",
+    "ParticleExchange": "likewise for particles",
     "Launcher": "carries a command in one process; that of ranks agrees on arguments first",
     "Scene": "a scene without particles, sides and joints; the models of its simulators have them",
     "ParticleScene": "what a material says of itself; sand says it all with constants",

@@ -31,7 +31,7 @@ def answers(bodies: SandBodies, packing: Packing, index: np.ndarray, centers: np
     bodies.begin(packing, speeds, speeds, velocity=velocity, inverse_mass=inverse, density=1.0 / grid.cell_volume)
     bodies.prepare(packing, wp.array(np.full(NUMBERS, 0.5), dtype=wp.float32), pressure_step=0.8, shear_step=0.4)
     stress = wp.array(fields["stress"], dtype=wp.float32)
-    found = [bodies.velocity.numpy().copy(), bodies._correction.numpy().copy()]
+    found = [bodies.velocity.numpy().copy(), bodies._correction.array.numpy().copy()]
     for implicit in (True, False):
         bodies.respond(packing, stress, wp.launch, implicit=implicit)
         found += [bodies._force.numpy().copy(), bodies.velocity.numpy().copy()]

@@ -153,7 +153,7 @@ def test_points_enter_cells_as_a_fine_look_along_their_way_tells(seed: int) -> N
     sources._entered(0, since, now, starts=False)
     count = int(sources._lattice.count.value)
     entries, slot, filled, points = (array[:count] for array in sources._found)
-    span = sources._span_on_host
+    span = sources._span.host
     first, sizes = span[9:12], np.append(span[12:14], count / span[12:14].prod()).astype(int)
     at_rest = lattice_points(sources, 0, first, sizes)
 

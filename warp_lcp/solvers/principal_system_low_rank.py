@@ -167,6 +167,16 @@ class LowRankCorrection:
         return len(self._slot_columns)
 
     @property
+    def is_calm(self) -> bool:
+        """Whether no column is corrected for, which a GPU may go on without while `calm` says so."""
+        return self.calm is not None and self.slots == 0
+
+    @property
+    def is_made_ahead(self) -> bool:
+        """Whether a GPU makes the potentials of the last solve's columns as the next solve begins."""
+        return self.calm is not None and self.slots > 0
+
+    @property
     def readings(self) -> tuple[Reading, ...]:
         """What `note`, `note_products` and `make_potentials` write."""
         return (self.noted,) if self._read_products is None else (self.noted, self._read_products)

@@ -224,9 +224,16 @@ class RunAhead:
         self._take_rows()
         return True
 
+    @property
+    def _calm(self) -> wp.array[Any] | None:
+        """On a GPU, whether bodies ask for no correction of the cycle; None: there are none."""
+        correction = self._work.correction
+        return None if correction is None else correction.calm
+
     def _may_rebuild(self) -> bool:
         """Return whether the device follows the free set now."""
-        return self._rebuilds or self._work.is_calm()
+        correction = self._work.correction
+        return self._rebuilds or (correction is not None and correction.is_calm)
 
     def begin(self, guess: wp.array[Any], criteria: StoppingCriteria | MeanCriteria, left: int) -> float | None:
         """Begin a solve from a guess, and take steps; return the residual at clip(0, l, u), None where the loop has to begin again.
@@ -285,7 +292,7 @@ class RunAhead:
         """Record the kernel that decides whether the guess is good enough."""
         *given, noise = self._numbers
         memory = [self._work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
-        launch(begin_kernel, 1, [*memory, *given, counted, noise, self._work.calm], device=self._work.A.device)
+        launch(begin_kernel, 1, [*memory, *given, counted, noise, self._calm], device=self._work.A.device)
 
     def _launch_resumption(self, loop: Program) -> None:
         """Launch the kernel that resumes, and on CUDA the steps."""
@@ -293,8 +300,10 @@ class RunAhead:
         launch(resume_kernel, 1, [*memory, *self._standing], device=device)
         if device.is_cuda:
             loop.run_while(self._going)
-            self._work.note_free_set(launch)
-            self._work.note_correction()
+            if (correction := self._work.correction) is not None:
+                correction.note(launch)
+                if correction.slots:
+                    correction.note_products()
 
     def _take_rows(self) -> None:
         """Take over the rows that a loop has left; waits for the device."""
@@ -318,9 +327,10 @@ class RunAhead:
             if work.precision is Precision.SINGLE:  # rounding cannot be taken back: x, the best iterate, is stored before each step
                 CONVERT.bind(Rows.of_fields(work.problem.layout), a=work.x, b=work.best()).launch(loop.launch)
             loop.extend(step)
-            calm = work.calm if rebuilds else None
+            calm = self._calm if rebuilds else None
             if calm is not None:
-                work.note_free_set(loop.launch)
+                assert work.correction is not None
+                work.correction.note(loop.launch)
             memory = [work.residual.scalars, self._found.array, self._judged.array, self._going, self._stale]
             loop.launch(judge_kernel, 1, [*memory, rebuilds, work.bounded, calm], device=work.A.device)
         return self._loops[key]
@@ -382,8 +392,9 @@ class Beginning:
         self._judge(self._counted, launch)
         if loop is not None:
             loop.run_while(going)
-        else:
-            self._work.prepare_correction()
+        elif (correction := self._work.correction) is not None and correction.is_made_ahead:
+            self._work.hierarchy.rebuild_changed()
+            correction.make_potentials()
 
     def is_plain(self) -> bool:
         """Return whether no component floats and the guess is finite; waits for the device."""
@@ -418,7 +429,7 @@ class Beginning:
         r.project(x, keep=True, launch=launch)
         work.round_iterate(launch=launch)
         r.assess(x, classify=True, launch=launch)
-        if device.is_cuda:
-            work.note_free_set(launch)
+        if device.is_cuda and work.correction is not None:
+            work.correction.note(launch)
         if work.scratch is not None:
             CLEAR.bind(work.flat, x=work.scratch[1]).launch(launch)

@@ -76,6 +76,7 @@ class CoupledWorkspace(MultigridWorkspace):
     """Memory of the method for one problem of a grid and bodies."""
 
     residual: CoupledResidual
+    correction: LowRankCorrection
 
     def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
         self._low = low
@@ -88,8 +89,6 @@ class CoupledWorkspace(MultigridWorkspace):
         self._fresh = True  # whether the correction is still that of the last solve
         self.readings = (low.products, *self.correction.readings)
         self._prepared = False  # whether potentials have been made as the solve began
-        if problem.device.is_cuda and self._ahead is not None:
-            self.calm = self.correction.calm
         low.products_of = self.x if problem.layout.across is None else None
         self._newton: Inner | None = None
         self._searches = False  # whether steps are Newton's
@@ -107,27 +106,8 @@ class CoupledWorkspace(MultigridWorkspace):
         if guess is not None:
             self.correction.prepare()
         reference = super().begin_ahead(guess, criteria, steps)
-        self._prepared = reference is not None and self.calm is not None and self.correction.slots > 0
+        self._prepared = reference is not None and self.correction.is_made_ahead
         return reference
-
-    def is_calm(self) -> bool:
-        """Return whether there is no correction, which a GPU may go on without."""
-        return self.calm is not None and self.correction.slots == 0
-
-    def note_free_set(self, launch: Launch) -> None:
-        """Launch what `LowRankCorrection.renew` reads."""
-        self.correction.note(launch)
-
-    def note_correction(self) -> None:
-        """Launch the products that the correction is made of, for the free set as it is."""
-        if self.correction.slots:
-            self.correction.note_products()
-
-    def prepare_correction(self) -> None:
-        """Launch the potentials of the last solve's columns for the free set as it is, and their products."""
-        if self.calm is not None and self.correction.slots:
-            self.hierarchy.rebuild_changed()
-            self.correction.make_potentials()
 
     def crawls(self) -> bool:
         """Take note of the pace; bodies have no part in the grid's matrix, so it is Newton's steps that take over."""

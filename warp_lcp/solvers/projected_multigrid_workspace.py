@@ -32,6 +32,7 @@ from warp_lcp.solvers.phases import FIRST, AlgebraicSteps, Pace
 from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 if TYPE_CHECKING:
+    from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 
 
@@ -185,8 +186,8 @@ class MultigridWorkspace(IterateMemory):
 
     residual: AssessedResidual
     readings: tuple[Reading, ...] = ()  # that evaluations leave besides the residual's
-    calm: wp.array[Any] | None = None  # int32 on a GPU, whether it may follow the free set alone; None: it always may
-    free_set_noted = False  # whether `note_free_set` has been launched for the free set as it is
+    correction: LowRankCorrection | None = None  # of the cycle, for bodies
+    free_set_noted = False  # whether `LowRankCorrection.note` has been launched for the free set as it is
 
     def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid, *, shifted: bool = False) -> None:
         precision = Precision(settings.precision)
@@ -245,19 +246,6 @@ class MultigridWorkspace(IterateMemory):
     def begins_ahead(self) -> bool:
         """Whether a GPU can begin a solve without the host."""
         return self._ahead is not None and self.A.device.is_cuda
-
-    def is_calm(self) -> bool:
-        """Return whether a GPU may take steps that follow the free set as long as `calm` says so."""
-        return False
-
-    def note_free_set(self, launch: Launch) -> None:
-        """Launch on a GPU what the host has to know of the free set before the next step."""
-
-    def note_correction(self) -> None:
-        """Launch on a GPU what the host has to know of a correction of the cycle."""
-
-    def prepare_correction(self) -> None:
-        """Launch on a GPU what the first step of a solve needs if the host finds what it did in the last one."""
 
     @property
     def exact(self) -> bool:
