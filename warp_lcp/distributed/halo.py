@@ -76,7 +76,7 @@ class Halo:
         return self._coarser[factors]
 
     def join_components(self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray | None:
-        """Join connected components of this rank's cells with those of other ranks; collective.
+        """Join components of this rank's cells with those of others; collective.
 
         Components of boxes that nothing holds are nodes of a graph, whose edges are open faces at cuts; one more node is all that is held.
 

@@ -290,7 +290,10 @@ class CutCells:
             self._differences[axis] = float(np.moveaxis(apart, 2 - axis, 0)[end : end + 1].max(initial=0.0))
 
     def difference(self, axis: int) -> float:
-        """Return by how much the distances at the two sides of a periodic axis differ, as far as solids are near [cells]; collective."""
+        """Return the difference of distances at two periodic sides [cells]; collective.
+
+        Distances are compared as far as solids are near.
+        """
         if axis in self._differences:
             mine = self._differences[axis]
         else:

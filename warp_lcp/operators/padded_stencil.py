@@ -88,7 +88,7 @@ class Ghosts(Protocol):
         """Return what fills those of aggregates of so many cells along x, y, z; None if aggregates would be cut."""
 
     def join_components(self, number: np.ndarray, held: np.ndarray, faces: Sequence[np.ndarray | float]) -> np.ndarray | None:
-        """Join connected components of this process's cells with those of others; collective.
+        """Join components of this process's cells with those of others; collective.
 
         Args:
             number: of the component of each stored cell, flat, from 0; -1: none, or something holds it.
