@@ -1,6 +1,8 @@
-"""Build a liquid's models: surface, pressure, surface tension, viscosity."""
+"""Build a liquid's models: surface, pressure, surface tension, viscosity; the protocol of other models."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import warp as wp
@@ -14,9 +16,47 @@ from warp_lcp.fluids.surface_tension import SurfaceTension
 from warp_lcp.fluids.unilateral import UnilateralPressure
 from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.grid.level_set import Fill
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary, CutBoundary
+from warp_lcp.material.particle_log import Row
 from warp_lcp.rigid.bodies import RigidBodies
+
+if TYPE_CHECKING:
+    from warp_lcp.fluids.simulator import LiquidSimulation
+
+
+class LiquidModel(Protocol):
+    """A model of your own in the step of a liquid, such as a force; `LiquidSimulation` takes it among its `models`.
+
+    It acts on all of the liquid: with such models the corrections of bodies in flight, which know of gravity alone, are off.
+
+    Written once, it runs in one process and on ranks: `liquid.grid.part` says which cells are this process's, fills ghost cells and adds
+    up over all. Every rank enters `act` in every step.
+
+    Attributes:
+        columns: of the log, that `act` fills.
+    """
+
+    columns: tuple[str, ...]
+
+    def allocate(self, liquid: LiquidSimulation) -> None:
+        """Allocate what belongs to `liquid.grid`; called again when the liquid goes on on another grid."""
+
+    def act(self, liquid: LiquidSimulation, window: Window, dt: float) -> Row:
+        """Change `liquid.velocity` after gravity and before viscosity and pressure; collective.
+
+        Args:
+            liquid: whose faces in liquid are known, `liquid.projection.known`; forces act for `liquid.kick_dt` [s].
+            window: cells that the liquid can touch in the step.
+            dt: time step [s].
+
+        Returns:
+            What the log has in `columns`, the same on all ranks.
+
+        Raises:
+            StepFailed: a smaller dt may be tried; on all ranks.
+        """
+
 
 VISCOUS_TOLERANCE = 1e-4  # where the pressure's comes from the time step
 

@@ -11,7 +11,7 @@ import numpy as np
 
 import warp_lcp as wl
 from warp_lcp.fluids.forces import SolidForces, WallSums
-from warp_lcp.fluids.models import make_pressure, make_surface, make_tension, make_viscosity
+from warp_lcp.fluids.models import LiquidModel, make_pressure, make_surface, make_tension, make_viscosity
 from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
 from warp_lcp.fluids.scene import LiquidScene
@@ -62,6 +62,7 @@ class LiquidSimulation(ParticleSimulation):
         parts: the fields and models on that grid.
         particles: the liquid at the start.
         solids: of the scene, if the output needs the forces on them.
+        models: of your own, see `warp_lcp.fluids.models.LiquidModel`.
         more: as of `ParticleSimulation`.
 
     Attributes:
@@ -82,9 +83,11 @@ class LiquidSimulation(ParticleSimulation):
         particles: Particles,
         *,
         solids: Sequence[PlacedSolid] = (),
+        models: Sequence[LiquidModel] = (),
         **more: Any,
     ) -> None:
         tell = scene.output.forces or (scene.drags is not None and more.get("bodies") is not None)
+        self.models = tuple(models)
         self.forces = SolidForces(solids, grid.dimension) if tell else None
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
@@ -110,6 +113,10 @@ class LiquidSimulation(ParticleSimulation):
         self.wall_sums = WallSums(grid, self.boundary, 1 + len(self.scene.solid)) if asked else None
         self.wall_drag = WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
+        if self.models:  # flights and spray know of gravity alone
+            self.flights = None
+        for model in self.models:
+            model.allocate(self)
         if self.tension is not None:
             self.projection.jump, self.projection.adhesion = self.tension.jump, self.tension.adhesion
 
@@ -155,6 +162,7 @@ class LiquidSimulation(ParticleSimulation):
         self.particles_to_grid(window)
         speed = self.top_speed(before)
         self._find_surface(window)
+        own = self._act(window, dt)
         if self.grid.device.is_cuda and self.surface.density is not None:
             self.monitor_density(window, self.surface.density)  # so that it is read with the solve
         viscous = self._rub(self.viscosity, window, dt, speed) if self.viscosity is not None else {}
@@ -174,7 +182,9 @@ class LiquidSimulation(ParticleSimulation):
         self.grid_to_particles(window, self.projection.kind, dt)
         if self.tension is not None:
             self.tension.calm(self.particles, dt)
-        row = self.move(dt, window, self.surface.density, self.projection.contact) | self.solve_row(projected.result) | viscous | walls
+        row = (
+            self.move(dt, window, self.surface.density, self.projection.contact) | self.solve_row(projected.result) | viscous | walls | own
+        )
         if self.scene.output.diagnostics:
             row |= {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": self.surface.volume(projected.unknowns)}
             if self.tension is not None:
@@ -238,12 +248,14 @@ class LiquidSimulation(ParticleSimulation):
         solve took and reached, the energy that became heat in the step, and the work of moving walls on it [J; J/m in 2-D]. With drag along
         walls: drag_work [J; J/m in 2-D], the energy that it takes from the liquid in the step.
         """
+        own = tuple(name for model in self.models for name in model.columns)
         drags = ("drag_work",) if self.scene.drags is not None else ()
         columns = ("active", "max_divergence", "volume", *drags) if self.scene.output.diagnostics else ("active", *drags)
         if self.tension is not None and self.scene.output.diagnostics:
             columns = (*columns, "surface_energy")
         columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
-        return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
+        automatic = () if self.projection.automatic is None else ("tolerance", "time_error")
+        return (*columns, *automatic, *own)
 
     def frame(self) -> list[Part]:
         """Return the parts of a frame: particles, liquid cells, surface and volume.
@@ -288,6 +300,14 @@ class LiquidSimulation(ParticleSimulation):
         if self.tension is not None:
             with self.watch.stage("surface tension", *self.velocity, self.tension.jump):
                 self.tension.act(self.velocity, window, projection.kind, self.kick_dt)
+
+    def _act(self, window: Window, dt: float) -> Row:
+        """Let the caller's models act; return what the log says of them."""
+        row = Row()
+        for model in self.models:
+            with self.watch.stage(type(model).__name__, *self.velocity):
+                row |= model.act(self, window, dt)
+        return row
 
     def _mark_cells(self, window: Window) -> None:
         """Mark the liquid's cells, ghost cells as other processes do."""
@@ -411,7 +431,8 @@ class FluidsSimulator:
     scene_model = LiquidScene
 
     def create(
-        self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None
+        self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None,
+        models: Sequence[LiquidModel] = (),
     ) -> LiquidSimulation:  # fmt: skip
         """Build the simulation of a scene, on several ranks this rank's part of it; then collective.
 
@@ -422,6 +443,7 @@ class FluidsSimulator:
             ranks: that share it, for which the scene is the same; None: one process.
             wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the solids' cells stay
                 fixed. None: all are at rest.
+            models: of your own, see `warp_lcp.fluids.models.LiquidModel`.
 
         Raises:
             ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed. On all ranks.
@@ -430,11 +452,12 @@ class FluidsSimulator:
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
         solids = placed_solids(scene, folder)
         bodies = make_bodies(scene, solids, partial(RigidBodies, ranks=ranks or ONE_PROCESS))
-        return self.assemble(scene, solids, bodies, device=device, folder=folder, ranks=ranks, wall_velocity=wall_velocity)
+        more: dict[str, Any] = {"ranks": ranks, "wall_velocity": wall_velocity, "models": models}
+        return self.assemble(scene, solids, bodies, device=device, folder=folder, **more)
 
     def assemble(
         self, scene: LiquidScene, solids: Sequence[PlacedSolid], bodies: RigidBodies | None, *, device: str, folder: Path,
-        ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None,
+        ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None, models: Sequence[LiquidModel] = (),
     ) -> LiquidSimulation:  # fmt: skip
         """Build the simulation of a scene from placed solids and bodies.
 
@@ -457,8 +480,8 @@ class FluidsSimulator:
         parts = make_parts(grid)
         without = start_band(scene, grid, parts.boundary, folder, parts.band)
         particles, notes = make_particles(scene, grid, parts.boundary, folder, without)
-        outlets, spray = make_outlets(scene, grid, folder), make_spray(scene, coverage, solids)
+        outlets, spray = make_outlets(scene, grid, folder), None if models else make_spray(scene, coverage, solids)
         return LiquidSimulation(
             scene, grid, parts, particles, make_parts=make_parts, solids=solids, outlets=outlets, bodies=bodies, coverage=coverage,
-            spray=spray, notes=[*warnings, *notes],
+            spray=spray, models=models, notes=[*warnings, *notes],
         )  # fmt: skip

@@ -9,10 +9,11 @@ import pytest
 
 import small_liquids
 import small_sands
+from code_blocks import blocks
 from small_liquids import box
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.fluids import viscosity_multigrid
+from warp_lcp.fluids import SIMULATOR, viscosity_multigrid
 from warp_lcp.frames.pieces import one_mesh
 from warp_lcp.frames.vtu import Mesh
 from warp_lcp.material.particle_scene import ParticleScene
@@ -234,6 +235,26 @@ def bare(ranks: Ranks, folder: Path) -> None:
             (folder / f"bare_{name}_{ranks.size}.json").write_text(json.dumps(rows))
 
 
+def own_model(ranks: Ranks, folder: Path) -> None:
+    """Run the documentation's model, unchanged, where rank 0 has all of the sponge, or all ranks have some."""
+    for name, tables in {"corner": CORNER, "flat": FLAT}.items():
+        simulation = SIMULATOR.create(scene(**tables), device="cpu", folder=Path(), ranks=ranks, models=[sponge()(20.0, 0.1)])
+        rows = advance(simulation, BARE_STEPS)
+        simulation.repartition(simulation.grid.part.repartition(simulation.grid.part.decomposition))
+        rows += advance(simulation, 1)
+        ranks.agree("the log", rows)
+        if ranks.is_root:
+            (folder / f"own_{name}_{ranks.size}.json").write_text(json.dumps(rows))
+
+
+def sponge() -> type:
+    """Return the model of the documentation's page, without what it runs at the end."""
+    page = Path(__file__).parents[2] / "docs/own-model.md"
+    names: dict[str, type] = {}
+    exec(compile(blocks(page, "python")[0].split("scene = load_scene")[0], page.name, "exec"), names)
+    return names["Sponge"]
+
+
 WRAPPED = {
     "flat": SCENES["flat"] | {"output": {"surface": True}, "solid": [DISC]},
     "coarse": SCENES["cut"] | {"output": {"surface": True, "surface_resolution": 1}, "resolution": 40},
@@ -337,6 +358,14 @@ def differ(ranks: Ranks, folder: Path) -> None:
 if __name__ == "__main__":
     world = Ranks.world()
     for what in sys.argv[1].split(","):
-        {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ, "dam": dam, "wrap": wrap, "bare": bare}[what](
-            world, Path(sys.argv[2])
-        )
+        {
+            "run": run,
+            "keep": keep,
+            "go-on": go_on,
+            "fail": fail,
+            "differ": differ,
+            "dam": dam,
+            "wrap": wrap,
+            "bare": bare,
+            "own-model": own_model,
+        }[what](world, Path(sys.argv[2]))

@@ -6,7 +6,22 @@ from pathlib import Path
 import liquids_on_ranks
 import numpy as np
 import pytest
-from liquids_on_ranks import BARE, BARE_STEPS, COLUMN, DAM_STEPS, FLAT, HEAP, RESUMED, SCENES, WRAPPED, advance, model, scene
+from liquids_on_ranks import (
+    BARE,
+    BARE_STEPS,
+    COLUMN,
+    CORNER,
+    DAM_STEPS,
+    FLAT,
+    HEAP,
+    RESUMED,
+    SCENES,
+    WRAPPED,
+    advance,
+    model,
+    scene,
+    sponge,
+)
 from scipy.spatial import cKDTree
 from turns import Seat
 
@@ -15,6 +30,7 @@ from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.extension import too_far
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.fluids import SIMULATOR
 from warp_lcp.material.particle_pieces import fields_of
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.scene_file import load_scene
@@ -130,10 +146,14 @@ def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs,
 
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_rank_without_material_takes_every_stage(mpi, tmp_path, ranks):
-    mpi(ranks, PROGRAM, "bare", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"})
+    mpi(ranks, PROGRAM, "bare,own-model", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"})
     for name, tables in BARE.items():
         rows = advance(single(scene(**tables)), BARE_STEPS)
         same(json.loads((tmp_path / f"bare_{name}_{ranks}.json").read_text()), rows, 1e-5)
+    for name, tables in {"corner": CORNER, "flat": FLAT}.items():  # the documentation's own model
+        rows = advance(SIMULATOR.create(scene(**tables), device="cpu", folder=Path(), models=[sponge()(20.0, 0.1)]), BARE_STEPS + 1)
+        assert rows[-1]["sponge_work"] > 0.0
+        same(json.loads((tmp_path / f"own_{name}_{ranks}.json").read_text()), rows, 1e-5)
 
 
 @pytest.mark.parametrize("ranks", [3, pytest.param(4, marks=pytest.mark.slow)])
