@@ -1,4 +1,4 @@
-"""Build a liquid's models: surface, pressure, surface tension, viscosity; the protocol of other models."""
+"""Models of a liquid: surface, pressure, surface tension, viscosity, your own."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
 
 class LiquidModel(Protocol):
-    """A model of your own in the step of a liquid, such as a force; `LiquidSimulation` takes it among its `models`.
+    """A model of your own in the step of a liquid, such as a force.
+
+    `LiquidSimulation` takes it among its `models`.
 
     It acts on all of the liquid: with such models the corrections of bodies in flight, which know of gravity alone, are off.
 
@@ -40,7 +42,7 @@ class LiquidModel(Protocol):
     columns: tuple[str, ...]
 
     def allocate(self, liquid: LiquidSimulation) -> None:
-        """Allocate what belongs to `liquid.grid`; called again when the liquid goes on on another grid."""
+        """Allocate arrays on `liquid.grid`; again when the grid has changed."""
 
     def act(self, liquid: LiquidSimulation, window: Window, dt: float) -> Row:
         """Change `liquid.velocity` after gravity and before viscosity and pressure; collective.

@@ -434,7 +434,7 @@ class FluidsSimulator:
         self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None, wall_velocity: np.ndarray | None = None,
         models: Sequence[LiquidModel] = (),
     ) -> LiquidSimulation:  # fmt: skip
-        """Build the simulation of a scene, on several ranks this rank's part of it; then collective.
+        """Build the simulation of a scene; on ranks, this rank's part (collective).
 
         Args:
             scene: a LiquidScene.

@@ -467,7 +467,7 @@ class GranularSimulator:
     scene_model = SandScene
 
     def create(self, scene: Scene, *, device: str, folder: Path, ranks: Ranks | None = None) -> SandSimulation:
-        """Build the simulation of a scene, on several ranks this rank's part of it; then collective.
+        """Build the simulation of a scene; on ranks, this rank's part (collective).
 
         Args:
             scene: a SandScene.

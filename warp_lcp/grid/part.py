@@ -130,7 +130,7 @@ class ParticleExchange:
             self.particles.number()
 
     def look_around(self) -> None:
-        """Take in the particles within a cell of this process's as ghosts, with positions alone; collective."""
+        """Copy positions of other ranks' particles within a cell as ghosts; collective."""
 
     def drop_ghosts(self) -> None:
         """Keep this process's own particles alone."""

@@ -428,7 +428,9 @@ class Particles:
         self._sorting.forget()  # which knows the halves of both
 
     def arrange(self, step: int) -> None:
-        """Take in ghosts and number the particles by cell; sort in every SORT_EVERY-th step, or where the order is needed; collective.
+        """Number the particles by cell, with ghosts on ranks; collective.
+
+        They are sorted in every SORT_EVERY-th step, or where the order is needed.
 
         It depends on nothing but the step, so that a run that was interrupted does the same.
 
@@ -438,7 +440,7 @@ class Particles:
         self.exchange.arrange(sort=self.offsets is not None or step % SORT_EVERY == 0)
 
     def look_around(self) -> None:
-        """Take in the particles within a cell of this process's as ghosts, with positions alone; collective."""
+        """Copy positions of other ranks' particles within a cell as ghosts; collective."""
         self.exchange.look_around()
 
     def drop_ghosts(self) -> None:
@@ -510,7 +512,10 @@ class Particles:
             launch_list(kernels.reorder_kernel, self.count, [self._order, source, target], device=device, cost=4)
 
     def totals(self) -> ParticleTotals:
-        """Return sums over the particles of all processes; bitwise reproducible, 0 without particles. Collective; ghosts are gone."""
+        """Return sums over the particles of all ranks; collective.
+
+        They are bitwise reproducible, and 0 without particles. Ghosts are gone.
+        """
         return self.exchange.joined_totals(self._own_totals())
 
     def _own_totals(self) -> ParticleTotals:

@@ -33,7 +33,9 @@ class Simulator(Protocol):
 
 
 def runs_on_ranks(simulator: Simulator) -> bool:
-    """Return whether the simulations of a plug-in run on several MPI ranks: its `create` takes `ranks`.
+    """Return whether a plug-in's simulations run on several MPI ranks.
+
+    Then its `create` takes `ranks`.
 
     They are then `warp_lcp.simulation.Joined`. `create` is collective, with the same scene on all ranks, and returns this rank's part.
     """
