@@ -45,7 +45,7 @@ class LiquidModel(Protocol):
         """Allocate arrays on `liquid.grid`; again when the grid has changed."""
 
     def act(self, liquid: LiquidSimulation, window: Window, dt: float) -> Row:
-        """Change `liquid.velocity` after gravity and before viscosity and pressure; collective.
+        """Change `liquid.velocity`, after gravity, before viscosity; collective.
 
         Args:
             liquid: whose faces in liquid are known, `liquid.projection.known`; forces act for `liquid.kick_dt` [s].
