@@ -42,8 +42,11 @@ class ViscosityMultigrid:
         self._boxes = [ActiveWindow(level.grid.everywhere) for level in self.levels]  # of the cells whose equations are made
         self._inner = [ActiveWindow(level.grid.domain) for level in self.levels]  # those of the domain among them
         self._window: Window | None = None  # of the last `move_to`
-        begin = [Launches(partial(perform, partial(wp.copy, self._b, self.r)))] if self._shared else []
+        begin = [Launches(partial(perform, self._take_right_side))] if self._shared else []
         self.program = recorded(grid.device, [*begin, *self.cycle.stages()])
+
+    def _take_right_side(self) -> None:
+        wp.copy(self._b, self.r)
 
     def _levels(self) -> list[ViscosityLevel]:
         grid: StaggeredGrid | None = self.grid

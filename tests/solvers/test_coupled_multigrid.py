@@ -121,7 +121,7 @@ def test_a_plain_preconditioner_is_not_enough(device):
         work = wl.ProjectedMultigrid().init(problem)
         assert isinstance(work, CoupledWorkspace)
         if not corrected:
-            work.correction.renew = lambda begins: False  # type: ignore[method-assign]
+            work.correction.renew = lambda begins, noted, made: False  # type: ignore[method-assign]
         result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=100), workspace=work)
         counts.append(result.linear_iterations if result else 100)
         assert (work.correction.slots > 0) == corrected
