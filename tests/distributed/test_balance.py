@@ -76,10 +76,11 @@ def test_boxes_are_cut_anew_only_if_the_whole_step_gets_a_quarter_shorter(least,
     now = SimpleNamespace(counts=(8, 8, 8), parts=[[4, 4], [8], [8]], repartition=lambda cut: cut)
     ranks = SimpleNamespace(size=2, rank=0, collect=lambda mine: [mine, None])
     part = SimpleNamespace(decomposition=now, layers=3, ranks=ranks)
+    particles = SimpleNamespace(exchange=SimpleNamespace(counts=[1000, 100]))
     monkeypatch.setattr(balance, "seen_by", lambda counts, parts, layers: np.zeros((2, 1, 1)))
     monkeypatch.setattr(balance, "blocks", lambda part, particles, edge: np.zeros(1))
     monkeypatch.setattr(balance, "Load", lambda *given: SimpleNamespace(best=lambda *asked, rank: (least, cuts)))
-    found = balance.Balance(fixed=1000.0).better(part, SimpleNamespace(counts=[1000, 100]), 1)
+    found = balance.Balance(fixed=1000.0).rebalance(part, particles, 1)
     assert found == (cuts if pays else None)
 
 
