@@ -8,12 +8,6 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = {"warp_lcp": "warp_lcp", "warp_lcp.fluids": "fluids", "warp_lcp.granular": "granular", "warp_lcp.benchmarks": "benchmarks"}
-# importer, imported: why the import within a function may close a circle
-ALLOWED = {
-    ("warp_lcp.fluids.simulator", "warp_lcp.fluids.distributed"): "needs MPI, so that it is imported when a run starts on ranks",
-    ("warp_lcp.granular.simulator", "warp_lcp.granular.distributed"): "likewise",
-    ("warp_lcp.distributed.halo", "warp_lcp.distributed.hierarchy"): "levels on ranks are asked of what fills their ghost cells",
-}
 
 
 def modules() -> dict[str, Path]:
@@ -75,7 +69,6 @@ def edges_of_all() -> dict[str, set[str]]:
     names, found = modules(), {}
     for name, path in names.items():
         direct = {other for other in imported(ast.parse(path.read_text()), names) if other in names and other != name}
-        direct -= {other for other in direct if (name, other) in ALLOWED}
         around = {other.rsplit(".", depth)[0] for other in direct for depth in range(1, other.count(".") + 1)}
         found[name] = direct | {package for package in around if package != name and not name.startswith(f"{package}.")}
     return found

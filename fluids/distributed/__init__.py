@@ -1,1 +1,0 @@
-"""Viscosity on the ranks of MPI."""
