@@ -228,3 +228,25 @@ def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision)
     fields = b.ravel()[fluid], lower.ravel()[fluid], np.full(fluid.sum(), np.inf)
     own = natural_residual(matrix, *fields, result.x.numpy().ravel()[fluid])
     assert own <= 1.1e-6 * natural_residual(matrix, *fields, np.zeros(fluid.sum()))
+
+
+@pytest.mark.parametrize("cycles", [1, 2, 3])
+def test_the_correction_is_of_the_free_set_after_the_projected_cycles(cycles, device, monkeypatch):
+    """In projected cycles every unknown is free, and no correction is made; the first one begins anew."""
+    taken, made = [], []
+    renew = LowRankCorrection.renew
+
+    def noted(self, *, begins, **others):
+        made.append((taken[-1], begins))
+        return renew(self, begins=begins, **others)
+
+    monkeypatch.setattr(LowRankCorrection, "renew", noted)
+    grid, U, _, _ = small(device)
+    A = wl.SumOperator(grid, wl.LowRankOperator(U, np.diag([1.0, 2.0, 3.0]), device=device))
+    problem = wl.LCP(A, np.random.default_rng(53).standard_normal(grid.shape))
+    method = wl.ProjectedMultigrid(monotone_cycles=cycles)
+    result = wl.solve(problem, method, stopping=TIGHT, callback=lambda record: taken.append(record.iteration))
+    assert [record.step for record in result.history[1 : cycles + 2]] == ["monotone cycle"] * cycles + ["truncated cycle"]
+    assert made[0] == (cycles, True)
+    assert len(made) > 1
+    assert not any(begins for _, begins in made[1:])

@@ -369,12 +369,12 @@ class MultigridWorkspace(IterateMemory):
         """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
         descent = self.descent
         self._leave()
-        self._cycles_left -= 1
         self._budget -= 1
-        classify = self._cycles_left == 0
+        classify = self._cycles_left == 1  # truncated cycles come next
         plain = type(self) is MultigridWorkspace and self._ahead is not None  # others read on the way
         with as_one_table(self.problem.device) if plain else nullcontext():
             self.rebuild(classify=self.residual.classified)
+            self._cycles_left -= 1
             self._move_monotonely(descent.safe, classify, launch_recorded)
         self.residual.read(classified=classify)
         if self.floating is not None and self._cycles_left == 0:
