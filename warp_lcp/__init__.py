@@ -35,7 +35,6 @@ from warp_lcp.rows.kernel_messages import hear_kernels
 from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
-from warp_lcp.solvers.coupled_problem import CoupledBlock, CoupledResult, StaggeredRound, solve_coupled
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
@@ -94,8 +93,6 @@ __all__ = [
     "BatchResult",
     "BlockedGaussSeidel",
     "Budget",
-    "CoupledBlock",
-    "CoupledResult",
     "CycleSettings",
     "DenseOperator",
     "DirectEnumeration",
@@ -127,7 +124,6 @@ __all__ = [
     "SolveResult",
     "SolveStatus",
     "SparseOperator",
-    "StaggeredRound",
     "Staggering",
     "Stencil",
     "Step",
@@ -147,6 +143,5 @@ __all__ = [
     "release_workspace",
     "set_threads",
     "solve",
-    "solve_coupled",
     "vjp",
 ]

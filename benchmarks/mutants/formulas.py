@@ -244,7 +244,7 @@ FORMULAS = [
         ("            work.sweep.run(x, forward=True)", "            work.sweep.run(x, forward=False)"),
     ),
     *_changes(
-        "solvers/partition.py",
+        "solvers/staggering.py",
         BLOCKS,
         ("[rows] + self._outer @", "[rows] - self._outer @"),
         ("            slab[:, rows] = 0.0\n", ""),
@@ -252,7 +252,7 @@ FORMULAS = [
         ("others[rows] = 0.0", "others[rows] = 1.0"),
         ("x=self._y, less=self._z, target=self._b", "x=self._y, less=None, target=self._b"),
     ),
-    *_changes("solvers/coupled_problem.py", BLOCKS, ("range(count) if forward else reversed(range(count))", "range(count)")),
+    *_changes("solvers/staggering.py", BLOCKS, ("range(count) if forward else reversed(range(count))", "range(count)")),
     *_changes(
         "solvers/blocked_gauss_seidel_kernels.py",
         BLOCKS,

@@ -20,9 +20,8 @@ from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_sweep_kernel
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.partition import Blocks, blocks_of_size, color_blocks, given_blocks
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
-from warp_lcp.solvers.staggering import StaggeringWorkspace
+from warp_lcp.solvers.staggering import Blocks, StaggeringWorkspace, blocks_of_size, color_blocks, given_blocks
 from warp_lcp.solvers.sweep import bound_operands, check_colors
 
 CONSECUTIVE = 3  # unknowns of a block unless given: a contact in space
