@@ -1,19 +1,18 @@
-"""Conjugate gradients on a grid, preconditioned by multigrid, in two passes over the finest level besides the way down the cycle."""
+"""Conjugate gradients on a grid in fused passes, with a multigrid cycle as preconditioner."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import no_type_check
 
-import numpy as np
 import warp as wp
 
-from warp_lcp.krylov.conjugate_gradient import first_iteration, next_iteration
+from warp_lcp.krylov.conjugate_gradient import ConjugateGradient, first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import KernelFile, Wave
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.fields import zeros_like
+from warp_lcp.rows.program import Launch, launch
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, NORM, SIZE, STEP
@@ -49,11 +48,12 @@ def end_grid_kernel(scalars: f64, going: wp.array(dtype=int)):
     going[0] = wp.where(scalars[STEP] == wp.float64(0.0), 0, more)
 
 
-class GridConjugateGradient:
-    """What `ConjugateGradient` does, for one CPU thread and a grid without periodic axes.
+class FusedConjugateGradient(ConjugateGradient):
+    """`ConjugateGradient` in fused passes, for one CPU thread and a grid without periodic axes, preconditioned by a multigrid cycle.
 
-    The cycle's last leg sums the products of its correction that beta and the step need; a second pass makes the direction, moves the
-    solution and takes A p off the residual, one plane behind. Beta comes from z'A p, so that no product of residuals is carried on.
+    Two passes over the finest level besides the way down the cycle: the cycle's last leg sums the products of z = M r that beta and alpha
+    need; a second pass makes the direction, moves the solution and takes alpha A p off the residual, one plane behind. Beta comes from
+    z'A p, so that no product of residuals is carried on; the norm of the residual decides when to stop.
 
     Args:
         source: the operator's stencil.
@@ -61,34 +61,35 @@ class GridConjugateGradient:
         weighted: residuals are measured as ||d^(-1/2) r||, d the finest diagonal, else as ||r||.
     """
 
+    _end_kernel = end_grid_kernel
+
     def __init__(self, source: PaddedStencil, hierarchy: Hierarchy, *, weighted: bool) -> None:
-        finest, device = hierarchy.finest, hierarchy.device
+        finest = hierarchy.finest
         r, s = finest.b, finest.stencil
-        self.device, self.x, self._p = device, zeros_like(r), zeros_like(r)
-        self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=device)
-        self._going = wp.zeros(1, dtype=wp.int32, device=device)
-        sums = Reduction(r.size, device, self._scalars, columns=4, threads=s.rows.places)
-        program = self._program = hierarchy.cycle_with(engine.CLIMB, engine.measuring(finest, self._p, sums.partials))
-        sums.add_up(int(engine.ZAZ), columns=4, launch=program.launch)
-        program.launch(engine.plan_step_kernel, 1, [self._scalars], device=device)
-        direct = DIRECT.bind(s.rows, z=finest.x, q=self._p, scalars=self._scalars)
-        step = STEP_ALONG.bind(s.rows, stencil=s, q=self._p, x=self.x, r=r, scalars=self._scalars, weighted=weighted, out=sums.partials)
-        ADVANCE.launch(direct, step, launch=program.launch)
-        sums.add_up(int(SQUARE), launch=program.launch)
-        program.launch(end_grid_kernel, 1, [self._scalars, self._going], device=device)
+        self._allocate(r, SLOTS, int(SQUARE))
+        scalars = self._scalars.array
+        sums = self._reduction = Reduction(r.size, r.device, scalars, columns=4, threads=s.rows.places)
+        direct = DIRECT.bind(s.rows, z=finest.x, q=self._p, scalars=scalars)
+        step = STEP_ALONG.bind(s.rows, stencil=s, q=self._p, x=self.x, r=r, scalars=scalars, weighted=weighted, out=sums.partials)
+        self._passes = direct, step
+        self._program = hierarchy.cycle_with(engine.CLIMB, engine.measuring(finest, self._p, sums.partials))
+        self._advance(self._program.launch)
 
     def clear(self) -> None:
         """Forget what lies outside the rows that the operator has now."""
         self.x.zero_()
         self._p.zero_()
 
-    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate from x = 0 until ||r|| <= tolerance, ||r|| is no number, it has grown by GROWTH over its least, or A p = 0.
+    def _launch_beginning(self) -> None:
+        """Launch the start: the first iteration writes x and p."""
+        launch(begin_grid_kernel, 1, [self._scalars.array, self._going, *self._goal[:2]], device=self.device)
 
-        Returns:
-            The iterations done and the norm of the carried residual, an estimate that rounding bounds from below.
-        """
-        wp.launch(begin_grid_kernel, 1, [self._scalars, self._going, tolerance, max_iterations], device=self.device)
-        self._program.run_while(self._going)
-        scalars = self._scalars.numpy()
-        return int(scalars[int(ITERATIONS)]), float(np.sqrt(scalars[int(SQUARE)]))
+    def _turn(self, launch: Launch) -> None:
+        """Beta and alpha, of the sums z'A z, z'A p, r'z and r'p that the cycle has left."""
+        self._reduction.add_up(int(engine.ZAZ), columns=4, launch=launch)
+        launch(engine.plan_step_kernel, 1, [self._scalars.array], device=self.device)
+
+    def _move(self, launch: Launch) -> None:
+        """p = z + beta p, x += alpha p, r -= alpha A p; and r'r."""
+        ADVANCE.launch(*self._passes, launch=launch)
+        self._reduction.add_up(int(SQUARE), launch=launch)
