@@ -11,8 +11,7 @@ import warp_lcp as wl
 from oracle import assemble
 from plain_fischer import LEAST_Q, PlainMap, armijo
 from warp_lcp.gallery.contact_scenes import contact
-from warp_lcp.solvers.fischer_newton import FischerNewton
-from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
+from warp_lcp.solvers.fischer_newton import FischerDenseWorkspace, FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.nonsmooth_map import NonsmoothMap
 

@@ -22,7 +22,9 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.rows import KernelFile, RowPass, Rows, Wave
 from warp_lcp.rows.fields import PaddedLayout
+from warp_lcp.rows.host_kernel import HostKernel
 from warp_lcp.rows.vectors import Sums, convert
+from warp_lcp.solvers.dense_problem import DenseProblem
 
 LEAST_Q = 1e-6  # of q where it divides: measured; less makes D needlessly large, more slows convergence
 
@@ -38,6 +40,7 @@ GRADIENT = KERNELS["nonsmooth_map.gradient"]
 ADVANCE = KERNELS["nonsmooth_map.advance"]
 MOVE = KERNELS["nonsmooth_map.move"]
 CONDENSE_AT_ROWS = KERNELS["nonsmooth_map.condense_at_rows"]
+HOST = HostKernel(KERNELS["nonsmooth_map.host"])
 STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))  # a plane is condensed when the one above it has moved
 
 
@@ -302,3 +305,45 @@ class NonsmoothMap:
     def _fields(self, x: wp.array[Any]) -> MapFields:
         r = self.residual
         return MapFields(x, r.y, r.diagonal, self.problem.unknown, r.unit)
+
+
+class HostMap:
+    """f and a generalized Jacobian diag(p d) + diag(q) A of a dense problem on the host, by the formulas of `NonsmoothMap`.
+
+    Args:
+        data: the problem.
+        share: lambda.
+        kink: what stands at kinks.
+        rng: of random elements.
+    """
+
+    def __init__(self, data: DenseProblem, share: float, kink: Kink, rng: np.random.Generator) -> None:
+        self.data, self.share, self.kink, self._rng = data, share, kink, rng
+        d = np.abs(np.diag(data.A))
+        self.d = np.where(d == 0, 1.0, d)
+        self.scale = float(np.sqrt(np.mean(data.b**2))) or 1.0
+        n = len(data.b)
+        self._element = np.zeros(n), np.ones(n)
+
+    def value(self, x: np.ndarray, y: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
+        """Return f; smoothing mu > 0: of the smoothed map, with psi(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu), without penalty."""
+        return self._rows(x, y, smoothing)[0].copy()
+
+    def linearized(self, x: np.ndarray, y: np.ndarray | None = None, smoothing: float = 0.0) -> tuple[np.ndarray, ...]:
+        """Return f, p and q of an element of the generalized Jacobian, and which rows are at a kink; y = A x + b unless given."""
+        if self.kink is Kink.RANDOM:
+            self._element = tuple(1 - np.sqrt(0.5) * self._rng.random(len(x)) for _ in range(2))
+        f, p, q, kinks = (field.copy() for field in self._rows(x, self.data.affine(x) if y is None else y, smoothing))
+        return f, p, q, kinks != 0
+
+    def jacobian(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Return diag(p d) + diag(q) A."""
+        return np.diag(p * self.d) + q[:, None] * self.data.A
+
+    def _rows(self, x: np.ndarray, y: np.ndarray, smoothing: float) -> list[np.ndarray]:
+        """Return f, p, q and kinks: memory that the next call overwrites."""
+        n, data = len(x), self.data
+        reals = (x, y, self.d, data.lower, data.upper, *self._element)
+        share = 1.0 if smoothing else self.share
+        numbers = {"share": share, "over": 1 / self.scale, "kinks": KINK * self.scale, "twice_mu": 2 * smoothing}
+        return HOST.run(reals, (), tasks=n, count=n, **numbers)[1]
