@@ -29,6 +29,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.solve import Precision, Step, VariationalInequality
+from warp_lcp.problem.spare_workspace import release_workspace
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.recommend import Budget, Recommendation, recommend
 from warp_lcp.rows.kernel_messages import hear_kernels
@@ -52,7 +53,6 @@ from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
 from warp_lcp.solvers.psor import ProjectedSOR, advised_omega
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.registry import METHODS
-from warp_lcp.solvers.spare_workspace import release_workspace
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 

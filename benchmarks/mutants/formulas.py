@@ -26,13 +26,13 @@ def _changes(module: str, tests: str, *pairs: tuple[str, str]) -> list[Formula]:
     return [Formula(f"warp_lcp/{module}", before, after, f"tests/{tests}") for before, after in pairs]
 
 
-MAP, NEWTON, PATH = "solvers/test_nonsmooth_map.py", "solvers/test_fischer_newton_steps.py", "solvers/test_interior_point_steps.py"
+MAP, NEWTON, PATH = "reduced/test_nonsmooth_map.py", "solvers/test_fischer_newton_steps.py", "solvers/test_interior_point_steps.py"
 ACTIVE, GRADIENTS = "solvers/test_minimum_map_newton_steps.py", "solvers/test_mprgp_steps.py"
 SUBSPACE, BLOCKS, PIVOTS = "solvers/test_subspace_minimization_steps.py", "solvers/test_block_steps.py", "solvers/test_lemke_steps.py"
 
 FORMULAS = [
     *_changes(
-        "solvers/headers/nonsmooth_map.h",
+        "reduced/headers/nonsmooth_map.h",
         MAP,
         ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)1, kq = (R)0;"),
         ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)0, kq = (R)0;"),
@@ -59,7 +59,7 @@ FORMULAS = [
         ("top = high & (-c > least)", "top = high & (c > least)"),
     ),
     *_changes(
-        "solvers/headers/nonsmooth_map.h",
+        "reduced/headers/nonsmooth_map.h",
         MAP,
         ("solved ? size*p/qs : 0.0", "solved ? p/qs : 0.0"),
         ("-scale*f/qs", "-scale*f"),
@@ -69,21 +69,21 @@ FORMULAS = [
         ("least_q; const bool solved = inside & !(drop & kink)", "least_q; const bool solved = inside"),
     ),
     *_changes(
-        "solvers/headers/nonsmooth_map.h",
+        "reduced/headers/nonsmooth_map.h",
         MAP,
         ("(gradient[i] + product[i])/size", "(gradient[i] - product[i])/size"),
         ("gradient[i] = g/size", "gradient[i] = g"),
     ),
-    *_changes("solvers/headers/nonsmooth_map.h", MAP, ("size*p*f", "p*f")),
+    *_changes("reduced/headers/nonsmooth_map.h", MAP, ("size*p*f", "p*f")),
     *_changes(
-        "solvers/nonsmooth_map.py",
+        "reduced/nonsmooth_map.py",
         MAP,
         ("LEAST_Q = 1e-6", "LEAST_Q = 1e-3"),
         ("(Kink.ZERO, Kink.APPROXIMATION)", "(Kink.ZERO,)"),
         ("self.residual.norm_of_b() / np.sqrt(count)", "self.residual.norm_of_b()"),
     ),
     *_changes(
-        "solvers/nonsmooth_map.py",
+        "reduced/nonsmooth_map.py",
         NEWTON,
         ("((by_x, along), (by_y, product))", "((by_y, along), (by_x, product))"),
         ("np.clip(at - step, lower, upper)", "np.clip(at + step, lower, upper)"),
@@ -104,7 +104,7 @@ FORMULAS = [
         ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.NON_DESCENT if stationary"),
     ),
     *_changes(
-        "solvers/descent.py",
+        "reduced/descent.py",
         NEWTON,
         ("DECREASE = 1e-4", "DECREASE = 0.3"),
         ("limit + DECREASE * length * slope", "limit - DECREASE * length * slope"),
@@ -129,7 +129,7 @@ FORMULAS = [
         ("LOCAL_MINIMUM if failure and", "LOCAL_MINIMUM if not failure and"),
     ),
     *_changes(
-        "solvers/nonsmooth_map.py",
+        "reduced/nonsmooth_map.py",
         NEWTON,
         ("self._element = np.zeros(n), np.ones(n)", "self._element = np.ones(n), np.zeros(n)"),
         ("self._element = np.zeros(n), np.ones(n)", "self._element = np.zeros(n), np.zeros(n)"),
@@ -138,10 +138,10 @@ FORMULAS = [
         ("share = 1.0 if smoothing", "share = 0.5 if smoothing"),
     ),
     *_changes(
-        "solvers/nonsmooth_map.py", MAP, ("1 - np.sqrt(0.5) * self._rng", "1 - self._rng"), ('"kinks": KINK * self.scale', '"kinks": 0.0')
+        "reduced/nonsmooth_map.py", MAP, ("1 - np.sqrt(0.5) * self._rng", "1 - self._rng"), ('"kinks": KINK * self.scale', '"kinks": 0.0')
     ),
     *_changes(
-        "solvers/headers/nonsmooth_map.h",
+        "reduced/headers/nonsmooth_map.h",
         MAP,
         ("SMOOTHED(v) ((v) + twice_mu)", "SMOOTHED(v) ((v) - twice_mu)"),
         ("LOWERED(v) ((v) - twice_mu)", "LOWERED(v) ((v) + twice_mu)"),
@@ -198,7 +198,7 @@ FORMULAS = [
     *_changes("solvers/headers/interior_point.h", PATH, ("c = -y[i] > least ? -y[i] : least", "c = y[i] > least ? y[i] : least")),
     *_changes("solvers/headers/interior_point.h", PATH, ("vn = v[i] - length*dx", "vn = v[i] + length*dx")),
     *_changes(
-        "solvers/headers/active_set.h",
+        "reduced/headers/active_set.h",
         ACTIVE,
         ("low = v < l", "low = v <= l"),
         ("high = v > u", "high = v >= u"),
@@ -206,13 +206,13 @@ FORMULAS = [
         ("v = x[k] - known[k]/e", "v = x[k] - known[k]"),
     ),
     *_changes(
-        "solvers/headers/projected_multigrid.h",
+        "reduced/headers/grid_step.h",
         ACTIVE,
         ("low = below < v", "low = below <= v"),
         ("high = above > v", "high = above >= v"),
         ("(low ? -mark : mark)", "(low ? mark : -mark)"),
     ),
-    *_changes("solvers/headers/projected_multigrid.h", ACTIVE, ("high = g[k] >= mark", "high = g[k] > mark")),
+    *_changes("reduced/headers/grid_step.h", ACTIVE, ("high = g[k] >= mark", "high = g[k] > mark")),
     *_changes(
         "solvers/minimum_map_newton_direct.py",
         ACTIVE,
@@ -261,7 +261,7 @@ FORMULAS = [
     ),
     *_changes("solvers/staggering.py", BLOCKS, ("range(count) if forward else reversed(range(count))", "range(count)")),
     *_changes(
-        "solvers/blocked_gauss_seidel_kernels.py",
+        "sweeps/block_kernels.py",
         BLOCKS,
         ("c += v * x[j]", "c -= v * x[j]"),
         ("t[p, j] -= slope", "t[p, j] += slope"),
@@ -303,10 +303,7 @@ FORMULAS = [
         ("before = s != 0 ? own : g[k]", "before = g[k]"),
     ),
     *_changes(
-        "solvers/projected_multigrid_kernels.py",
-        GRADIENTS,
-        ("ratio = -zap / pap", "ratio = zap / pap"),
-        ("gz + ratio * gp", "gz - ratio * gp"),
+        "reduced/grid_step_kernels.py", GRADIENTS, ("ratio = -zap / pap", "ratio = zap / pap"), ("gz + ratio * gp", "gz - ratio * gp")
     ),
     *_changes(
         "solvers/lemke.py",

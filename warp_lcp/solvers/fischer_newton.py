@@ -20,15 +20,14 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import NoTranspose
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
+from warp_lcp.reduced.dense_problem import DenseWorkspace
+from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
+from warp_lcp.reduced.nonsmooth_map import FiniteDifferenceSystem, HostMap, Kink, KinkName, MapForm, NonsmoothMap
+from warp_lcp.reduced.principal_system import GridSystem, principal_system
 from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll, renamed
-from warp_lcp.solvers.dense_problem import DenseWorkspace
-from warp_lcp.solvers.descent import DECREASE, NonmonotoneSearch
-from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.nonsmooth_map import HostMap, Kink, KinkName, MapForm, NonsmoothMap
-from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27

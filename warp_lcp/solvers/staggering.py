@@ -24,11 +24,11 @@ from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.sweep import Contraction
+from warp_lcp.sweeps.sweep import Contraction
 
 SHARE = 0.3  # of the whole tolerance, which a block need not be solved beyond
 Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
-KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
+KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 SELECT = KERNELS["partition.select"]
 
 

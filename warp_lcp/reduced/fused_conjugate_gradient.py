@@ -10,19 +10,19 @@ import warp as wp
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient, first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.padded_stencil import PaddedStencil
+from warp_lcp.reduced import grid_step_kernels as engine
+from warp_lcp.reduced.grid_step_kernels import BETA, CARRY, NORM, SIZE, STEP
+from warp_lcp.reduced.grid_step_kernels import SLOTS as STEP_SLOTS
 from warp_lcp.rows import KernelFile, Wave
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.program import Launch, launch
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers import projected_multigrid_kernels as engine
-from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, NORM, SIZE, STEP
-from warp_lcp.solvers.projected_multigrid_kernels import SLOTS as STEP_SLOTS
 
 SQUARE = wp.constant(STEP_SLOTS)  # slots of the device scalars after those of a step: from the carried residual's square on
 ITERATIONS = wp.constant(STEP_SLOTS + 3)
 SLOTS = STEP_SLOTS + 5
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h", {"BETA": BETA, "STEP": STEP, "ITERATIONS": ITERATIONS})
+KERNELS = KernelFile(Path(__file__).parent / "headers/fused_conjugate_gradient.h", {"BETA": BETA, "STEP": STEP, "ITERATIONS": ITERATIONS})
 DIRECT = KERNELS["grid_conjugate_gradient.direct"]
 STEP_ALONG = KERNELS["grid_conjugate_gradient.step"]
 ADVANCE = Wave("grid_conjugate_gradient.advance", (DIRECT, 0), (STEP_ALONG, 1))  # both planes are in the cache

@@ -31,15 +31,14 @@ from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.reduced.dense_problem import equilibration, factored
+from warp_lcp.reduced.fused_conjugate_gradient import FusedConjugateGradient
+from warp_lcp.reduced.low_rank_correction import LowRankCorrection
+from warp_lcp.reduced.sparse_system import GuardedSystem, MatrixSystem, SparseSystem
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program, launch_now
 from warp_lcp.rows.vectors import rows_of
-from warp_lcp.solvers.dense_problem import equilibration, factored
-from warp_lcp.solvers.fused_conjugate_gradient import FusedConjugateGradient
-from warp_lcp.solvers.principal_system_guarded import GuardedSystem
-from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
-from warp_lcp.solvers.principal_system_sparse import MatrixSystem, SparseSystem
 
 NUDGES = (0.0, 1e-12, 1e-9, 1e-6)  # shifts of a singular banded block, in units of the matrix's largest column sum
 

@@ -221,3 +221,16 @@ for (int i = first; i < last; ++i) {
 #include "fischer"
     value[i] = f; by_x[i] = p; by_y[i] = q; kinked[i] = kink;
 }
+
+// kernel finite_difference.difference: over (q - f) on the free unknowns, 0 elsewhere
+//   compute    float64
+//   reads      uint8 free; float64 f
+//   writes     float64 q
+//   numbers    float64 over
+SIMD for (int k = 0; k < n; ++k) { const double v = over*(q[k] - f[k]); q[k] = free[k] ? v : 0.0; }
+
+// kernel finite_difference.scale: z = r / |d|, r where d is 0
+//   compute    float64
+//   reads      float64 r, d
+//   writes     float64 z
+SIMD for (int k = 0; k < n; ++k) { const double v = r[k]/(d[k] < 0 ? -d[k] : d[k]); z[k] = d[k] != 0 ? v : r[k]; }

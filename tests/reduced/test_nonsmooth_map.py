@@ -10,9 +10,9 @@ import warp_lcp as wl
 from oracle import assemble
 from plain_fischer import LEAST_Q, PlainMap
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.solvers.dense_problem import DenseProblem
+from warp_lcp.reduced.dense_problem import DenseProblem
+from warp_lcp.reduced.nonsmooth_map import WEIGHTED, HostMap, Kink, MapForm, MapWeights, NonsmoothMap
 from warp_lcp.solvers.fischer_newton import FischerNewton
-from warp_lcp.solvers.nonsmooth_map import WEIGHTED, HostMap, Kink, MapForm, MapWeights, NonsmoothMap
 
 FORMS = ["natural", "fischer", "penalized"]
 BOUNDS = [(0.0, np.inf), (-2.0, 3.0), (-np.inf, 1.0), (-np.inf, np.inf), (1.0, 1.0)]
