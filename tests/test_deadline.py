@@ -13,7 +13,6 @@ import warp_lcp as wl
 from oracle import natural_residual
 from warp_lcp import deadline
 from warp_lcp.problem.protocol import families
-from warp_lcp.solvers.partition import block_problem
 
 S = wl.SolveStatus
 CRITERIA = wl.StoppingCriteria(rtol=1e-8, max_iterations=25, patience=25)
@@ -170,19 +169,6 @@ def test_time_is_up_for_all_ranks_as_soon_as_it_is_for_one(monkeypatch):
     unlimited = Across(-0.0)
     assert deadline.Deadline(math.inf, unlimited).left() == math.inf
     assert unlimited.asked == 0  # ranks exchange nothing where there is no limit
-
-
-def test_coupled_problems_end_in_time(monkeypatch):
-    problem, A, b = case("dense", "staggering")
-    x = problem.layout.zeros(problem.b.dtype)
-    blocks = [block_problem(problem, x, rows) for rows in (np.arange(30), np.arange(30, 60))]
-    ticks = itertools.count()
-    monkeypatch.setattr(deadline, "now", lambda: float(next(ticks)))
-    stopping = replace(CRITERIA, max_seconds=12)
-    result = wl.solve_coupled(blocks, [wl.MinimumMapNewton()] * 2, stopping=stopping)
-    assert (result.status, result.iterations) == (S.TIME_LIMIT, len(result.history) - 1)
-    assert next(ticks) <= 12 + 1 + MORE
-    assert result.residual == pytest.approx(natural_residual(A, b, np.zeros(60), np.full(60, np.inf), x.numpy()), rel=1e-9)
 
 
 def test_lemke_on_an_american_put_ends_in_time():

@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from warp_lcp.distributed.petsc_active_set import PetscActiveSet
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics
 from warp_lcp.gallery.planted import Plant
 from warp_lcp.granular.coupled import METHODS as SAND
@@ -25,7 +24,7 @@ from warp_lcp.material import density_correction
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.settings import OrInfinite, SettingError, Settings, checked, ranges, renamed_method, rule
 
-KINDS = [*wl.METHODS.values(), wl.StoppingCriteria, wl.CycleSettings, AlgebraicSettings, PetscActiveSet, InverseKinematics, Plant]
+KINDS = [*wl.METHODS.values(), wl.StoppingCriteria, wl.CycleSettings, AlgebraicSettings, InverseKinematics, Plant]
 KINDS = [kind for kind in [*KINDS, *SAND.values()] if dataclasses.fields(kind)]
 NUMBERS = [None, True, "1", [1.0], 1j, math.nan, -math.inf, np.float64("nan"), np.bool_(True), np.ones(2)]  # that are none
 

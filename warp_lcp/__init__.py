@@ -29,13 +29,13 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.solve import Precision, Step, VariationalInequality
+from warp_lcp.problem.spare_workspace import release_workspace
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.recommend import Budget, Recommendation, recommend
 from warp_lcp.rows.kernel_messages import hear_kernels
 from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
-from warp_lcp.solvers.coupled_problem import CoupledBlock, CoupledResult, StaggeredRound, solve_coupled
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
@@ -53,7 +53,6 @@ from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
 from warp_lcp.solvers.psor import ProjectedSOR, advised_omega
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.registry import METHODS
-from warp_lcp.solvers.spare_workspace import release_workspace
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
@@ -94,8 +93,6 @@ __all__ = [
     "BatchResult",
     "BlockedGaussSeidel",
     "Budget",
-    "CoupledBlock",
-    "CoupledResult",
     "CycleSettings",
     "DenseOperator",
     "DirectEnumeration",
@@ -127,7 +124,6 @@ __all__ = [
     "SolveResult",
     "SolveStatus",
     "SparseOperator",
-    "StaggeredRound",
     "Staggering",
     "Stencil",
     "Step",
@@ -147,6 +143,5 @@ __all__ = [
     "release_workspace",
     "set_threads",
     "solve",
-    "solve_coupled",
     "vjp",
 ]

@@ -23,8 +23,8 @@ from warp_lcp.problem.program_optimality import (
 )
 from warp_lcp.problem.reformulate import QuadraticProgramData, quadratic_program_to_boxed
 from warp_lcp.problem.result import SolveStatus
+from warp_lcp.reduced.dense_problem import PROVABLE, DenseProblem
 from warp_lcp.rows.fields import real_array
-from warp_lcp.solvers.dense_problem import PROVABLE, DenseProblem
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.quadratic_program import is_convex

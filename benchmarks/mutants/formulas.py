@@ -26,13 +26,13 @@ def _changes(module: str, tests: str, *pairs: tuple[str, str]) -> list[Formula]:
     return [Formula(f"warp_lcp/{module}", before, after, f"tests/{tests}") for before, after in pairs]
 
 
-MAP, NEWTON, PATH = "solvers/test_nonsmooth_map.py", "solvers/test_fischer_newton_steps.py", "solvers/test_interior_point_steps.py"
+MAP, NEWTON, PATH = "reduced/test_nonsmooth_map.py", "solvers/test_fischer_newton_steps.py", "solvers/test_interior_point_steps.py"
 ACTIVE, GRADIENTS = "solvers/test_minimum_map_newton_steps.py", "solvers/test_mprgp_steps.py"
 SUBSPACE, BLOCKS, PIVOTS = "solvers/test_subspace_minimization_steps.py", "solvers/test_block_steps.py", "solvers/test_lemke_steps.py"
 
 FORMULAS = [
     *_changes(
-        "solvers/headers/nonsmooth_map.h",
+        "reduced/headers/nonsmooth_map.h",
         MAP,
         ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)1, kq = (R)0;"),
         ("const R kp = (R)0, kq = (R)1;", "const R kp = (R)0, kq = (R)0;"),
@@ -45,7 +45,7 @@ FORMULAS = [
         ("w*w/(es*(es + c0)) : 1 - c/es", "w*w/(es*(es + c0)) : 1 + c/es"),
         ("c*c/(es*(es + w0)) : 1 + w/es", "c*c/(es*(es + w0)) : 1 - w/es"),
         ("h = high ? -below : w", "h = high ? below : w"),
-        ("2*a*h : t - rho", "2*a*h : t + rho"),
+        ("(2*a*h) : t - rho", "(2*a*h) : t + rho"),
         ("p = p1 + q1*p2, q = q1*q2;", "p = p1 - q1*p2, q = q1*q2;"),
         ("part*f1 + g*extra", "part*f1 - g*extra"),
         ("part*f1 + g*extra", "part*f1"),
@@ -59,7 +59,7 @@ FORMULAS = [
         ("top = high & (-c > least)", "top = high & (c > least)"),
     ),
     *_changes(
-        "solvers/headers/nonsmooth_map.h",
+        "reduced/headers/nonsmooth_map.h",
         MAP,
         ("solved ? size*p/qs : 0.0", "solved ? p/qs : 0.0"),
         ("-scale*f/qs", "-scale*f"),
@@ -69,21 +69,21 @@ FORMULAS = [
         ("least_q; const bool solved = inside & !(drop & kink)", "least_q; const bool solved = inside"),
     ),
     *_changes(
-        "solvers/headers/nonsmooth_map.h",
+        "reduced/headers/nonsmooth_map.h",
         MAP,
         ("(gradient[i] + product[i])/size", "(gradient[i] - product[i])/size"),
         ("gradient[i] = g/size", "gradient[i] = g"),
     ),
-    *_changes("solvers/headers/nonsmooth_map.h", MAP, ("size*p*f", "p*f")),
+    *_changes("reduced/headers/nonsmooth_map.h", MAP, ("size*p*f", "p*f")),
     *_changes(
-        "solvers/nonsmooth_map.py",
+        "reduced/nonsmooth_map.py",
         MAP,
         ("LEAST_Q = 1e-6", "LEAST_Q = 1e-3"),
         ("(Kink.ZERO, Kink.APPROXIMATION)", "(Kink.ZERO,)"),
         ("self.residual.norm_of_b() / np.sqrt(count)", "self.residual.norm_of_b()"),
     ),
     *_changes(
-        "solvers/nonsmooth_map.py",
+        "reduced/nonsmooth_map.py",
         NEWTON,
         ("((by_x, along), (by_y, product))", "((by_y, along), (by_x, product))"),
         ("np.clip(at - step, lower, upper)", "np.clip(at + step, lower, upper)"),
@@ -104,7 +104,7 @@ FORMULAS = [
         ("SolveStatus.LOCAL_MINIMUM if stationary", "SolveStatus.NON_DESCENT if stationary"),
     ),
     *_changes(
-        "solvers/descent.py",
+        "reduced/descent.py",
         NEWTON,
         ("DECREASE = 1e-4", "DECREASE = 0.3"),
         ("limit + DECREASE * length * slope", "limit - DECREASE * length * slope"),
@@ -113,20 +113,13 @@ FORMULAS = [
         ("[*self.merits, merit][-self.memory :]", "[*self.merits, merit]"),
     ),
     *_changes(
-        "solvers/fischer_newton_dense.py",
+        "solvers/fischer_newton.py",
         NEWTON,
-        ("            return 0.0, 1.0", "            return 1.0, 0.0"),
-        ("            return 0.0, 1.0", "            return 0.0, 0.0"),
-        ("            return 0.0, 1.0", "            return -1.0, 5.0"),
         ("move = ~kinks if map_.kink is Kink.ZERO", "move = ~kinks if map_.kink is Kink.RANDOM"),
         ("_solve(J[np.ix_(move, move)], -f[move])", "_solve(J[np.ix_(move, move)], f[move])"),
-        ("(1 - self.share) * extra / self.scale", "(1 - self.share) * extra"),
-        ("self.share * f + (1", "self.share * f - (1"),
-        ("(y > 0) * lowered", "(y < 0) * lowered"),
         ("0.5 * float(f @ f), projected=True)", "0.5 * float(f @ f), projected=False)"),
         ("0.5 * float(f @ f), projected=False)", "0.5 * float(f @ f), projected=True)"),
         ("REGULARIZATION = 1e-6", "REGULARIZATION = 1e-3"),
-        ("2 * (a * b - smoothing)", "2 * (a * b + smoothing)"),
         ("-f - q * gap", "-f + q * gap"),
         ("A @ dx + gap, float", "A @ dx - gap, float"),
         ("self._mu *= self._factor", "self._mu *= 0.5 * self._factor"),
@@ -136,11 +129,25 @@ FORMULAS = [
         ("LOCAL_MINIMUM if failure and", "LOCAL_MINIMUM if not failure and"),
     ),
     *_changes(
-        "solvers/fischer_newton_dense.py",
+        "reduced/nonsmooth_map.py",
+        NEWTON,
+        ("self._element = np.zeros(n), np.ones(n)", "self._element = np.ones(n), np.zeros(n)"),
+        ("self._element = np.zeros(n), np.ones(n)", "self._element = np.zeros(n), np.zeros(n)"),
+        ("self._element = np.zeros(n), np.ones(n)", "self._element = -np.ones(n), 5 * np.ones(n)"),
+        ('"over": 1 / self.scale', '"over": 1.0'),
+        ("share = 1.0 if smoothing", "share = 0.5 if smoothing"),
+    ),
+    *_changes(
+        "reduced/nonsmooth_map.py", MAP, ("1 - np.sqrt(0.5) * self._rng", "1 - self._rng"), ('"kinks": KINK * self.scale', '"kinks": 0.0')
+    ),
+    *_changes(
+        "reduced/headers/nonsmooth_map.h",
         MAP,
-        ("1 - np.sqrt(0.5) * self._rng.random(n), 1", "1 - self._rng.random(n), 1"),
-        ("np.where(at, kp, 1 - a / safe)", "np.where(at, kp, 1 + a / safe)"),
-        ("p, q = p1 + q1 * p2, q1 * q2", "p, q = p1 + p2, q1 * q2"),
+        ("SMOOTHED(v) ((v) + twice_mu)", "SMOOTHED(v) ((v) - twice_mu)"),
+        ("LOWERED(v) ((v) - twice_mu)", "LOWERED(v) ((v) + twice_mu)"),
+        ("const bool exact = false;", "const bool exact = true;"),
+        ("d[i]*(upper[i] - x[i])", "d[i]*(x[i] - upper[i])"),
+        ("p = part*(p1 + q1*p2)", "p = part*(p1 + p2)"),
     ),
     *_changes(
         "solvers/interior_point.py",
@@ -191,7 +198,7 @@ FORMULAS = [
     *_changes("solvers/headers/interior_point.h", PATH, ("c = -y[i] > least ? -y[i] : least", "c = y[i] > least ? y[i] : least")),
     *_changes("solvers/headers/interior_point.h", PATH, ("vn = v[i] - length*dx", "vn = v[i] + length*dx")),
     *_changes(
-        "solvers/headers/active_set.h",
+        "reduced/headers/active_set.h",
         ACTIVE,
         ("low = v < l", "low = v <= l"),
         ("high = v > u", "high = v >= u"),
@@ -199,13 +206,13 @@ FORMULAS = [
         ("v = x[k] - known[k]/e", "v = x[k] - known[k]"),
     ),
     *_changes(
-        "solvers/headers/projected_multigrid.h",
+        "reduced/headers/grid_step.h",
         ACTIVE,
         ("low = below < v", "low = below <= v"),
         ("high = above > v", "high = above >= v"),
         ("(low ? -mark : mark)", "(low ? mark : -mark)"),
     ),
-    *_changes("solvers/headers/projected_multigrid.h", ACTIVE, ("high = g[k] >= mark", "high = g[k] > mark")),
+    *_changes("reduced/headers/grid_step.h", ACTIVE, ("high = g[k] >= mark", "high = g[k] > mark")),
     *_changes(
         "solvers/minimum_map_newton_direct.py",
         ACTIVE,
@@ -244,7 +251,7 @@ FORMULAS = [
         ("            work.sweep.run(x, forward=True)", "            work.sweep.run(x, forward=False)"),
     ),
     *_changes(
-        "solvers/partition.py",
+        "solvers/staggering.py",
         BLOCKS,
         ("[rows] + self._outer @", "[rows] - self._outer @"),
         ("            slab[:, rows] = 0.0\n", ""),
@@ -252,9 +259,9 @@ FORMULAS = [
         ("others[rows] = 0.0", "others[rows] = 1.0"),
         ("x=self._y, less=self._z, target=self._b", "x=self._y, less=None, target=self._b"),
     ),
-    *_changes("solvers/coupled_problem.py", BLOCKS, ("range(count) if forward else reversed(range(count))", "range(count)")),
+    *_changes("solvers/staggering.py", BLOCKS, ("range(count) if forward else reversed(range(count))", "range(count)")),
     *_changes(
-        "solvers/blocked_gauss_seidel_kernels.py",
+        "sweeps/block_kernels.py",
         BLOCKS,
         ("c += v * x[j]", "c -= v * x[j]"),
         ("t[p, j] -= slope", "t[p, j] += slope"),
@@ -296,10 +303,7 @@ FORMULAS = [
         ("before = s != 0 ? own : g[k]", "before = g[k]"),
     ),
     *_changes(
-        "solvers/projected_multigrid_kernels.py",
-        GRADIENTS,
-        ("ratio = -zap / pap", "ratio = zap / pap"),
-        ("gz + ratio * gp", "gz - ratio * gp"),
+        "reduced/grid_step_kernels.py", GRADIENTS, ("ratio = -zap / pap", "ratio = zap / pap"), ("gz + ratio * gp", "gz - ratio * gp")
     ),
     *_changes(
         "solvers/lemke.py",

@@ -20,7 +20,7 @@ import warp_lcp as wl
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel, proximal_sweeps
 from warp_lcp.gallery.contact_scenes import contact_scene, incline
 from warp_lcp.krylov import GMRES
-from warp_lcp.solvers.descent import DECREASE, NonmonotoneSearch
+from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
 
 OUT = Path(__file__).parents[1] / "algorithms.png"
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=400, patience=400)

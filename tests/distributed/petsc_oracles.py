@@ -14,10 +14,9 @@ from oracle_problems import BOUNDS, small
 import warp_lcp as wl
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.launch import petsc
-from warp_lcp.distributed.petsc_active_set import PetscActiveSet
 from warp_lcp.distributed.ranks import Ranks
 
-OURS = {"petsc": PetscActiveSet(), "newton": wl.MinimumMapNewton(), "multigrid": wl.ProjectedMultigrid()}
+OURS = {"newton": wl.MinimumMapNewton(), "multigrid": wl.ProjectedMultigrid()}
 TIGHT = wl.StoppingCriteria(rtol=1e-10)
 
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.solvers import projected_multigrid_kernels as kernels
+from warp_lcp.reduced import grid_step_kernels as kernels
 
 
 def started(precision="mixed", faces=None, closed=False):

@@ -11,7 +11,7 @@ import warp_lcp as wl
 from oracle import assemble, boxed, lemke
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.lemke import Lemke
-from warp_lcp.solvers.partition import color_blocks
+from warp_lcp.solvers.staggering import color_blocks
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=5000, patience=2000)
 

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 import warp_lcp as wl
 from oracle import boxed, natural_residual
-from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
-from warp_lcp.solvers.direct_enumeration_kernels import enumeration_kernels
+from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch, enumeration_kernels
 
 TIGHT = wl.StoppingCriteria(rtol=1e-12)
 

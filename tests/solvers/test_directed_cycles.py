@@ -7,7 +7,7 @@ import scipy.sparse.linalg
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.solvers.principal_system import principal_system
+from warp_lcp.reduced.principal_system import principal_system
 
 
 def stochastic(rng, n, kind):

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 import warp_lcp as wl
 from oracle import boxed, lemke, natural_residual
-from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
-from warp_lcp.solvers.principal_inverse import PrincipalInverse
+from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting, PrincipalInverse
 
 TIGHT = wl.StoppingCriteria(rtol=1e-8, max_iterations=1000)
 

@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.solvers.dense_problem import DenseProblem, certifies, diagonally_dominant, inconsistent
+from warp_lcp.reduced.dense_problem import DenseProblem, certifies, diagonally_dominant, inconsistent
 
 NONE = wl.SolveStatus.INFEASIBLE
 

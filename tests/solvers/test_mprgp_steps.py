@@ -6,8 +6,8 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble
+from warp_lcp.reduced.grid_step_kernels import conjugate
 from warp_lcp.solvers.mprgp import MPRGP
-from warp_lcp.solvers.projected_multigrid_kernels import conjugate
 
 
 class PlainMPRGP:

@@ -1,4 +1,4 @@
-"""Staggering: partitions of one problem, and blocks that are operators of their own."""
+"""Staggering: partitions of one problem into blocks, each with its own method."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,6 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble, lemke
-from warp_lcp.solvers.coupled_problem import StaggeredRound, solve_coupled
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.staggering import Staggering
 
@@ -64,73 +63,22 @@ def test_operators_that_change_in_place_are_taken_again(device):
         np.testing.assert_allclose(result.x.numpy(), lemke(matrix.toarray(), b), atol=1e-7)
 
 
-class Normal:
-    """Normal force n >= 0 of a contact whose friction t is another problem's: y = 2 n + t / 2 - 1."""
-
-    def __init__(self, shared, device):
-        self.shared = shared
-        self.b = wp.zeros(1, dtype=wp.float64, device=device)
-        self.problem = wl.LCP(wl.DenseOperator(np.array([[2.0]]), device=device), self.b)
-
-    def couple(self):
-        self.b.assign([0.5 * self.shared["t"][0] - 1.0])
-
-    def guess(self):
-        return wp.array(self.shared["n"], dtype=wp.float64, device=self.problem.device)
-
-    def accept(self, result):
-        self.shared["n"] = result.x.numpy().copy()
-
-
-class Friction:
-    """Friction t of two directions on a sparse operator, |t| <= mu n: y = 3 t + n / 2 + pull."""
-
-    def __init__(self, shared, device):
-        self.shared = shared
-        self.b, self.low, self.high = (wp.zeros(2, dtype=wp.float64, device=device) for _ in range(3))
-        A = wl.SparseOperator(scipy.sparse.csr_array(3 * np.eye(2)), device=device)
-        self.problem = wl.LCP(A, self.b, self.low, self.high)
-
-    def couple(self):
-        n = self.shared["n"][0]
-        self.b.assign([0.5 * n - self.shared["pull"], 0.0])
-        self.low.assign([-0.4 * n] * 2)
-        self.high.assign([0.4 * n] * 2)
-
-    def guess(self):
-        return wp.array(self.shared["t"], dtype=wp.float64, device=self.problem.device)
-
-    def accept(self, result):
-        self.shared["t"] = result.x.numpy().copy()
-
-
 @pytest.mark.parametrize("pull", [0.4, 5.0])
-def test_blocks_of_different_operators_meet_at_their_common_solution(pull, device):
-    """By hand: sticking, t = (pull - n / 2) / 3 with 2 n + t / 2 = 1; sliding, t = 0.4 n and n = 1 / 2.2."""
-    shared = {"n": np.zeros(1), "t": np.zeros(2), "pull": pull}
-    blocks = [Normal(shared, device), Friction(shared, device)]
-    result = solve_coupled(blocks, [Lemke(), wl.ProjectedSOR(omega=1.0)], stopping=wl.StoppingCriteria(rtol=1e-10))
+def test_normal_force_and_friction_meet_at_their_common_solution(pull, device):
+    """By hand, y = A (n, t) + b and |t| <= 0.4 n: sticking, t_1 = (pull - n / 2) / 3 with 2 n + t_1 / 2 = 1; sliding, n = 1 / 2.2."""
+    A = np.array([[2.0, 0.5, 0.0], [0.5, 3.0, 0.0], [0.0, 0.0, 3.0]])
+    low, high = wl.AffineBounds.friction([-1, 0, 0], 0.4)
+    problem = wl.LCP(wl.DenseOperator(A, device=device), np.array([-1.0, -pull, 0.0]), low, high)
+    method = Staggering(blocks=[[0], [1, 2]], solvers=[Lemke(), wl.ProjectedSOR(omega=1.0)])
+    result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-10))
     assert result, result.status
-    n = np.linalg.solve([[2.0, 0.5], [0.5, 3.0]], [1.0, pull])
-    expected = n if n[1] <= 0.4 * n[0] else np.array([1 / 2.2, 0.4 / 2.2])
-    assert (pull > 1) == (n[1] > 0.4 * n[0])
-    np.testing.assert_allclose([shared["n"][0], shared["t"][0]], expected, atol=1e-9)
-    assert shared["t"][1] == pytest.approx(0.0, abs=1e-12)
-    assert result.residual == pytest.approx(np.linalg.norm(result.blocks))
-    assert len(result.history) == result.iterations + 1
+    sticking = np.linalg.solve([[2.0, 0.5], [0.5, 3.0]], [1.0, pull])
+    slides = sticking[1] > 0.4 * sticking[0]
+    assert (pull > 1) == slides
+    np.testing.assert_allclose(result.x.numpy(), [*(np.array([1 / 2.2, 0.4 / 2.2]) if slides else sticking), 0.0], atol=1e-9)
     assert result.iterations <= 12
-
-
-def test_a_coupled_solve_says_how_it_failed(device):
-    shared = {"n": np.zeros(1), "t": np.zeros(2), "pull": 0.4}
-    blocks = [Normal(shared, device), Friction(shared, device)]
-    few = solve_coupled(blocks, [wl.ProjectedSOR()] * 2, stopping=wl.StoppingCriteria(rtol=1e-12, max_iterations=1))
-    assert few.status is wl.SolveStatus.MAX_ITERATIONS
-    assert not few
-    shared["pull"] = np.nan
-    assert solve_coupled(blocks, [wl.ProjectedSOR()] * 2).status is wl.SolveStatus.NON_FINITE
-    with pytest.raises(ValueError, match="1 for 2 blocks"):
-        StaggeredRound(blocks, [wl.ProjectedSOR()], eta=0.1, max_iterations=10)
+    with pytest.raises(ValueError, match="solvers: 3 for 2 blocks"):
+        Staggering(blocks=[[0], [1, 2]], solvers=[Lemke()] * 3).init(problem)
 
 
 def test_what_cannot_be_taken_apart_is_refused():

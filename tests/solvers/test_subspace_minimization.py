@@ -11,7 +11,7 @@ from warp_lcp.gallery.contact_models import BoxedModel
 from warp_lcp.gallery.contact_scenes import heavy_on_light
 from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
-from warp_lcp.solvers.sweep_kernels import CHANGE
+from warp_lcp.sweeps.sweep_kernels import CHANGE
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=500)
 

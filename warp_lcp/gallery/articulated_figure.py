@@ -111,14 +111,6 @@ class ArticulatedFigure:
         """Return the positions f(theta) of the end effectors [m], shape (e, dimension)."""
         return self._frames(theta)[2][:, : self.dimension]
 
-    def skeleton(self, theta: Vector) -> tuple[Vector, Vector]:
-        """Return positions of hinges and end effectors [m], to draw the figure.
-
-        Shapes (n, dimension) and (e, dimension).
-        """
-        places, _, ends = self._frames(theta)
-        return places[:, : self.dimension], ends[:, : self.dimension]
-
     def jacobian(self, theta: Vector) -> Vector:
         """Return the Jacobian df/dtheta [m], shape (e dimension, n).
 

@@ -175,11 +175,6 @@ class Window:
             return Rows.box(self.low, self.high, self.device, slab=planes)
         return self._whole
 
-    @property
-    def rows_visited(self) -> np.ndarray:
-        """Active rows (k, j), shape (n, 2), if only a part of the box is visited."""
-        return self._hulls.numpy()[:, 0]
-
     @cached_property
     def _shared(self) -> Rows:
         if self.near is None:

@@ -98,8 +98,14 @@ class Preconditioner(Protocol):
 class ConjugateGradient:
     """Preconditioned conjugate gradients for symmetric positive semi-definite A.
 
-    The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution is `x`. The device decides after each
-    iteration whether another one follows. Where graphs have loops the host waits once a solve, else it reads that decision every time.
+    The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution is `x`. From x = 0, p = 0 an iteration
+    is
+
+        z = M r,   p = z + beta p,   x += alpha p,   r -= alpha A p
+
+    with beta such that p is conjugate to the last direction, and alpha such that x minimizes along p. This class launches a pass for each
+    operation; a subclass overrides `_turn` and `_move` by fused passes. The device decides after each iteration whether another one
+    follows. Where graphs have loops the host waits once a solve, else it reads that decision every time.
 
     Args:
         product: A.
@@ -110,23 +116,30 @@ class ConjugateGradient:
         across: communicator; None if serial.
     """
 
+    _end_kernel: Any = end_kernel
+
     def __init__(
         self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None, rows: Rows | None = None,
         across: Across | None = None,
     ) -> None:  # fmt: skip
         self._product, self._preconditioner, self._rows, r = product, preconditioner, rows, preconditioner.r
-        self.device, self.x, self._p, self._q = r.device, zeros_like(r), zeros_like(r), zeros_like(r)
-        self._scalars, self._shared = Reading(r.device, SLOTS), across is not None
-        self._goal = [Scalar() for _ in range(3)]  # tolerance, iterations at most, whether the error decides
-        self._beginning = LaunchGraph(r.device, self._launch_beginning)
-        self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
+        self._allocate(r, SLOTS, int(RR))
+        self._q, self._shared = zeros_like(r), across is not None
         self._reduction = Reduction(r.size, r.device, self._scalars.array, threads=None if rows is None else rows.places, across=across)
-        self._program: Program | None = None
         rows = rows or rows_of(r)
         self._direction = DIRECTION.bind(rows, z=preconditioner.z, direction=self._p, scalars=self._scalars.array)
         self._update = UPDATE.bind(
             rows, direction=self._p, q=self._q, w=weight, x=self.x, r=r, scalars=self._scalars.array, out=self._reduction.partials
         )
+
+    def _allocate(self, r: wp.array[Any], slots: int, square: int) -> None:
+        """Allocate x, p and device scalars; from slot `square` on they are r'r and what `next_iteration` decides by."""
+        self.device, self.x, self._p = r.device, zeros_like(r), zeros_like(r)
+        self._scalars, self._square, self._shared = Reading(r.device, slots), square, False
+        self._goal = [Scalar() for _ in range(3)]  # tolerance, iterations at most, whether the error decides
+        self._beginning = LaunchGraph(r.device, self._launch_beginning)
+        self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
+        self._program: Program | None = None
 
     def solve(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> tuple[int, float]:
         """Iterate from x = 0 until the residual norm is at most the tolerance.
@@ -152,22 +165,19 @@ class ConjugateGradient:
         """
         for number, value in zip(self._goal, (tolerance, max_iterations, int(by_error)), strict=True):
             number.value = value
-        cycle = getattr(self._preconditioner, "program", None)
-        if cycle is not None and self._program is None:
-            self._program = Program(self.device)
-            self._program.extend(cycle)
-            self._advance(self._program.launch)
+        if self._program is None:
+            self._program = self._recorded()
         self._beginning.run()
-        if cycle is None:
+        if self._program is None:
             wp.capture_while(self._going, self._iterate)
-        elif self._program is not None and not self._loops_with_beginning:
+        elif not self._loops_with_beginning:
             self._program.run_while(self._going)
         self._scalars.changed()
 
     def found(self) -> tuple[int, float]:
         """Return iterations and norm after `start`; waits for the device."""
         scalars = self._scalars.numpy()
-        return int(scalars[ITERATIONS]), float(np.sqrt(scalars[RR]))
+        return int(scalars[self._square + ITERATIONS - RR]), float(np.sqrt(scalars[self._square]))
 
     @property
     def _loops_with_beginning(self) -> bool:
@@ -182,6 +192,16 @@ class ConjugateGradient:
         if self._loops_with_beginning and self._program is not None:
             self._program.run_while(self._going)
 
+    def _recorded(self) -> Program | None:
+        """Return an iteration as a program; None if the preconditioner is not recorded."""
+        cycle = getattr(self._preconditioner, "program", None)
+        if cycle is None:
+            return None
+        program = Program(self.device)
+        program.extend(cycle)
+        self._advance(program.launch)
+        return program
+
     def _iterate(self) -> None:
         """Launch an iteration whose preconditioner is no program."""
         check_time()
@@ -189,11 +209,19 @@ class ConjugateGradient:
         self._advance(wp.launch)
 
     def _advance(self, launch: Launch) -> None:
-        """Launch what follows the preconditioner."""
+        """Launch what follows z = M r."""
+        self._turn(launch)
+        self._move(launch)
+        launch(self._end_kernel, 1, [self._scalars.array, self._going], device=self.device)
+
+    def _turn(self, launch: Launch) -> None:
+        """p = z + beta p, beta = r'z / (r'z)_old; and q = A p with p'q, of which alpha = r'z / p'q."""
         self._reduction.dot(self._preconditioner.r, self._preconditioner.z, int(RZ), rows=self._rows, launch=launch)
         self._direction.launch(launch)
         self._product(self._p, self._q, launch=launch)
         self._reduction.dot(self._p, self._q, int(PQ), rows=self._rows, launch=launch)
+
+    def _move(self, launch: Launch) -> None:
+        """x += alpha p, r -= alpha q; and r'r."""
         self._update.launch(launch)
         self._reduction.add_up(int(RR), launch=launch)
-        launch(end_kernel, 1, [self._scalars.array, self._going], device=self.device)

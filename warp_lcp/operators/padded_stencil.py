@@ -191,11 +191,6 @@ class PaddedStencil:
         unit = self.unit if d.dtype is self.d.dtype else 1.0
         return replace(self, d=d, unit=unit)
 
-    @property
-    def has_ghosts(self) -> bool:
-        """Whether ghost cells must be filled before each product."""
-        return any(self.periodic) or self.ghosts is not None
-
     def wrap(self, x: wp.array[Any], *, launch: Launch = launch_now) -> None:
         """Fill x's ghost cells along periodic axes, and those that stand for cells of others."""
         for filling in self.fillings(x):

@@ -81,10 +81,6 @@ class Tuning:
         """Return whether the chosen settings meet the accuracy, or the noise limit."""
         return self.limit <= 1.0
 
-    def near_enough(self, own: Trial) -> bool:
-        """Return whether another run is within the bounds of the chosen one."""
-        return self.bounds.miss(own, self.reference) <= self.limit
-
     def verdict(self, accuracy: str) -> list[str]:
         """Return the result in words: settings, accuracy, missed bounds and a remedy."""
         best, asked, volume = self.chosen, self.preset, self.chosen.trial.volume_error(self.reference)

@@ -15,7 +15,7 @@ from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Settings
-from warp_lcp.solvers.spectrum import positive_diagonal, scaled_spectrum
+from warp_lcp.sweeps.spectrum import positive_diagonal, scaled_spectrum
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 PROGRESS = KERNELS["accelerated.progress"]

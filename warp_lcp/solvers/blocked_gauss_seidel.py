@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,22 +14,21 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, check_taken, has
 from warp_lcp.problem.solve import PrecisionName, Solver, Step
-from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.rows import Rows
 from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
-from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_sweep_kernel
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.partition import Blocks, blocks_of_size, color_blocks, given_blocks
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
-from warp_lcp.solvers.staggering import StaggeringWorkspace
-from warp_lcp.solvers.sweep import bound_operands, check_colors
+from warp_lcp.solvers.staggering import Blocks, StaggeringWorkspace, blocks_of_size, color_blocks, given_blocks
+from warp_lcp.sweeps.block_kernels import BlockLists, block_sweep_kernel
+from warp_lcp.sweeps.sweep import bound_operands, check_colors
+from warp_lcp.sweeps.sweep_kernels import KERNELS
 
 CONSECUTIVE = 3  # unknowns of a block unless given: a contact in space
 MOST = 6  # unknowns of a block that a thread solves by active sets
 CHANGES = 60  # of a line's set; few are needed, and what is left is projected
 
 f64 = wp.float64
-KERNELS = KernelFile(Path(__file__).parent / "headers/gauss_seidel.h")
 SOLVE_LINE = KERNELS["grid_lines.solve"]
 
 

@@ -1,34 +1,42 @@
-"""Newton's method on the Fischer-Burmeister map, matrix-free: shifted principal systems on grids and sparse operators."""
+"""Newton's method on the Fischer-Burmeister map: shifted principal systems matrix-free, factors of the Jacobian where A is dense."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy.linalg
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.problem.bounds import INFINITY, without_far
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import NoTranspose
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
+from warp_lcp.reduced.dense_problem import DenseWorkspace
+from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
+from warp_lcp.reduced.nonsmooth_map import FiniteDifferenceSystem, HostMap, Kink, KinkName, MapForm, NonsmoothMap
+from warp_lcp.reduced.principal_system import GridSystem, principal_system
 from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll, renamed
-from warp_lcp.solvers.descent import DECREASE, NonmonotoneSearch
-from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
-from warp_lcp.solvers.fischer_newton_dense import STATIONARY, FischerDenseWorkspace
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.nonsmooth_map import Kink, KinkName, MapForm, NonsmoothMap
-from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
+FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27
+REGULARIZATION = 1e-6  # nu is this times min(1, ||f||), A's entries being near 1: J'J + nu I has a factorization whatever J is
+HOMOTOPIES = ((None, 1.0, 0.3, 40), (10.0, 1.0, 0.5, 60))  # start of x (None: as the solve began), first mu, its factor, steps
+# projected gradient, in parts of ||f||, up to which a point where a search has failed is stationary: the shortest steps, 1e-8, leave up to
+# that of a local minimum's gradient; where searches fail on contacts for other reasons it is 1 to 4
+STATIONARY = 1e-4
+DESCENT = 1e-10  # a direction whose slope is less than this times ||dx||^2.1 is no descent
 
 
 @renamed(share="fischer_weight")
@@ -282,3 +290,155 @@ class FischerWorkspace(IterateMemory):
         else:
             self.map.advance(self._from, self.system.e, scale, x, projected=True)
         self._gone = scale
+
+
+class FischerDenseWorkspace(DenseWorkspace):
+    """Memory of the method for one dense problem.
+
+    Steps are taken in units in which A is equilibrated, and may leave the bounds; x is the projection of where they are.
+
+    Attributes:
+        stage: 0 while steps are Newton's on the map itself, k in the k-th homotopy.
+        units: of x, one for each unknown.
+    """
+
+    def __init__(self, problem: LCP, settings: FischerNewton) -> None:
+        super().__init__(problem, settings.precision)
+        self.settings, self._descent = settings, settings.descent(problem)
+        self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
+        self.active_set: Any = None
+        self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
+        self._gradient: DescentWorkspace | None = None
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Read the problem, and begin the first stage."""
+        super().start(warm=warm, tolerance=tolerance)
+        s = self.settings
+        data, self.units = self.data.scaled()
+        lower, upper = without_far(data.lower, data.upper, INFINITY)  # squares of what is larger overflow
+        data = replace(data, lower=lower, upper=upper)
+        self.map = HostMap(data, self._descent.fischer_weight, Kink(s.kink), np.random.default_rng(2015))
+        self._identity = np.eye(len(data.b))
+        self._search.forget()
+        self.descents_left, self.stage, self.steps, self.target = s.warm_start, 0, 0, tolerance
+        self._gradient = None
+        self._iterate = self._begun = self.read_iterate() / self.units
+
+    def descend(self, x: Any) -> Step:
+        """Go down the gradient of the same map once."""
+        if self._gradient is None:
+            self._gradient = DescentWorkspace(self.problem, self._descent, self.residual)
+            self._gradient.start(warm=True, tolerance=self.target)
+        step = self._gradient.descend(x)
+        self._iterate = self._begun = self.read_iterate() / self.units
+        return Step("gradient", step.linear_iterations)
+
+    def newton_step(self, x: Any) -> Step:
+        """Take a step of the stage that is due."""
+        self.steps += 1
+        if self.stage == 0:
+            failure = self._regularized() if self.settings.safeguard else self._plain()
+            if self.settings.safeguard and (failure is not None or self.steps >= FIRST_STEPS):
+                failure = None
+                self._next_stage()
+        else:
+            failure = self._homotopy()
+        self.write_iterate(self.units * self._iterate)
+        self.round_iterate()
+        name = "fischer" if self.stage == 0 else "homotopy"
+        return Step(name, 1, None, failure, interim=self.settings.safeguard and failure is None)
+
+    def _plain(self) -> SolveStatus | None:
+        """Take a step of the book's method: algorithm 12."""
+        x, map_ = self._iterate, self.map
+        f, p, q, kinks = map_.linearized(x)
+        move = ~kinks if map_.kink is Kink.ZERO else np.ones(len(x), dtype=bool)
+        J = map_.jacobian(p, q)
+        dx = np.zeros(len(x))
+        dx[move] = _solve(J[np.ix_(move, move)], -f[move])
+        gradient = J.T @ f
+        if np.linalg.norm(gradient / map_.d) <= 1e-12 * np.linalg.norm(f):
+            return SolveStatus.LOCAL_MINIMUM
+        failure = self._searched(x, dx, float(gradient @ dx), 0.5 * float(f @ f), projected=True)
+        inside = map_.d * (x - np.clip(x - gradient / map_.d**2, map_.data.lower, map_.data.upper))
+        return SolveStatus.LOCAL_MINIMUM if failure and np.linalg.norm(inside) <= STATIONARY * np.linalg.norm(f) else failure
+
+    def _regularized(self) -> SolveStatus | None:
+        """Take a step of the safeguarded method, along the gradient if that of Newton's is no descent."""
+        x, map_ = self._iterate, self.map
+        f, p, q, kinks = map_.linearized(x)
+        if map_.kink is Kink.ZERO:
+            p, q = np.where(kinks, 1.0, p), np.where(kinks, 0.0, q)
+        J = map_.jacobian(p, q)
+        gradient, nu = J.T @ f, REGULARIZATION * min(1.0, float(np.linalg.norm(f)))
+        dx = -_solve(J.T @ J + nu * self._identity, gradient)
+        slope = float(gradient @ dx)
+        if not slope <= -DESCENT * float(dx @ dx) ** 1.05:
+            dx, slope = -gradient, -float(gradient @ gradient)
+        return self._searched(x, dx, slope, 0.5 * float(f @ f), projected=False)
+
+    def _searched(self, x: np.ndarray, dx: np.ndarray, slope: float, merit: float, *, projected: bool) -> SolveStatus | None:
+        """Move along a direction; return how that fails."""
+        if not (np.isfinite(slope) and slope < 0):
+            return SolveStatus.NON_DESCENT
+        data, found = self.map.data, x
+
+        def trial(length: float) -> float:
+            nonlocal found
+            found = x + length * dx
+            if projected:
+                found = np.clip(found, data.lower, data.upper)
+            f = self.map.value(found, data.affine(found))
+            return 0.5 * float(f @ f)
+
+        self._search.remember(merit)
+        length, _ = self._search.search(trial, slope)
+        if length == 0.0:
+            return SolveStatus.NON_DESCENT
+        self._iterate = found
+        return None
+
+    def _next_stage(self) -> None:
+        """Begin the next homotopy: y independent of x, and not below 1 at first."""
+        start, self._mu, self._factor, self._steps_left = HOMOTOPIES[self.stage]
+        self.stage += 1
+        data = self.map.data
+        x = self._begun if start is None else np.clip(np.full(len(self._begun), start), data.lower, data.upper)
+        y = data.affine(x)
+        one_sided = np.isfinite(data.lower) & ~np.isfinite(data.upper)
+        self._iterate, self._y = x, np.where(one_sided, np.maximum(y, 1.0), y)
+
+    def _homotopy(self) -> SolveStatus | None:
+        """Take a Newton step for A x + b = y and the smoothed map of (x, y), and lower mu."""
+        x, y, map_, A = self._iterate, self._y, self.map, self.map.data.A
+        gap, (f, p, q, _) = map_.data.affine(x) - y, map_.linearized(x, y, self._mu)
+        dx = _solve(map_.jacobian(p, q), -f - q * gap)
+        if not np.isfinite(dx).all():
+            dx, self._steps_left = np.zeros(len(x)), 1
+        dy, size, length = A @ dx + gap, float(np.hypot(np.linalg.norm(gap), np.linalg.norm(f))), 1.0
+        while length > 1e-6:
+            after = map_.value(x + length * dx, y + length * dy, self._mu)
+            if np.hypot((1 - length) * np.linalg.norm(gap), np.linalg.norm(after)) <= (1 - 1e-4 * length) * size:
+                break
+            length *= 0.5
+        self._iterate, self._y = x + length * dx, y + length * dy
+        self._mu *= self._factor
+        self._steps_left -= 1
+        if self._steps_left > 0:
+            return None
+        if self.stage < len(HOMOTOPIES):
+            self._next_stage()
+            return None
+        return SolveStatus.STAGNATED
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a linear system; the least-squares solution of least norm where the matrix is singular to rounding."""
+    if not right.size:
+        return right
+    factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)
+    if not (np.isfinite(factors).all() or np.isfinite(matrix).all()) or not np.isfinite(right).all():
+        return np.full(right.shape, np.nan)  # LAPACK's least squares would raise or not return
+    if info != 0 or not np.isfinite(factors).all():
+        return np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
+    return scipy.linalg.lapack.dgetrs(factors, pivots, right)[0]

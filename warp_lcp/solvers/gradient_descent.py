@@ -13,9 +13,9 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.reduced.descent import NonmonotoneSearch
+from warp_lcp.reduced.nonsmooth_map import MapForm, MapName, NonsmoothMap
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll, renamed
-from warp_lcp.solvers.descent import NonmonotoneSearch
-from warp_lcp.solvers.nonsmooth_map import MapForm, MapName, NonsmoothMap
 
 LEAST = 1e-12  # relative decrease of the merit without which a step is none
 LONGEST = 1e6  # length tried

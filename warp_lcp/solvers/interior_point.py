@@ -22,14 +22,14 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.reduced.equilibrated import EquilibratedWorkspace
+from warp_lcp.reduced.principal_system import GridSystem, principal_system
 from warp_lcp.rows import KernelFile, Known, Wave
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
-from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
 LARGEST_START = 1e6  # of the residual's norm: ||b|| up to which it gives the start's size
 

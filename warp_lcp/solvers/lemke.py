@@ -17,8 +17,8 @@ from warp_lcp.problem.bounds import without_far
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
+from warp_lcp.reduced.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of
 from warp_lcp.settings import Count, Settings
-from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of
 from warp_lcp.solvers.lemke_howson import start_game
 
 REGULAR = 1e-10  # reciprocal condition number above which the equations' block is eliminated

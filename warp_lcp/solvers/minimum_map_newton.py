@@ -19,9 +19,22 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.reduced.dense_problem import incompatible
+from warp_lcp.reduced.grid_step_kernels import SLOTS
+from warp_lcp.reduced.principal_system import (
+    CLASSIFY,
+    ON_FREE,
+    BandedSystem,
+    DenseSystem,
+    GridSystem,
+    LineSystem,
+    PrincipalSystem,
+    principal_system,
+    projected_move,
+)
+from warp_lcp.reduced.sparse_system import SparseSystem
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solvers.dense_problem import incompatible
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.phases import (
@@ -35,19 +48,6 @@ from warp_lcp.solvers.phases import (
     ProximalPoint,
     projected_cycle,
 )
-from warp_lcp.solvers.principal_system import (
-    CLASSIFY,
-    ON_FREE,
-    BandedSystem,
-    DenseSystem,
-    GridSystem,
-    LineSystem,
-    PrincipalSystem,
-    principal_system,
-    projected_move,
-)
-from warp_lcp.solvers.principal_system_sparse import SparseSystem
-from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
 
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
 # unknowns from which that is six cycles for each on a grid: one costs a fifth of a Newton step, which moves the set by a row, and rows are

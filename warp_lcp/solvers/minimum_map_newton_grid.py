@@ -14,7 +14,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Step
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.solvers import projected_multigrid_kernels as engine
+from warp_lcp.reduced import grid_step_kernels as engine
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 
 if TYPE_CHECKING:

@@ -22,16 +22,16 @@ from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
+from warp_lcp.reduced import grid_step_kernels as engine
+from warp_lcp.reduced.descent import Descent
+from warp_lcp.reduced.principal_system import DiagonalSystem, principal_system, projected_move
+from warp_lcp.reduced.sparse_system import SparseSystem
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
-from warp_lcp.solvers import projected_multigrid_kernels as engine
-from warp_lcp.solvers.descent import Descent
 from warp_lcp.solvers.phases import projected_cycle
-from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system, projected_move
-from warp_lcp.solvers.principal_system_sparse import SparseSystem
-from warp_lcp.solvers.sweep import Diagonal
+from warp_lcp.sweeps.sweep import Diagonal
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 SPLIT = KERNELS["mprgp.split"]

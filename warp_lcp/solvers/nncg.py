@@ -17,7 +17,7 @@ from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
-from warp_lcp.solvers.sweep import sweep_for
+from warp_lcp.sweeps.sweep import sweep_for
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 TAKEN = KERNELS["nncg.taken"]

@@ -15,12 +15,12 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.reduced.principal_system import ON_FREE, principal_system
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.principal_system import ON_FREE, principal_system
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]

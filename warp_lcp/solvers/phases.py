@@ -22,16 +22,16 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, Step, solve
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.reduced.dense_problem import proved_infeasible
+from warp_lcp.reduced.grid_step_kernels import GAPS, SIZE
+from warp_lcp.reduced.principal_system import ALL_FREE, ON_FREE, GridSystem, LineSystem
 from warp_lcp.rows import Rows
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers.dense_problem import proved_infeasible
 from warp_lcp.solvers.method_table import METHODS
-from warp_lcp.solvers.principal_system import ALL_FREE, ON_FREE, GridSystem, LineSystem
-from warp_lcp.solvers.projected_multigrid_kernels import GAPS, SIZE
 
 if TYPE_CHECKING:
+    from warp_lcp.reduced.sparse_system import SparseSystem
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-    from warp_lcp.solvers.principal_system_sparse import SparseSystem
 
 # of steps on a grid's matrix
 WINDOW = 10  # steps over which the residual's fall is measured

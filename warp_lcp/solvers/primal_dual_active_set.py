@@ -17,11 +17,11 @@ from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import PrecisionName, Step
+from warp_lcp.reduced.dense_problem import DenseProblem, pivots_of
+from warp_lcp.reduced.principal_system import projected_move
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solvers.dense_problem import DenseProblem, pivots_of
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.phases import ProximalPoint
-from warp_lcp.solvers.principal_system import projected_move
 
 LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
 STUCK = 2  # steps on one set that leave the residual where it is: its free block is singular

@@ -12,8 +12,8 @@ from warp_lcp.problem.protocol import version_of
 from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Positive, Settings
 from warp_lcp.solvers.psor import SweepWorkspace
-from warp_lcp.solvers.spectrum import scaled_spectrum
-from warp_lcp.solvers.sweep_kernels import jacobi_kernel
+from warp_lcp.sweeps.spectrum import scaled_spectrum
+from warp_lcp.sweeps.sweep_kernels import jacobi_kernel
 
 STEPS = 20  # of Lanczos' method
 SHARE = 1.8  # of the 2 / lambda_max at which Jacobi's method stops converging; Lanczos sees lambda_max from below

@@ -12,10 +12,10 @@ from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasColumns, HasStencil, check_taken, has
 from warp_lcp.problem.solve import PrecisionName, Step
+from warp_lcp.problem.spare_workspace import SpareWorkspace, lend
 from warp_lcp.settings import Count, CountOrZero, Settings
 from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
 from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
-from warp_lcp.solvers.spare_workspace import SpareWorkspace, lend
 
 
 @dataclass(frozen=True, kw_only=True)

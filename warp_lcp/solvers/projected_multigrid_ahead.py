@@ -15,6 +15,8 @@ from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem.solve import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
+from warp_lcp.reduced.descent import CREEP, STALL
+from warp_lcp.reduced.grid_step_kernels import CARRY, ENERGY, MOVED, NORM, PER_SIZE, SIZE, STEP, f64
 from warp_lcp.rows import Rows
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.fields import zeros
@@ -22,8 +24,6 @@ from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Conditional, Launch, LaunchGraph, Program, copy, launch, loops_on_device
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import CONVERT
-from warp_lcp.solvers.descent import CREEP, STALL
-from warp_lcp.solvers.projected_multigrid_kernels import CARRY, ENERGY, MOVED, NORM, PER_SIZE, SIZE, STEP, f64
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace

@@ -13,14 +13,14 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
+from warp_lcp.reduced import grid_step_kernels as kernels
+from warp_lcp.reduced import low_rank_correction as coupling
+from warp_lcp.reduced.low_rank_correction import LowRankCorrection
 from warp_lcp.rows.program import Launch, LaunchGraph, Program, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import CONVERT, rows_of
-from warp_lcp.solvers import principal_system_low_rank as coupling
-from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.phases import Inner
-from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 

@@ -20,19 +20,19 @@ from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
+from warp_lcp.reduced import grid_step_kernels as kernels
+from warp_lcp.reduced.descent import Descent
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.fields import nothing
 from warp_lcp.rows.program import Launch, Program, as_one_table, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers import projected_multigrid_kernels as kernels
-from warp_lcp.solvers.descent import Descent
 from warp_lcp.solvers.phases import FIRST, AlgebraicSteps, Pace
 from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 if TYPE_CHECKING:
-    from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
+    from warp_lcp.reduced.low_rank_correction import LowRankCorrection
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 
 

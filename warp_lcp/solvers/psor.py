@@ -13,8 +13,8 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, Relaxes, check_taken, has, version_of
 from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.settings import Relaxation, Settings
-from warp_lcp.solvers.spectrum import scaled_spectrum
-from warp_lcp.solvers.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for
+from warp_lcp.sweeps.spectrum import scaled_spectrum
+from warp_lcp.sweeps.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for
 
 BOOK = 1.4  # relaxation factor, best of the book's parameter study (fig. C.4)
 DIRECTIONS = {"forward": (True,), "backward": (False,), "symmetric": (True, False)}

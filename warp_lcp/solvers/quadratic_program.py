@@ -14,8 +14,8 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Step
+from warp_lcp.reduced.dense_problem import SEMIDEFINITE, DenseProblem, DenseWorkspace, check_size, inconsistent, semidefinite, sparse_matrix
 from warp_lcp.settings import Count, Positive, Settings
-from warp_lcp.solvers.dense_problem import SEMIDEFINITE, DenseProblem, DenseWorkspace, check_size, inconsistent, semidefinite, sparse_matrix
 
 
 @dataclass(frozen=True, kw_only=True)

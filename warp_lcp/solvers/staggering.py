@@ -1,22 +1,35 @@
-"""Staggering: a problem in a few blocks, each solved by its own method in turn."""
+"""Staggering: a problem in a few blocks, each solved by its own method in turn ([Book] 2.2.4)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
+import scipy.sparse
 import warp as wp
 
-from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.protocol import HasBlocks, HasRows, check_taken
-from warp_lcp.problem.solve import IterateMemory, Solver, Step
+from warp_lcp.deadline import check_time
+from warp_lcp.operators.grid_poisson import AIR, FLUID
+from warp_lcp.operators.sparse import SparseOperator, greedy_colors
+from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.protocol import HasBlocks, HasRows, check_taken, described, has, version_of
+from warp_lcp.problem.result import SolveResult
+from warp_lcp.problem.solve import IterateMemory, Solver, Step, solve
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.rows import KernelFile
+from warp_lcp.rows.vectors import rows_of
 from warp_lcp.settings import Count, Settings, Share
-from warp_lcp.solvers.coupled_problem import StaggeredRound
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.partition import Block, Blocks, block_problem, given_blocks
-from warp_lcp.solvers.sweep import Contraction
+from warp_lcp.sweeps.sweep import Contraction
+
+SHARE = 0.3  # of the whole tolerance, which a block need not be solved beyond
+Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
+KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
+SELECT = KERNELS["partition.select"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +40,7 @@ class Staggering(Settings):
 
     Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: a block Gauss-Seidel method, which converges for symmetric
     positive definite A. Bounds affine in x are constants of the block while it is solved, so that any method may solve it: normal
-    forces and friction in turn. For blocks that are operators of their own see `solve_coupled`.
+    forces and friction in turn.
 
     Args:
         blocks: for each block flat indices into a field of the problem's shape, together all unknowns, each once; or a number of blocks
@@ -91,3 +104,231 @@ class StaggeringWorkspace(IterateMemory):
         for block in self.blocks:
             block.refresh()
         self.contraction.start(self.x)
+
+
+class StaggeredRound:
+    """One round of staggering: every block is solved once, in turn.
+
+    Args:
+        blocks: in their order.
+        solvers: one for each.
+        eta: a block's residual is reduced by this factor, or to the accuracy that the whole problem needs.
+        max_iterations: maximum number of steps in a block.
+    """
+
+    def __init__(self, blocks: Sequence[Block], solvers: Sequence[Solver], *, eta: float, max_iterations: int) -> None:
+        if len(blocks) != len(solvers):
+            raise ValueError(f"solvers: {len(solvers)} for {len(blocks)} blocks, expected one for each")
+        self.blocks, self.solvers, self._eta, self._max = list(blocks), list(solvers), eta, max_iterations
+        self._works = [solver.init(block.problem) for block, solver in zip(self.blocks, self.solvers, strict=True)]
+
+    def residuals(self) -> tuple[float, ...]:
+        """Return the residual of each block at the current state."""
+        return tuple(self._residual(k) for k in range(len(self.blocks)))
+
+    def run(self, target: float, *, forward: bool = True) -> int:
+        """Solve each block once, forward or backward; return linear iterations.
+
+        `target` is the residual asked for of all blocks.
+        """
+        count, linear = len(self.blocks), 0
+        for k in range(count) if forward else reversed(range(count)):
+            check_time()
+            norm = self._residual(k)
+            goal = max(self._eta * norm, SHARE * target / math.sqrt(count))
+            if not math.isfinite(norm) or norm <= goal:
+                continue
+            block, stopping = self.blocks[k], StoppingCriteria(rtol=0.0, atol=goal, max_iterations=self._max)
+            result = solve(block.problem, self.solvers[k], stopping=stopping, x0=block.guess(), workspace=self._works[k])
+            linear += result.linear_iterations
+            block.accept(result)
+        return linear
+
+    def _residual(self, k: int) -> float:
+        block, work = self.blocks[k], self._works[k]
+        block.couple()
+        block.problem.bounds.refresh()
+        wp.copy(work.x, block.problem.layout.load(block.guess(), wp.float64))
+        return work.residual.evaluate(work.x)
+
+
+def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:
+    """Return stored indices of the unknowns, `size` consecutive ones a block; the last block may be smaller."""
+    unknowns = np.flatnonzero(problem.unknown.numpy() == 1)
+    return [unknowns[i : i + size] for i in range(0, len(unknowns), size)]
+
+
+def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
+    """Return stored indices of each block.
+
+    Args:
+        problem: whose unknowns they are.
+        blocks: for each block flat indices into a field of the problem's shape; together all unknowns, each once.
+
+    Raises:
+        ValueError: an index is out of range, an unknown is missing or in two blocks, or a block is empty.
+    """
+    if isinstance(blocks, str) or not hasattr(blocks, "__iter__"):
+        raise ValueError(f"blocks = {blocks!r}: expected a number of unknowns, or for each block a list of indices")
+    layout = problem.layout
+    place = layout.places()
+    found = []
+    for k, block in enumerate(blocks):
+        index = np.asarray(block, dtype=np.int64).ravel()
+        if index.size == 0:
+            raise ValueError(f"blocks[{k}] is empty")
+        if index.min() < 0 or index.max() >= len(place):
+            raise ValueError(f"blocks[{k}] has indices from {index.min()} to {index.max()}: expected 0 ... {len(place) - 1}")
+        found.append(place[index])
+    count = np.bincount(np.concatenate(found), minlength=layout.size) if found else np.zeros(layout.size, dtype=int)
+    wrong = count != (problem.unknown.numpy() == 1)
+    if wrong.any():
+        at = int(np.flatnonzero(wrong[place])[0])
+        raise ValueError(f"blocks hold index {at} {count[place[at]]} times, expected {int(problem.unknown.numpy()[place[at]] == 1)}")
+    return found
+
+
+def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) -> list[np.ndarray]:
+    """Return the blocks of each color, in order: no row of a block has an entry in a column of another block of its color.
+
+    Args:
+        matrix: A.
+        owner: block of each row.
+        count: number of blocks.
+    """
+    members = scipy.sparse.csr_array((np.ones(len(owner)), (np.arange(len(owner)), owner)), shape=(len(owner), count))
+    pattern = scipy.sparse.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+    color = greedy_colors((members.T @ pattern @ members).tocsr())
+    return [np.flatnonzero(color == c) for c in range(int(color.max()) + 1)]
+
+
+class MatrixBlock:
+    """A block of a dense or sparse problem: A_BB x_B + (b_B + A_BC x_C), C the other unknowns. Products with A_BC are made on the host.
+
+    Attributes:
+        problem: the block's own; b and bounds are written by `couple`.
+    """
+
+    def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
+        self._whole, self._x, self._rows = whole, x, rows
+        inner, self._outer = self._entries()
+        device, size = whole.device, len(rows)
+        A = as_operator(inner, device, whole.A.dtype)
+        b, low, high = (wp.zeros(size, dtype=wp.float64, device=device) for _ in range(3))
+        self.problem = LCP(A, b, low, high)
+        self._version = version_of(whole.A)
+
+    def refresh(self) -> None:
+        """Take A's entries again where they have changed."""
+        A, version = cast(Any, self.problem.A), version_of(self._whole.A)
+        if isinstance(A, SparseOperator) and version == self._version:
+            return
+        self._version = version
+        inner, self._outer = self._entries()
+        A.update(inner)
+
+    def couple(self) -> None:
+        """Write b_B + A_BC x_C and the bounds at x."""
+        whole, problem, rows = self._whole, self.problem, self._rows
+        whole.bounds.follow(self._x)
+        problem.b.assign(whole.b.numpy()[rows] + self._outer @ self._x.numpy())
+        for field, source in ((problem.lower, whole.lower), (problem.upper, whole.upper)):
+            field.assign(source.numpy()[rows])
+
+    def guess(self) -> wp.array[Any]:
+        """Return x_B, a copy on the device."""
+        return wp.array(self._x.numpy()[self._rows], dtype=wp.float64, device=self._whole.device)
+
+    def accept(self, result: SolveResult) -> None:
+        """Write a block's x_B to the common iterate."""
+        values = self._x.numpy()
+        values[self._rows] = result.x.numpy()
+        self._x.assign(values)
+
+    def _entries(self) -> tuple[Any, Any]:
+        """Return A_BB, and the block's rows of A with 0 in place of it."""
+        A, rows = self._whole.A, self._rows
+        assert has(A, HasRows)
+        slab = A.rows().matrix()[rows]
+        if isinstance(slab, np.ndarray):
+            inner = slab[:, rows]
+            slab[:, rows] = 0.0
+            return inner, slab
+        others = np.ones(slab.shape[1])
+        others[rows] = 0.0
+        outer = slab @ scipy.sparse.diags_array(others)
+        return slab[:, rows], outer
+
+
+class GridBlock:
+    """A block of a grid problem: the same grid with AIR, x = 0, in place of the other unknowns, whose part is in b.
+
+    Attributes:
+        problem: the block's own, in the layout of the whole; bounds are shared with it.
+    """
+
+    def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
+        A = whole.A
+        assert has(A, HasBlocks)
+        layout = whole.layout
+        self._whole, self._x = whole, x
+        member = np.zeros(layout.size, dtype=np.uint8)
+        member[rows] = 1
+        self._member = wp.array(member, dtype=wp.uint8, device=whole.device)
+        sub = A.on_cells(self._cells())
+        self._b, self._y, self._z, self._guess = (layout.zeros(wp.float64) for _ in range(4))
+        stored = layout.stored_shape
+        self.problem = LCP(sub, self._b.reshape(stored), whole.lower.reshape(stored), whole.upper.reshape(stored))
+        self._version = A.version
+
+    def refresh(self) -> None:
+        """Take A's coefficients again; cells that are no longer FLUID leave the block, new ones belong to none."""
+        A = self._whole.A
+        assert has(A, HasBlocks)
+        if A.version != self._version:
+            self._version = A.version
+            cells = self._cells().reshape(self._whole.layout.stored_shape)
+            self.problem.A.update(wp.array(cells, dtype=wp.int8, device=self._whole.device))  # type: ignore[attr-defined]
+
+    def couple(self) -> None:
+        """Write what A x + b leaves of b when the block's own part is taken out."""
+        whole, member = self._whole, self._member
+        whole.bounds.follow(self._x)
+        whole.apply_plus(self._x, whole.b, self._y)
+        SELECT.bind(rows_of(self._x), x=self._x, less=None, target=self._guess, member=member, kept=False).launch()
+        self.problem.A.apply(self._guess, self._z)
+        SELECT.bind(rows_of(self._x), x=self._y, less=self._z, target=self._b, member=member, kept=False).launch()
+
+    def guess(self) -> wp.array[Any]:
+        """Return x_B as `couple` found it."""
+        return self._guess
+
+    def accept(self, result: SolveResult) -> None:
+        """Write a block's x_B to the common iterate."""
+        SELECT.bind(rows_of(self._x), x=result.x.flatten(), less=None, member=self._member, target=self._x, kept=True).launch()
+
+    def _cells(self) -> np.ndarray:
+        """Return the padded cell types with AIR in place of the other unknowns."""
+        cells, member = self._whole.A.cells.numpy().ravel(), self._member.numpy()  # type: ignore[attr-defined]
+        return np.where((cells == FLUID) & (member == 0), AIR, cells).astype(np.int8)
+
+
+Block = MatrixBlock | GridBlock
+
+
+def block_problem(whole: LCP, x: wp.array[Any], rows: np.ndarray) -> Block:
+    """Return a block of a problem as a problem of its own.
+
+    Args:
+        whole: the problem.
+        x: the iterate that all blocks share, stored.
+        rows: the block's stored indices.
+
+    Raises:
+        ValueError: the operator has no principal sub-operators.
+    """
+    if has(whole.A, HasBlocks):
+        return GridBlock(whole, x, rows)
+    if has(whole.A, HasRows):
+        return MatrixBlock(whole, x, rows)
+    raise ValueError(f"{type(whole.A).__name__} cannot be split into blocks, which need {described(HasRows, HasBlocks)}")

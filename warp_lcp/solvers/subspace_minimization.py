@@ -15,12 +15,12 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.solve import PrecisionName, Step
+from warp_lcp.reduced.principal_system import ON_FREE, principal_system, projected_move
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
-from warp_lcp.solvers.principal_system import ON_FREE, principal_system, projected_move
 from warp_lcp.solvers.psor import SweepWorkspace
-from warp_lcp.solvers.sweep import sweep_for
+from warp_lcp.sweeps.sweep import sweep_for
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
 BETWEEN = KERNELS["subspace.between"]

@@ -1,5 +1,5 @@
 // Kernels of methods of projected gradients: MPRGP, NNCG, subspace minimization, accelerated
-// gradients.
+// gradients; and of staggering.
 
 // kernel mprgp.split: y = A x + b: the natural residual and its parts on held and free unknowns,
 // the free set, g = -y / size on it, and the chopped step; y is not stored
@@ -144,34 +144,12 @@ with_bounds([&](auto lower, auto upper) {
         const T c = clipped(a - s/(lipschitz*d[k]), lower(k), upper(k));
         x_old[k] = x[k]; y_old[k] = y[k]; z[k] = a; y_z[k] = s; x[k] = unknown[k] == 1 ? c : x[k]; } });
 
-// kernel grid_conjugate_gradient.direct: The direction q = z + beta q
-//   compute    S
-//   reads      S z
-//   writes     S q
-//   whole      float64 scalars
-//   constants  BETA
-const S beta = (S)scalars[BETA];
-fetch(0, n, z, q);
-if (beta == 0) { SIMD for (int k = 0; k < n; ++k) q[k] = z[k]; }
-else { SIMD for (int k = 0; k < n; ++k) q[k] = z[k] + beta*q[k]; }
-
-// kernel grid_conjugate_gradient.step: x moved along the direction q, A q taken off the residual,
-// and the residual's square, weighted by 1 / d or not
-//   compute    S
-//   stencil    F, S
-//   reads      S q
-//   writes     S x, r
-//   whole      float64 scalars
-//   numbers    bool weighted
-//   sums       square
-//   constants  STEP, ITERATIONS
-const S alpha = (S)scalars[STEP]; T square = 0;
-fetch(0, n, x, r);
-const auto each = [&](auto from, auto weigh) {
-    SIMD for (int k = 0; k < n; ++k) {
-        const T c = diagonal(k), w = r[k] - alpha*product(q, k);
-        x[k] = from(k) + alpha*q[k]; r[k] = w; square += w*w*weigh(c); } };
-const auto one = [](T) { return (T)1; }; const auto zero = [](int) { return (T)0; }; const auto old = [&](int k) { return x[k]; };
-const auto inverse = [](T c) { const T a = c < 0 ? -c : c; return (T)1/(a > 0 ? a : (T)1); };
-if (scalars[ITERATIONS] == 0) { if (weighted) each(zero, inverse); else each(zero, one); }
-else { if (weighted) each(old, inverse); else each(old, one); }
+// kernel partition.select: x, less what is to be left out, on the members; elsewhere what was
+// there, or 0
+//   compute    float64
+//   reads      float64 x, less?; uint8 member
+//   writes     float64 target
+//   numbers    bool kept
+const auto select = [&](auto value) {
+    SIMD for (int k = 0; k < n; ++k) { const double v = value(k), rest = kept ? target[k] : 0.0; target[k] = member[k] ? v : rest; } };
+if (less) select([&](int k) { return x[k] - less[k]; }); else select([&](int k) { return x[k]; });

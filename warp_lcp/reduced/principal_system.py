@@ -31,15 +31,14 @@ from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.reduced.dense_problem import equilibration, factored
+from warp_lcp.reduced.fused_conjugate_gradient import FusedConjugateGradient
+from warp_lcp.reduced.low_rank_correction import LowRankCorrection
+from warp_lcp.reduced.sparse_system import GuardedSystem, MatrixSystem, SparseSystem
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program, launch_now
 from warp_lcp.rows.vectors import rows_of
-from warp_lcp.solvers.dense_problem import equilibration, factored
-from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
-from warp_lcp.solvers.principal_system_guarded import GuardedSystem
-from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
-from warp_lcp.solvers.principal_system_sparse import MatrixSystem, SparseSystem
 
 NUDGES = (0.0, 1e-12, 1e-9, 1e-6)  # shifts of a singular banded block, in units of the matrix's largest column sum
 
@@ -102,23 +101,20 @@ class GridSystem(GuardedSystem):
         self._weight = zeros_like(self.r) if shifted else None
         # one CPU thread, no ghost cells to fill
         self.fused = self.hierarchy.ends_in_wave and A.symmetric and A.stencil.ghosts is None
-        self._iterate_by(self._krylov_method(), self._weight)
+        if self.fused:
+            method: Any = FusedConjugateGradient(A.stencil, self.hierarchy, weighted=shifted)
+        else:
+            method = (ConjugateGradient if A.symmetric else GMRES)(self.hierarchy.finest.stencil.product, self, weight=self._weight)
+        self._iterate_by(method, self._weight)
         if not A.symmetric and A.stencil.ghosts is None:
             self._guard(partial(MatrixSystem, A, shifted=shifted))
-
-    def _krylov_method(self) -> Any:
-        """Return what iterates: it has `solve`, and the solution in `x`."""
-        if self.fused:
-            return GridConjugateGradient(self._A.stencil, self.hierarchy, weighted=self._weight is not None)
-        method = ConjugateGradient if self._A.symmetric else GMRES
-        return method(self.hierarchy.finest.stencil.product, self, weight=self._weight)
 
     def refresh(self) -> None:
         """Take the rows and the weights again if the operator has changed."""
         if self._version != self._A.version:
             self._version, self._substitute = self._A.version, None
             self.hierarchy.refresh()
-            if isinstance(self._krylov, GridConjugateGradient):
+            if isinstance(self._krylov, FusedConjugateGradient):
                 self._krylov.clear()
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:

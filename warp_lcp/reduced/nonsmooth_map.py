@@ -17,12 +17,17 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
+from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.stencil_level import StencilLevel
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.reduced.dense_problem import DenseProblem
 from warp_lcp.rows import KernelFile, RowPass, Rows, Wave
 from warp_lcp.rows.fields import PaddedLayout
-from warp_lcp.rows.vectors import Sums, convert
+from warp_lcp.rows.host_kernel import HostKernel
+from warp_lcp.rows.program import Launch, launch_now
+from warp_lcp.rows.vectors import Sums, convert, rows_of
 
 LEAST_Q = 1e-6  # of q where it divides: measured; less makes D needlessly large, more slows convergence
 
@@ -38,7 +43,11 @@ GRADIENT = KERNELS["nonsmooth_map.gradient"]
 ADVANCE = KERNELS["nonsmooth_map.advance"]
 MOVE = KERNELS["nonsmooth_map.move"]
 CONDENSE_AT_ROWS = KERNELS["nonsmooth_map.condense_at_rows"]
+HOST = HostKernel(KERNELS["nonsmooth_map.host"])
 STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))  # a plane is condensed when the one above it has moved
+DIFFERENCE = KERNELS["finite_difference.difference"]
+SCALE = KERNELS["finite_difference.scale"]
+APART = 1e-7  # distance of two points of a difference, relative to ||x|| / ||p||: half the digits of float64
 
 
 KINK = 1e-14  # times the size of b: a point this near to both sides of a kink is on it
@@ -302,3 +311,94 @@ class NonsmoothMap:
     def _fields(self, x: wp.array[Any]) -> MapFields:
         r = self.residual
         return MapFields(x, r.y, r.diagonal, self.problem.unknown, r.unit)
+
+
+class FiniteDifferenceSystem(KrylovSystem):
+    """Solve J e = -f by GMRES with J p = (f(x + h p) - f(x)) / h, preconditioned by the diagonal of A.
+
+    `linearize` takes the point; `r` and `e` are as in a principal system.
+
+    Args:
+        problem: the problem.
+        residual: evaluated at x when a step begins; its memory is used for the differences.
+        map: the reformulation.
+        share: lambda of the penalized map.
+    """
+
+    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float) -> None:
+        layout, self._problem, self._residual = problem.layout, problem, residual
+        self.r, self.z, self._f, self._moved = (layout.zeros(wp.float64) for _ in range(4))
+        self._map = NonsmoothMap(problem, residual, map, share, Kink.APPROXIMATION)
+        self._iterate_by(GMRES(self._product, self), None)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take the diagonal and b's scale again."""
+        self._map.begin()
+        d = self._residual.diagonal.numpy().astype(np.float64) * self._residual.unit
+        self._diagonal = wp.array(d, dtype=wp.float64, device=self._problem.device)
+
+    def linearize(self, x: wp.array[Any], free: wp.array[Any], size: float) -> None:
+        """Take the point x, where the residual was evaluated, and make -f / size on the free unknowns the right-hand side."""
+        self._x, self._free, self._size = x, free, size
+        self._map.values(x, self._f)
+        self._length = 1 + self.norm(x)
+        self.r.zero_()
+        DIFFERENCE.bind(rows_of(self.r), free=free, f=self._f, over=1 / size, q=self.r).launch()
+
+    def apply(self) -> None:
+        """Precondition: z = r / d."""
+        SCALE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
+
+    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = launch_now) -> None:
+        norm = self.norm(p)
+        if norm == 0:
+            q.zero_()
+            return
+        h = APART * self._length / norm
+        self._map.advance(self._x, p, h, self._moved, projected=False)
+        self._residual.affine(self._moved)
+        self._map.values(self._moved, q)
+        DIFFERENCE.bind(rows_of(q), free=self._free, f=self._f, over=1 / h, q=q).launch()
+
+
+class HostMap:
+    """f and a generalized Jacobian diag(p d) + diag(q) A of a dense problem on the host, by the formulas of `NonsmoothMap`.
+
+    Args:
+        data: the problem.
+        share: lambda.
+        kink: what stands at kinks.
+        rng: of random elements.
+    """
+
+    def __init__(self, data: DenseProblem, share: float, kink: Kink, rng: np.random.Generator) -> None:
+        self.data, self.share, self.kink, self._rng = data, share, kink, rng
+        d = np.abs(np.diag(data.A))
+        self.d = np.where(d == 0, 1.0, d)
+        self.scale = float(np.sqrt(np.mean(data.b**2))) or 1.0
+        n = len(data.b)
+        self._element = np.zeros(n), np.ones(n)
+
+    def value(self, x: np.ndarray, y: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
+        """Return f; smoothing mu > 0: of the smoothed map, with psi(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu), without penalty."""
+        return self._rows(x, y, smoothing)[0].copy()
+
+    def linearized(self, x: np.ndarray, y: np.ndarray | None = None, smoothing: float = 0.0) -> tuple[np.ndarray, ...]:
+        """Return f, p and q of an element of the generalized Jacobian, and which rows are at a kink; y = A x + b unless given."""
+        if self.kink is Kink.RANDOM:
+            self._element = tuple(1 - np.sqrt(0.5) * self._rng.random(len(x)) for _ in range(2))
+        f, p, q, kinks = (field.copy() for field in self._rows(x, self.data.affine(x) if y is None else y, smoothing))
+        return f, p, q, kinks != 0
+
+    def jacobian(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Return diag(p d) + diag(q) A."""
+        return np.diag(p * self.d) + q[:, None] * self.data.A
+
+    def _rows(self, x: np.ndarray, y: np.ndarray, smoothing: float) -> list[np.ndarray]:
+        """Return f, p, q and kinks: memory that the next call overwrites."""
+        n, data = len(x), self.data
+        reals = (x, y, self.d, data.lower, data.upper, *self._element)
+        share = 1.0 if smoothing else self.share
+        numbers = {"share": share, "over": 1 / self.scale, "kinks": KINK * self.scale, "twice_mu": 2 * smoothing}
+        return HOST.run(reals, (), tasks=n, count=n, **numbers)[1]

@@ -7,8 +7,8 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble
-from warp_lcp.solvers.principal_system import CoupledGridSystem, DiagonalSystem, principal_system
-from warp_lcp.solvers.principal_system_sparse import IncompleteFactors, suits_multigrid
+from warp_lcp.reduced.principal_system import CoupledGridSystem, DiagonalSystem, principal_system
+from warp_lcp.reduced.sparse_system import IncompleteFactors, suits_multigrid
 
 
 def grid(cells, dtype=wp.float64, device="cpu", **faces):

@@ -18,6 +18,50 @@ const auto root = [](R v) -> R {
 #endif
 };
 
+// snippet fischer: f, p, q and the kink of a row, of what `map` says they are made of: Fischer and
+// Burmeister's function psi(a, b) = a + b - rho, rho = sqrt(a^2 + b^2), of a and h = -psi(-w, c),
+// and its derivatives 1 - a / rho and 1 - b / rho, penalized or not. Without cancellation these are
+// 2 a b / (a + b + rho) and b^2 / (rho (rho + a)). HOST: rho^2 is greater by 2 mu; and derivatives
+// are 0 where b is less than rounding beside a, so that factors find a singular Jacobian singular.
+#if HOST
+#define SMOOTHED(v) ((v) + twice_mu)
+#define LOWERED(v) ((v) - twice_mu)
+const bool exact = false;
+#else
+#define SMOOTHED(v) (v)
+#define LOWERED(v) (v)
+const bool exact = true;
+#endif
+const R c0 = c > 0 ? c : (R)0, w0 = -w > 0 ? -w : (R)0;
+#if UPPER
+const R e = root(SMOOTHED(w*w + c*c)), es = e > tiny ? e : (R)1, n = c - w;
+const R below = n > 0 ? LOWERED(-2*w*c)/(n + es) : n - e, h = high ? -below : w;
+const bool kink2 = high & (e <= tiny);
+const R p2 = high ? (kink2 ? kp : (exact & (c > 0) ? w*w/(es*(es + c0)) : 1 - c/es)) : (R)0;
+const R q2 = high ? (kink2 ? kq : (exact & (w < 0) ? c*c/(es*(es + w0)) : 1 + w/es)) : (R)1;
+#else
+const R h = w, p2 = 0, q2 = 1; const bool kink2 = false;
+#endif
+const R rho = root(SMOOTHED(a*a + h*h)), rs = rho > tiny ? rho : (R)1, t = a + h;
+const R a0 = a > 0 ? a : (R)0, h0 = h > 0 ? h : (R)0;
+const bool kink1 = low & (rho <= tiny), flat1 = exact & (a > 0), flat2 = exact & (h > 0);
+const R f1 = low ? (t > 0 ? LOWERED(2*a*h) : t - rho)/(t > 0 ? t + rs : (R)1) : h;
+const R p1 = low ? (kink1 ? kp : (flat1 ? h*h : rs - a)/(rs*(flat1 ? rs + a0 : (R)1))) : (R)0;
+const R q1 = low ? (kink1 ? kq : (flat2 ? a*a : rs - h)/(rs*(flat2 ? rs + h0 : (R)1))) : (R)1;
+const bool kink = inside & (kink1 | kink2);
+#if PENALIZED
+const R yp = w > 0 ? w : (R)0, g = (1 - part)*over_b;
+const R extra = (low ? a0*yp : (R)0) - (high ? c0*w0 : (R)0);
+const R ep = ((low & (a > 0)) ? yp : (R)0) + ((high & (c > 0)) ? w0 : (R)0);
+const R eq = ((low & (w > 0)) ? a0 : (R)0) + ((high & (w < 0)) ? c0 : (R)0);
+const R f = inside ? part*f1 + g*extra : (R)0;
+const R p = part*(p1 + q1*p2) + g*ep, q = part*q1*q2 + g*eq;
+#else
+const R f = inside ? f1 : (R)0, p = p1 + q1*p2, q = q1*q2;
+#endif
+#undef SMOOTHED
+#undef LOWERED
+
 // snippet map: Of cell i: f, p, q, whether there is a kink, and what they are made of; R is the
 // type of it. FUSED: in units of `scale`, which makes them of order one; the map is free of
 // cancellation.
@@ -44,34 +88,8 @@ const R kp = (R)0, kq = (R)1;
 const R least = (low & (a < w)) ? a : w;
 const bool top = high & (-c > least), bottom = low & (a < w), kink = false;
 const R f = inside ? (top ? -c : least) : (R)0, p = (top | bottom) ? (R)1 : (R)0, q = (R)1 - p;
-#else  // 2 a b / (a + b + sqrt) and b^2 / (rho (rho + a)) are psi and 1 - a / rho without cancellation
-const R c0 = c > 0 ? c : (R)0, w0 = -w > 0 ? -w : (R)0;
-#if UPPER
-const R e = root(w*w + c*c), es = e > tiny ? e : (R)1, n = c - w;
-const R below = n > 0 ? -2*w*c/(n + es) : n - e, h = high ? -below : w;
-const bool kink2 = high & (e <= tiny);
-const R p2 = high ? (kink2 ? kp : (c > 0 ? w*w/(es*(es + c0)) : 1 - c/es)) : (R)0;
-const R q2 = high ? (kink2 ? kq : (w < 0 ? c*c/(es*(es + w0)) : 1 + w/es)) : (R)1;
 #else
-const R h = w, p2 = 0, q2 = 1; const bool kink2 = false;
-#endif
-const R rho = root(a*a + h*h), rs = rho > tiny ? rho : (R)1, t = a + h;
-const R a0 = a > 0 ? a : (R)0, h0 = h > 0 ? h : (R)0;
-const bool kink1 = low & (rho <= tiny), flat1 = a > 0, flat2 = h > 0;
-const R f1 = low ? (t > 0 ? 2*a*h : t - rho)/(t > 0 ? t + rs : (R)1) : h;
-const R p1 = low ? (kink1 ? kp : (flat1 ? h*h : rs - a)/(rs*(flat1 ? rs + a0 : (R)1))) : (R)0;
-const R q1 = low ? (kink1 ? kq : (flat2 ? a*a : rs - h)/(rs*(flat2 ? rs + h0 : (R)1))) : (R)1;
-const bool kink = inside & (kink1 | kink2);
-#if PENALIZED
-const R yp = w > 0 ? w : (R)0, g = (1 - part)*over_b;
-const R extra = (low ? a0*yp : (R)0) - (high ? c0*w0 : (R)0);
-const R ep = ((low & (a > 0)) ? yp : (R)0) + ((high & (c > 0)) ? w0 : (R)0);
-const R eq = ((low & (w > 0)) ? a0 : (R)0) + ((high & (w < 0)) ? c0 : (R)0);
-const R f = inside ? part*f1 + g*extra : (R)0;
-const R p = part*(p1 + q1*p2) + g*ep, q = part*q1*q2 + g*eq;
-#else
-const R f = inside ? f1 : (R)0, p = p1 + q1*p2, q = q1*q2;
-#endif
+#include "fischer"
 #endif
 
 // kernel nonsmooth_map.merit: The sum of f^2
@@ -185,3 +203,34 @@ else SIMD for (int i = 0; i < n; ++i) x[i] = base[i] + scale*(double)e[i];
 //   numbers    float64 step
 fetch(0, n, x, e);
 SIMD8 for (int k = 0; k < n; ++k) x[k] += step*(double)e[k];
+
+// kernel nonsmooth_map.host: f, p, q and the kink of rows first <= i < last on the host. `reals`
+// holds x, y, d, the bounds, and the element (kp, kq) that stands at each kink.
+//   compute    float64
+//   whole      float64 reals; int32 indices
+//   box        float64 value, by_x, by_y, kinked
+//   numbers    int count; float64 share, over, kinks, twice_mu
+//   constants  UPPER = 1, PENALIZED = 1, HOST = 1, FUSED = 0
+EXACT_MATH
+#include "map_numbers"
+const double *x = reals, *y = x + count, *d = y + count, *lower = d + count, *upper = lower + count, *element = upper + count;
+for (int i = first; i < last; ++i) {
+    const bool inside = true, low = lower[i] > -(double)INFINITY, high = upper[i] < (double)INFINITY;
+    const R a = low ? d[i]*(x[i] - lower[i]) : 0.0, c = high ? d[i]*(upper[i] - x[i]) : 0.0, w = y[i];
+    const R kp = element[i], kq = element[count + i];
+#include "fischer"
+    value[i] = f; by_x[i] = p; by_y[i] = q; kinked[i] = kink;
+}
+
+// kernel finite_difference.difference: over (q - f) on the free unknowns, 0 elsewhere
+//   compute    float64
+//   reads      uint8 free; float64 f
+//   writes     float64 q
+//   numbers    float64 over
+SIMD for (int k = 0; k < n; ++k) { const double v = over*(q[k] - f[k]); q[k] = free[k] ? v : 0.0; }
+
+// kernel finite_difference.scale: z = r / |d|, r where d is 0
+//   compute    float64
+//   reads      float64 r, d
+//   writes     float64 z
+SIMD for (int k = 0; k < n; ++k) { const double v = r[k]/(d[k] < 0 ? -d[k] : d[k]); z[k] = d[k] != 0 ? v : r[k]; }

@@ -16,7 +16,7 @@ from warp_lcp.problem.protocol import HasRows, HasStencil, NamesComponents, Rela
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.rows.vectors import ADD, rows_of
-from warp_lcp.solvers.sweep_kernels import CHANGE, row_kernels
+from warp_lcp.sweeps.sweep_kernels import CHANGE, row_kernels
 
 
 class SweepOrder(StrEnum):

@@ -33,7 +33,7 @@ f64 = wp.array(dtype=wp.float64)
 
 SLOT = {"SIZE": SIZE, "BETA": BETA, "STEP": STEP, "PER_SIZE": PER_SIZE}
 
-KERNELS = KernelFile(Path(__file__).parent / "headers/projected_multigrid.h", SLOT)
+KERNELS = KernelFile(Path(__file__).parent / "headers/grid_step.h", SLOT)
 UPDATE = KERNELS["projected_multigrid.update"]
 ASSESS = KERNELS["projected_multigrid.assess"]
 ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))  # a plane is assessed when the one above it has moved

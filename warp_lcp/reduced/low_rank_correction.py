@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
+from warp_lcp.reduced.grid_step_kernels import ENERGY, ZAP, ZAZ
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.compiler import forward_kernel
 from warp_lcp.rows.host_array import HostArray
@@ -17,7 +18,6 @@ from warp_lcp.rows.program import Launch, LaunchGraph, clear, copy, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers.projected_multigrid_kernels import ENERGY, ZAP, ZAZ
 
 STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
 SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere

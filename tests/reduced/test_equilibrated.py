@@ -7,7 +7,7 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import boxed, lemke
-from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
+from warp_lcp.reduced.equilibrated import EquilibratedWorkspace
 from warp_lcp.solvers.interior_point import InteriorPoint
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10)

@@ -1,5 +1,7 @@
 """The maps that Newton-type methods descend on: each row against its definition, at kinks too, in all places where they are computed."""
 
+from decimal import Decimal, localcontext
+
 import numpy as np
 import pytest
 import warp as wp
@@ -8,10 +10,9 @@ import warp_lcp as wl
 from oracle import assemble
 from plain_fischer import LEAST_Q, PlainMap
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.solvers.dense_problem import DenseProblem
+from warp_lcp.reduced.dense_problem import DenseProblem
+from warp_lcp.reduced.nonsmooth_map import WEIGHTED, HostMap, Kink, MapForm, MapWeights, NonsmoothMap
 from warp_lcp.solvers.fischer_newton import FischerNewton
-from warp_lcp.solvers.fischer_newton_dense import FischerMap
-from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
 FORMS = ["natural", "fischer", "penalized"]
 BOUNDS = [(0.0, np.inf), (-2.0, 3.0), (-np.inf, 1.0), (-np.inf, np.inf), (1.0, 1.0)]
@@ -79,7 +80,7 @@ def test_the_map_on_the_host_is_that_of_the_definition(form, kink):
     A, b, lower, upper, x = at_kinks(4007)
     share = 1.0 if form == "fischer" else 0.7
     data = DenseProblem(np.arange(len(b)), A, b, lower, upper, 0.0)
-    made = FischerMap(data, share, kink, np.random.default_rng(1))
+    made = HostMap(data, share, kink, np.random.default_rng(1))
     plain = PlainMap(form, A, b, lower, upper, share=share)
     f, p, q, kinks = made.linearized(x)
     for got, expected in zip((f, p, q), plain.rows(x), strict=False):
@@ -88,11 +89,64 @@ def test_the_map_on_the_host_is_that_of_the_definition(form, kink):
     np.testing.assert_allclose(made.jacobian(p, q), plain.jacobian(x), rtol=1e-8, atol=1e-7)
 
 
+def towards_kinks(seed, n=400):
+    """Rows with (a, y) or (c, -y) at angles all around and distances of 1e-18 to 1 from a kink, the kink itself among them.
+
+    Returns the diagonal of A, b, bounds and x; 2^k units, so that a = d (x - l) is exact for l = 0.
+    """
+    rng = np.random.default_rng(seed)
+    d, angle = 2.0 ** rng.integers(-3, 4, n), rng.choice(np.arange(16) * np.pi / 8, n) + rng.choice([0.0, 1e-9, 0.1], n)
+    distance = rng.choice([0.0, *10.0 ** np.arange(-18, 1)], n)
+    a, y = distance * np.cos(angle), distance * np.sin(angle)
+    kind = rng.integers(0, 4, n)
+    lower = np.where(kind < 2, 0.0, -np.inf)
+    upper = np.select([kind == 1, kind == 2], [0.5, 0.0], np.inf)
+    x = np.where(kind == 2, -a, a) / d
+    return d, np.where(kind == 2, -y, y) - d * x, lower, upper, x
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7])
+@pytest.mark.parametrize("seed", [4021, 4027])
+def test_host_and_device_agree_step_by_step_at_the_kink(share, seed, device):
+    """f, p f and q f of rows at and near their kinks, from one y: to rounding of p and q, which on the host is that of 1 - a / rho."""
+    d, b, lower, upper, x = towards_kinks(seed)
+    form = "fischer" if share == 1 else "penalized"
+    made, field, problem = device_map(np.diag(d), b, lower, upper, x, form, share, Kink.PERTURBATION, device)
+    y, values, by_x, by_y = made.residual.y.numpy(), *(problem.layout.zeros(wp.float64) for _ in range(3))
+    made.values(field, values)
+    made._half_sum(WEIGHTED, field, MapWeights(by_x, by_y))
+    data = DenseProblem(np.arange(len(b)), np.diag(d), b, lower, upper, 0.0)
+    f, p, q, kinks = HostMap(data, share, Kink.PERTURBATION, np.random.default_rng(1)).linearized(x, y)
+    assert 10 < kinks.sum() < len(x) / 2
+    np.testing.assert_allclose(values.numpy(), f, rtol=1e-15, atol=0.0)
+    for got, slope in ((by_x.numpy() / d, p), (by_y.numpy(), q)):
+        assert (np.abs(got - slope * f) <= 1e-15 * (1 + slope) * np.abs(f)).all()
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 1e-12, 0.3])
+def test_the_smoothed_map_is_that_of_the_definition(smoothing):
+    """psi = x + y - sqrt(x^2 + y^2 + 2 mu) without cancellation, and its rounded derivatives, beside 60 digits."""
+    rng = np.random.default_rng(4049)
+    x, y = (rng.choice([-1.0, 1.0], 300) * 10.0 ** rng.uniform(-4, 4, 300) for _ in range(2))
+    data = DenseProblem(np.arange(300), np.eye(300), np.ones(300), np.zeros(300), np.full(300, np.inf), 0.0)
+    found = HostMap(data, 1.0, Kink.ZERO, np.random.default_rng(1)).linearized(x, y, smoothing)
+    assert not found[3].any()
+    with localcontext(prec=60):
+        for f, p, q, a, h in zip(*found[:3], *([Decimal(v) for v in side] for side in (x, y)), strict=True):
+            rho = (a * a + h * h + 2 * Decimal(smoothing)).sqrt()
+            # near a h = mu the map itself is 0: to rounding of its terms
+            assert f == pytest.approx(float(a + h - rho), rel=1e-14, abs=1e-15 * float(min(abs(a), abs(h))))
+            for slope, side in ((p, a), (q, h)):
+                exact = float(1 - side / rho)
+                assert slope == pytest.approx(exact, rel=0.0, abs=1e-15)  # five roundings
+                assert slope == 0 or exact > 1e-17, "a row that does not count makes factors singular"
+
+
 def test_random_elements_on_the_host_are_from_the_disc():
     """(1 - p)^2 + (1 - q)^2 <= 1, up to the edge, and not the same for all."""
     n = 2000
     data = DenseProblem(np.arange(n), np.eye(n), np.zeros(n), np.zeros(n), np.full(n, np.inf), 0.0)
-    _, p, q, kinks = FischerMap(data, 1.0, Kink.RANDOM, np.random.default_rng(1)).linearized(np.zeros(n))
+    _, p, q, kinks = HostMap(data, 1.0, Kink.RANDOM, np.random.default_rng(1)).linearized(np.zeros(n))
     assert kinks.all()
     assert ((1 - p) ** 2 + (1 - q) ** 2 <= 1).all()
     for one in (p, q):

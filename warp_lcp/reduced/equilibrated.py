@@ -17,9 +17,7 @@ from warp_lcp.problem.protocol import HasRows, HasScale, has, version_of
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scaled
 from warp_lcp.problem.solve import IterateMemory, Step
-from warp_lcp.rows import KernelFile
-from warp_lcp.rows.vectors import rows_of
-from warp_lcp.solvers.dense_problem import (
+from warp_lcp.reduced.dense_problem import (
     DenseProblem,
     power_of_two,
     proved_infeasible,
@@ -27,6 +25,8 @@ from warp_lcp.solvers.dense_problem import (
     within_reach,
     without_contact,
 )
+from warp_lcp.rows import KernelFile
+from warp_lcp.rows.vectors import rows_of
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/active_set.h")
 UNITS = KERNELS["equilibrated.units"]

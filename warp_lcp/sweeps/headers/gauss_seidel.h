@@ -1,4 +1,4 @@
-// Kernels of Gauss-Seidel sweeps over lines of a grid.
+// Kernels of Gauss-Seidel sweeps, over lines of a grid too.
 
 // kernel sweep.change: The largest |x - old|, old set to x; clang vectorizes no largest value of
 // doubles, as one may be NaN; out_of[0] is 0 before

@@ -9,9 +9,9 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.problem import spare_workspace
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.solvers import spare_workspace
-from warp_lcp.solvers.spare_workspace import KEPT, MOST_CELLS
+from warp_lcp.problem.spare_workspace import KEPT, MOST_CELLS
 
 pytestmark = pytest.mark.cpu_form("workspaces are kept on the CPU")
 

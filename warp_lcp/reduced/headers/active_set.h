@@ -73,16 +73,6 @@ else { SIMD for (int k = 0; k < n; ++k) q[k] = free[k] ? q[k] : 0.0; }
 //   writes     float64 z
 SIMD for (int k = 0; k < n; ++k) { const double v = r[k]/d[k]; z[k] = d[k] != 0 ? v : r[k]; }
 
-// kernel partition.select: x, less what is to be left out, on the members; elsewhere what was
-// there, or 0
-//   compute    float64
-//   reads      float64 x, less?; uint8 member
-//   writes     float64 target
-//   numbers    bool kept
-const auto select = [&](auto value) {
-    SIMD for (int k = 0; k < n; ++k) { const double v = value(k), rest = kept ? target[k] : 0.0; target[k] = member[k] ? v : rest; } };
-if (less) select([&](int k) { return x[k] - less[k]; }); else select([&](int k) { return x[k]; });
-
 // kernel equilibrated.units: A field times units, or over them: powers of 2, so that nothing is
 // rounded, and infinities stay what they are
 //   compute    float64
@@ -90,16 +80,3 @@ if (less) select([&](int k) { return x[k] - less[k]; }); else select([&](int k) 
 //   writes     float64 scaled
 //   numbers    bool inverse
 SIMD for (int k = 0; k < n; ++k) { const double times = x[k]*units[k], over_ = x[k]/units[k]; scaled[k] = inverse ? over_ : times; }
-
-// kernel finite_difference.difference: over (q - f) on the free unknowns, 0 elsewhere
-//   compute    float64
-//   reads      uint8 free; float64 f
-//   writes     float64 q
-//   numbers    float64 over
-SIMD for (int k = 0; k < n; ++k) { const double v = over*(q[k] - f[k]); q[k] = free[k] ? v : 0.0; }
-
-// kernel finite_difference.scale: z = r / |d|, r where d is 0
-//   compute    float64
-//   reads      float64 r, d
-//   writes     float64 z
-SIMD for (int k = 0; k < n; ++k) { const double v = r[k]/(d[k] < 0 ? -d[k] : d[k]); z[k] = d[k] != 0 ? v : r[k]; }

@@ -12,7 +12,7 @@ from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.nncg import NNCG
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.psor import advised_omega
-from warp_lcp.solvers.spectrum import scaled_spectrum
+from warp_lcp.sweeps.spectrum import scaled_spectrum
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=2000)
 LOOSE = wl.StoppingCriteria(rtol=1e-6, max_iterations=5000, patience=1000)

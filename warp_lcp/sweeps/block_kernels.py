@@ -9,7 +9,7 @@ import warp as wp
 from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.problem.affine_bounds import AffineSide, bound_at
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.solvers.sweep_kernels import INFINITE, ZERO, scalar_solution
+from warp_lcp.sweeps.sweep_kernels import INFINITE, ZERO, scalar_solution
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 AT_LOWER, FREE, AT_UPPER = wp.constant(0), wp.constant(1), wp.constant(2)
