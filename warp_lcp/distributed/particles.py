@@ -9,33 +9,25 @@ made anew each time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import CellBox
-from warp_lcp.distributed.particle_pieces import cells_of
+from warp_lcp.distributed.particle_messages import KERNELS, REACH, Buffer, ParticleMessages, bounds_of
 from warp_lcp.distributed.place_order import PlaceOrder
 from warp_lcp.grid.part import ParticleExchange
 from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.particles import MOST_A_CELL, NEW, Particles, ParticleTotals
-from warp_lcp.rows import KernelFile
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
 
 INNER, BORDER, OUTSIDE = 0, 1, 2  # of a box: in it and away from its cuts, within reach of them, beyond them
-KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
 WHERE = KERNELS["warp_lcp.distributed.particles.where"]
-
-
-REACH = 1  # cells from a box within which particles touch its faces and cells
 ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
-ENDLESS = 1e30  # a coordinate beyond all
 
 
 class ParticleMigration(ParticleExchange):
@@ -44,16 +36,11 @@ class ParticleMigration(ParticleExchange):
     Args:
         part: where this rank works.
         particles: this rank's, in its box or within its ghost layers.
-
-    Attributes:
-        place: int64, shape (count,): where each particle is in the order of all ranks' particles.
     """
-
-    place: np.ndarray
 
     def __init__(self, part: Subdomain, particles: Particles) -> None:
         super().__init__(particles)
-        self.place = np.empty(0, dtype=np.int64)
+        self._places, self._placed = Buffer(wp.int64), 0
         self._counts: list[int] = []
         self._expected = 0
         self._added = 0  # by this rank since the last totals
@@ -65,9 +52,19 @@ class ParticleMigration(ParticleExchange):
         self._own: np.ndarray | int | None = None  # which particles are this rank's, or how many of the first; None: all
         self._lying: PlaceOrder | None = None  # of those of this rank; None: not known
         self._neighbors = [r for r, box in enumerate(decomposition.boxes) if r != part.ranks.rank and decomposition.meet(box, around)]
-        self._end = _beyond(decomposition.counts, part.grid.spacing)
         if self._neighbors:
             self.room = ROOM
+            self._messages = ParticleMessages(part, self.particles, self._places, self._neighbors)
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where each particle is in the order of all ranks' particles, int64, shape (count,)."""
+        return self._places.host[: self._placed]
+
+    @place.setter
+    def place(self, place: np.ndarray) -> None:
+        self._places.take(place)
+        self._placed = len(place)
 
     @property
     def counts(self) -> list[int]:
@@ -86,14 +83,14 @@ class ParticleMigration(ParticleExchange):
     def arrange(self, *, sort: bool) -> None:
         """Hand particles that have left the box to their ranks, take in those that came, with ghosts, and bring all into order."""
         self.drop_ghosts()
-        self.particles.number()
         if self._neighbors:
             self._exchange()
         if sort:
             self.particles.sort()
-        elif self._neighbors:
+        else:
             self.particles.number()
-            self._find_runs()
+            if self._neighbors:
+                self._find_runs()
 
     def look_around(self) -> None:
         """Let ghosts be there with their positions alone; own particles stay this rank's, wherever they are."""
@@ -101,9 +98,8 @@ class ParticleMigration(ParticleExchange):
             self.arrange(sort=True)
         elif self._neighbors:
             self.drop_ghosts()
-            self.particles.number()
             self._own = self.particles.count
-            self._swap(np.flatnonzero(self._where() != INNER), ["position"])
+            self._placed += self._messages.exchange(positions_only=True)
             self._find_runs()
 
     @contextmanager
@@ -116,32 +112,19 @@ class ParticleMigration(ParticleExchange):
 
     def _exchange(self) -> None:
         """Hand over and take in, and put ghosts behind the others."""
-        particles = self.particles
-        first, border = particles.count, np.flatnonzero(self._where() != INNER)
-        cells = self._swap(border, list(particles.arrays()))
-        out, near = ~_within(cells, self.part.box), _within(cells, self.part.box.grown(REACH))
-        come = first + np.flatnonzero(self._where(first) == OUTSIDE)
-        others, ghosts = np.append(border[out], come), np.append(border[out & near], come)
-        count, end = particles.count - len(others), particles.count - len(others) + len(ghosts)
-        own, there = np.ones(particles.count - count, dtype=bool), np.zeros(len(ghosts), dtype=bool)  # of the numbers from `count` on
-        own[others[others >= count] - count] = False
-        stay = (ghosts >= count) & (ghosts < end)
-        there[ghosts[stay] - count] = True
-        free, last = others[others < count], count + np.flatnonzero(own)
-        sources, targets = np.append(last, ghosts[~stay]), np.append(free, count + np.flatnonzero(~there))
-        particles.move(sources, targets)
-        self.place[targets] = self.place[sources]
-        particles.resize(end)
-        self.place, self._own = self.place[:end], count
+        first, come = self.particles.count, self._messages.exchange(positions_only=False)
+        own, end, free = self._messages.settle(come)
+        self.particles.resize(end)
+        self._placed, self._own = end, own
         if self._lying is not None:
-            self._lying = self._lying.changed(free, first, count)
+            self._lying = self._lying.changed(free, first, own)
 
     def _find_runs(self) -> None:
         """Find the order in which sums take the particles, of which the first are this rank's."""
         assert isinstance(self._own, int), "ghosts lie behind the others"
         if self._lying is None:
             self._order_first(self._own)
-            self._lying = PlaceOrder(self.place[: self._own])
+            self._lying = PlaceOrder(self.place[: self._own].copy())
         runs = self._lying.runs(self.place, self._own)
         self.particles.set_runs(wp.array(runs, dtype=wp.int32, device=self.part.grid.device))
 
@@ -213,11 +196,11 @@ class ParticleMigration(ParticleExchange):
         mine, self._own, self.particles.runs = self._own, None, None
         if isinstance(mine, int):
             self.particles.resize(mine)
-            self.place = self.place[:mine]
+            self._placed = mine
         elif mine is not None:
             self._take(np.flatnonzero(mine))
             self.particles.number()
-            self._lying = PlaceOrder(self.place)
+            self._lying = PlaceOrder(self.place.copy())
 
     def joined_totals(self, own: ParticleTotals) -> ParticleTotals:
         """Return sums over all ranks' particles; there are no ghosts now."""
@@ -247,18 +230,12 @@ class ParticleMigration(ParticleExchange):
         self.place = np.sort(np.asarray(place, dtype=np.int64))
         self.count()
 
-    def _where(self, first: int = 0) -> np.ndarray:
-        """Return INNER, BORDER or OUTSIDE of each particle from a number on, uint8, shape (count - first,)."""
-        part, grid = self.part, self.part.grid
-        bits = [[part.cuts >> 2 * axis + side & 1 for axis in range(3)] for side in range(2)]
-        low = [box + 1 if cut else -ENDLESS for box, cut in zip(part.box.low, bits[0], strict=True)]
-        high = [box + 1 if cut else ENDLESS for box, cut in zip(part.box.high, bits[1], strict=True)]
-        low_x, low_y, low_z, high_x, high_y, high_z = map(float, low + high)
-        found = wp.empty(self.particles.count - first, dtype=wp.uint8, device=grid.device)
-        if len(found):
-            ends = {"low_x": low_x, "low_y": low_y, "low_z": low_z, "high_x": high_x, "high_y": high_y, "high_z": high_z}
-            position = self.particles.position[first:]
-            launch(WHERE, len(found), grid, position=position, where=found, reach=float(REACH), **ends)
+    def _where(self) -> np.ndarray:
+        """Return INNER, BORDER or OUTSIDE of each particle, uint8, shape (count,)."""
+        grid, count = self.part.grid, self.particles.count
+        found = wp.empty(count, dtype=wp.uint8, device=grid.device)
+        if count:
+            launch(WHERE, count, grid, position=self.particles.position, where=found, **bounds_of(self.part))
         return np.asarray(found.numpy())
 
     def _cells(self, which: np.ndarray) -> np.ndarray:
@@ -267,64 +244,3 @@ class ParticleMigration(ParticleExchange):
         rows, i = np.divmod(self.particles.key.numpy()[: self.particles.count][which], nx)
         k, j = np.divmod(rows, ny)
         return np.stack([i, j, k]) + (np.array(self.part.grid.origin, dtype=np.int32) - 1)[:, None]
-
-    def _swap(self, border: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Exchange columns of what neighbors must know: particles in their boxes and within a cell of them.
-
-        Args:
-            border: numbers of particles that may be.
-            names: of the columns that come; what comes lies behind the others.
-
-        Returns:
-            The cells (x, y, z) of the whole domain that those of `border` lie in, shape (3, n).
-        """
-        joined = self.part.decomposition.joined  # who has gone around has come far
-        cells = cells_of(self.part, self.particles.position.numpy()[border]).T if joined else self._cells(border)
-        incoming = self.part.mailbox.swap({rank: self._seen_by(rank, border, cells, names) for rank in self._neighbors})
-        if joined:
-            incoming.append(self._seen_by(self.part.ranks.rank, border, cells, names))
-        counts = [len(message) // (8 + 12 * len(names)) for message in incoming]
-        first = self.particles.make_room(sum(counts))
-        arrays = self.particles.arrays()
-
-        def come(begin: int, end: int) -> np.ndarray:  # bytes of each particle
-            return np.concatenate([message[begin * n : end * n] for message, n in zip(incoming, counts, strict=True)])
-
-        if sum(counts):
-            for column, name in enumerate(names):
-                values = come(8 + 12 * column, 20 + 12 * column).view(np.float32).reshape(-1, 3)
-                arrays[name][first:].assign(values)
-        self.place = np.append(self.place, come(0, 8).view(np.int64))
-        return cells
-
-    def _seen_by(self, rank: int, border: np.ndarray, cells: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Return what a rank must know of, as bytes; arguments as of `_swap`.
-
-        Where axes have no end, positions are those that continue what is in its box; of this rank, which has the others, those alone.
-        """
-        decomposition, arrays = self.part.decomposition, self.particles.arrays()
-        columns = [arrays[name].numpy() for name in names]
-        shifts, seen = decomposition.shifts[rank == self.part.ranks.rank :], decomposition.boxes[rank].grown(REACH)
-        found = [border[_within(cells, seen.moved(shift, -1))] for shift in shifts]
-        which = np.concatenate(found)
-        columns = [column[which] for column in columns]
-        if decomposition.joined:
-            way, position = np.repeat(shifts, [len(part) for part in found], axis=0), columns[names.index("position")]
-            position += way * self.part.grid.spacing
-            np.maximum(position, self._end, out=position, where=way > 0)  # not inside by its rounding
-        return np.concatenate([values.ravel().view(np.uint8) for values in (self.place[which], *columns)])
-
-
-def _beyond(counts: Sequence[int], spacing: float) -> np.ndarray:
-    """Return the least coordinates [m] for which kernels find the cell beyond the last along x, y, z, float32."""
-    one, inverse = np.float32(1.0), np.float32(1.0 / spacing)
-    end = np.array(counts, dtype=np.float32) * np.float32(spacing)
-    while (short := end * inverse + one < np.array(counts, dtype=np.float32) + one).any():
-        end[short] = np.nextafter(end[short], np.float32(np.inf))
-    return end
-
-
-def _within(cells: np.ndarray, box: CellBox) -> np.ndarray:
-    """Tell which cells (x, y, z), shape (3, n), are in a box."""
-    low, high = np.array([box.low, box.high], dtype=np.int32)[:, :, None]
-    return np.asarray(((cells >= low) & (cells < high)).all(axis=0))

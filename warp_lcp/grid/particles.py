@@ -210,6 +210,11 @@ class Particles:
         return self._capacity
 
     @property
+    def column_count(self) -> int:
+        """Number of `arrays`."""
+        return len(self._names)
+
+    @property
     def listed_count(self) -> Scalar:
         """The number of particles, for recorded launches."""
         return self._memory.count
@@ -342,20 +347,6 @@ class Particles:
             self.exchange.removing(marks)
             self.resize(self.count - first - others)
         return first, others
-
-    def move(self, sources: np.ndarray, targets: np.ndarray) -> None:
-        """Copy the particles with some numbers to where others are.
-
-        Args:
-            sources: their numbers, shape (n,).
-            targets: numbers of those that are overwritten, shape (n,), none among `sources`.
-        """
-        device = self.grid.device
-        if len(sources):
-            of, to = (wp.array(numbers, dtype=wp.int32, device=device) for numbers in (sources, targets))
-            for column in self._columns.values():
-                launch_list(kernels.reorder_kernel, len(sources), [of, column.view, self._spare.view], device=device, cost=4)
-                launch_list(kernels.put_kernel, len(targets), [to, self._spare.view, column.view], device=device, cost=4)
 
     def take(self, order: np.ndarray) -> None:
         """Keep the particles with these numbers, in this order."""

@@ -47,12 +47,6 @@ def reorder_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp
     target[i] = source[order[i]]
 
 
-@list_kernel("warp_lcp.grid.particles")
-def put_kernel(i, order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)):
-    """Put particles where they are wanted."""
-    target[order[i]] = source[i]
-
-
 @list_kernel("warp_lcp.grid.particles_removal")
 def stays_kernel(i, marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32), removed: wp.array(dtype=wp.int32)):
     """Write 1 for a particle without a mark, 0 for others; count those with the mark 1, and those with another."""

@@ -314,8 +314,17 @@ class ComponentFinder:
         return self._none_at == version
 
     def record(self, scratch: Scratch | None, launch: Launch) -> None:
-        """Record the launches of a search, which are for when it is `wanted`; `scratch` as of `find`."""
-        self._search(scratch, self._A.cells_around, launch)
+        """Record the launches of a search, which are for when it is `wanted`; `scratch` as of `find`.
+
+        On ranks it is one of this rank's cells alone, see `held_here`.
+        """
+        shared = self._A.layout.across is not None
+        self._search(scratch, self._A.cells if shared else self._A.cells_around, launch)
+
+    @property
+    def held_here(self) -> wp.array[wp.int32]:
+        """The number of cells of the last search in components that nothing on this rank holds, shape (1,)."""
+        return self._count.array
 
     def _grow(self, scratch: Scratch | None, joined: wp.array[Any]) -> Scratch:
         """Search now; returns what `_search` does."""

@@ -148,7 +148,16 @@ class Bounds:
     @property
     def stays(self) -> bool:
         """Whether there is a code now if there was one before, and none if there was none."""
-        return not self.in_place or bool(self._other_values()) == (self.code is not self._memory)
+        return not self.in_place or self.stays_with(self._other_values())
+
+    def stays_with(self, others: float) -> bool:
+        """Return `stays`, given how many finite values other than 0 there are on all ranks."""
+        return not self.in_place or bool(others) == (self.code is not self._memory)
+
+    @property
+    def others_here(self) -> wp.array[wp.float64] | None:
+        """The number of finite values other than 0 that the last coding has met on this rank, shape (1,); None: nothing is coded."""
+        return self._others.reading.array if self.in_place and self._memory is not None else None
 
     def _other_values(self) -> float:
         """Return how many finite values other than 0 the last coding has met, on all ranks."""

@@ -23,7 +23,7 @@ from warp_lcp.rows.fields import zeros
 from warp_lcp.rows.memory import Scalar
 from warp_lcp.rows.program import Conditional, Launch, LaunchGraph, Program, copy, launch, loops_on_device
 from warp_lcp.rows.readings import Reading
-from warp_lcp.rows.vectors import CONVERT
+from warp_lcp.rows.vectors import CONVERT, add_across
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
@@ -81,6 +81,17 @@ def take_unit_kernel(scalars: f64, square: f64):
 def keep_row_kernel(scalars: f64, rows: f64, n: int):
     """Keep what an evaluation has found as row n."""
     keep_row(scalars, rows, n)
+
+
+@forward_kernel(module="warp_lcp.projected_multigrid.ahead")
+@no_type_check
+def join_unusual_kernel(floating: wp.array(dtype=wp.int32), faults: f64, others: f64, unusual: f64):
+    """Put side by side what tells whether a solve begins as usual, so that ranks exchange it together."""
+    unusual[0] = wp.float64(floating[0])
+    unusual[1] = faults[0]
+    unusual[2] = wp.float64(0.0)
+    if others:
+        unusual[2] = others[0]
 
 
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
@@ -192,6 +203,7 @@ class RunAhead:
 
     def __init__(self, work: MultigridWorkspace, *, rebuilds: bool = True) -> None:
         self._work, self._rebuilds, device = work, rebuilds, work.A.device
+        self._shared = work.problem.layout.across is not None
         self.rows = deque[np.ndarray]()
         self._found, self._judged = Reading(device, ROWS * int(ROW)), Reading(device, JUDGED)
         self._going, self._stale = (zeros(1, wp.int32, device) for _ in range(2))
@@ -203,13 +215,19 @@ class RunAhead:
 
     @staticmethod
     def suits(work: MultigridWorkspace) -> bool:
-        """Return whether the device can do without its host: where loops run on it, on a grid in one process."""
+        """Return whether the device can do without its host: where loops run on it, on a grid. Ranks begin a solve so, on the CPU."""
         plain = type(work.hierarchy) is Hierarchy and isinstance(work.A, GridPoisson)
-        return plain and work.problem.layout.across is None and loops_on_device(work.A.device)
+        alone = work.problem.layout.across is None
+        return plain and loops_on_device(work.A.device) and (alone or work.A.device.is_cpu)
 
     def steps(self, tolerance: float, left: int) -> bool:
-        """Take a step and what follows it, at most `left`; return False, with nothing done, where kernels have yet to be loaded."""
+        """Take a step and what follows it, at most `left`; return False, with nothing done, where kernels have yet to be loaded.
+
+        Ranks, which wait for each other in every step, take none.
+        """
         work = self._work
+        if self._shared:
+            return False
         if not self._rebuilds:
             work.rebuild(classify=True)
         loop = self._loop(rebuilds=self._may_rebuild())
@@ -246,10 +264,10 @@ class RunAhead:
             left: steps at most.
         """
         work, r = self._work, self._work.residual
-        loop = self._loop(rebuilds=True) if self._may_rebuild() else None
-        if loop is None and self._rebuilds and not work.A.device.is_cuda:
+        loop = self._loop(rebuilds=True) if self._may_rebuild() and not self._shared else None
+        if loop is None and self._rebuilds and not (work.A.device.is_cuda or self._shared):
             return None
-        p, hierarchy = work.problem, work.hierarchy
+        hierarchy = work.hierarchy
         renewed = r.has_new_operator()
         if renewed and not (work.A.device.is_cuda and hierarchy.knows_changes):
             hierarchy.refresh()
@@ -274,7 +292,7 @@ class RunAhead:
             return 0.0
         reference, first = (math.sqrt(row[int(NORM)]) for row in (self.rows[0], self.rows[1]))
         size = math.sqrt(r.square_of_b.numpy()[0])
-        usual = p.bounds.stays and self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
+        usual = self._beginning.is_plain() and math.isfinite(size) and 4 * EPS * size < reference < math.inf
         if not (usual and reference > ORDINARY and RATIOS[0] * size < first < RATIOS[1] * size):
             self.rows.clear()
             work.distrust_hierarchy()  # it may be of any free set now
@@ -354,6 +372,7 @@ class Beginning:
         self._work, self._guess, self._counted, self._found, device = work, guess, counted, found, work.A.device
         self._key, self._finder = work.program_key(), work.A.component_finder  # type: ignore[attr-defined]  # of a GridPoisson
         self._judge, self._graph = judge, LaunchGraph(device, self._launch)  # on CUDA
+        self._unusual = Reading(device, 3)  # of ranks
         self._program = None if device.is_cuda else Program(device)
         if self._program is not None:
             self._searches, search = zeros(1, wp.int32, device), Program(device)
@@ -397,8 +416,12 @@ class Beginning:
             correction.make_potentials()
 
     def is_plain(self) -> bool:
-        """Return whether no component floats and the guess is finite; waits for the device."""
-        return self._finder.none() and not self._faults.numpy()[0]
+        """Return whether no component floats, the guess is finite and bounds are coded as before; waits for the device."""
+        bounds = self._work.problem.bounds
+        if self._work.problem.layout.across is not None:
+            floating, faults, others = self._unusual.numpy()
+            return floating == faults == 0.0 and bounds.stays_with(others)
+        return bounds.stays and self._finder.none() and not self._faults.numpy()[0]
 
     def _record(self, launch: Launch, search: Conditional | Callable[[Any], object] | None) -> None:
         """Record the launches, or launch them.
@@ -410,6 +433,7 @@ class Beginning:
         work, r, x = self._work, self._work.residual, self._work.x
         p, device = work.problem, work.A.device
         p.bounds.encode(launch)
+        r.share_bounds(launch)
         r.project(x, keep=False, launch=launch)
         work.round_iterate(launch=launch)
         r.launch_square_of_b(launch)
@@ -422,6 +446,10 @@ class Beginning:
         elif search is not None:
             search(work.scratch)
         self._faults = p.look_at(self._guess, launch)
+        if p.layout.across is not None:
+            memory = [self._finder.held_here, self._faults.array, p.bounds.others_here, self._unusual.array]
+            launch(join_unusual_kernel, 1, memory, device=device)
+            add_across(p.layout.across, self._unusual.array, slice(0, 3), launch)
         if device.is_cuda:
             copy(x, self._guess)
         else:

@@ -67,15 +67,19 @@ class AssessedResidual(NaturalResidual):
             super().start(x, keep=keep)
             if not keep:
                 self.launch_square_of_b()
-        ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
-        for bound in (lower, upper, code):
-            if ghosts is not None and bound.size:
-                ghosts.fill(bound)  # x's ghost cells will move as the cells do that they stand for
         self.classified = keep
         if not keep:
+            self.share_bounds()
             self._norm_of_b = float(np.sqrt(self.square_of_b.numpy()[0]))
             self.set(kernels.SIZE, self._norm_of_b or 1.0)
             self.set(kernels.STEP, 0.0)
+
+    def share_bounds(self, launch: Launch = launch_now) -> None:
+        """Fill the bounds' ghost cells: x's will move as the cells do that they stand for."""
+        ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
+        for bound in (lower, upper, code):
+            if ghosts is not None and bound.size:
+                ghosts.filling(bound).launch(launch)
 
     def renew(self) -> None:
         """Take the operator again if it has changed."""
@@ -372,7 +376,7 @@ class MultigridWorkspace(IterateMemory):
         self._budget -= 1
         classify = self._cycles_left == 1  # truncated cycles come next
         plain = type(self) is MultigridWorkspace and self._ahead is not None  # others read on the way
-        with as_one_table(self.problem.device) if plain else nullcontext():
+        with as_one_table(self.problem.device, self.problem.layout.across) if plain else nullcontext():
             self.rebuild(classify=self.residual.classified)
             self._cycles_left -= 1
             self._move_monotonely(descent.safe, classify, launch_recorded)

@@ -18,21 +18,144 @@ SIMD for (int k = 0; k < n; ++k) { const T e = (T)(scale*v[k]); x[k] = d[k] != 0
 if (others) { SIMD for (int k = 0; k < n; ++k) { const double e = scale*(double)x[k], held = others[k]; v[k] = d[k] != 0 ? e : held; } }
 else { SIMD for (int k = 0; k < n; ++k) { const double e = scale*(double)x[k]; v[k] = d[k] != 0 ? e : 0.0; } }
 
+// snippet side_of_box: Where a particle is: 0 in a box and away from its cuts, 1 within reach of
+// them, 2 beyond. The box begins at the grid coordinates `low` and ends at `high`
+#include "snippets.h:grid_coordinate"
+const T low[3] = {low_x, low_y, low_z}, high[3] = {high_x, high_y, high_z};
+auto side_of_box = [&](const T* at) -> int {
+    const T x = grid_coordinate(at[0]), y = grid_coordinate(at[1]), z = grid_coordinate(at[2]);
+    const int in = (int)(x >= low[0]) & (int)(x < high[0]) & (int)(y >= low[1]) & (int)(y < high[1])
+        & (int)(z >= low[2]) & (int)(z < high[2]);
+    const int away = (int)(x >= low[0] + reach) & (int)(x < high[0] - reach) & (int)(y >= low[1] + reach) & (int)(y < high[1] - reach)
+        & (int)(z >= low[2] + reach) & (int)(z < high[2] - reach);
+    return 2 - in - away;
+};
+
+// snippet columns: Columns of particles that are there
+float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data, (float*)given.affine_0.data,
+                          (float*)given.affine_1.data, (float*)given.affine_2.data, (float*)given.kept.data};
+auto to_words = [&](int* to, long long p) {  // of a message: place, then what columns hold
+    __builtin_memcpy(to, place + p, 8); to += 2;
+    for (const float* column : columns) if (column) { __builtin_memcpy(to, column + 3*p, 12); to += 3; } };
+auto from_words = [&](const int* from, long long p) {
+    __builtin_memcpy(place + p, from, 8); from += 2;
+    for (float* column : columns) if (column) { __builtin_memcpy(column + 3*p, from, 12); from += 3; } };
+int words = 2;
+for (const float* column : columns) words += column ? 3 : 0;
+
+// snippet in_cells: Whether a cell is in a box, six numbers: its first cell, and the one behind the last
+auto in_cells = [](const int* cell, const int* box, int more) -> bool {
+    return cell[0] >= box[0] - more && cell[1] >= box[1] - more && cell[2] >= box[2] - more
+        && cell[0] < box[3] + more && cell[1] < box[4] + more && cell[2] < box[5] + more; };
+
 // kernel warp_lcp.distributed.particles.where: Where particles are: a box begins at the grid
 // coordinates `low` and ends at `high`; `reach` is in cells
 //   compute    float32
 //   box        vec3 position; uint8 where
 //   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z; float32 low_x,
 //              low_y, low_z, high_x, high_y, high_z, reach
-#include "snippets.h:grid_coordinate"
+#include "side_of_box"
 const T* position = (const T*)given.position.data;
-const T low[3] = {low_x, low_y, low_z}, high[3] = {high_x, high_y, high_z};
-SIMD for (int p = first; p < last; ++p) {
-    const long long q = 3*(long long)p;
-    const T x = grid_coordinate(position[q]), y = grid_coordinate(position[q + 1]), z = grid_coordinate(position[q + 2]);
-    const int in = (int)(x >= low[0]) & (int)(x < high[0]) & (int)(y >= low[1]) & (int)(y < high[1])
-        & (int)(z >= low[2]) & (int)(z < high[2]);
-    const int away = (int)(x >= low[0] + reach) & (int)(x < high[0] - reach) & (int)(y >= low[1] + reach) & (int)(y < high[1] - reach)
-        & (int)(z >= low[2] + reach) & (int)(z < high[2] - reach);
-    where[p] = (unsigned char)(2 - in - away);
-}
+SIMD for (int p = first; p < last; ++p) where[p] = (unsigned char)side_of_box(position + 3*(long long)p);
+
+// kernel warp_lcp.distributed.particles.find_border: List the particles that are not well inside a
+// box, and their cells; count them, and those in each of the boxes from the third on. Cells are cut
+// off at the first box
+//   compute    float32
+//   whole      vec3 position; int32 boxes, border, cells
+//   box        int32 found
+//   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z; float32 low_x,
+//              low_y, low_z, high_x, high_y, high_z, reach; int count, ends
+#include "side_of_box"
+#include "in_cells"
+constexpr int BLOCK = 1024;
+const T* at = (const T*)given.position.data;
+unsigned char side[BLOCK];
+int many = 0;
+for (int b = 0; b < ends; ++b) found[1 + b] = 0;
+for (int from = 0; from < count; from += BLOCK) {
+    const int n = count - from < BLOCK ? count - from : BLOCK;
+    SIMD for (int e = 0; e < n; ++e) side[e] = (unsigned char)side_of_box(at + 3*(long long)(from + e));
+    for (int e = n; e < (n + 7)/8*8; ++e) side[e] = 0;
+    for (int e = 0; e < n; e += 8) {
+        unsigned long long eight; __builtin_memcpy(&eight, side + e, 8);
+        if (!eight) continue;
+        for (int p = e; p < e + 8; ++p) {
+            if (!side[p]) continue;
+            int* cell = cells + 3*many;
+            border[many++] = from + p;
+            for (int d = 0; d < 3; ++d) {
+                const T x = grid_coordinate(at[3*(long long)(from + p) + d]), least = boxes[d] + 1, most = boxes[3 + d];
+                const T inside = x > least ? x : least;
+                cell[d] = (int)(inside < most ? inside : most) - 1; }
+            if (planes == 1) cell[2] = boxes[2];
+            for (int b = 0; b < ends; ++b) found[1 + b] += in_cells(cell, boxes + 12 + 6*b, 0); } } }
+found[0] = many;
+
+// kernel warp_lcp.distributed.particles.pack: Write the particles in each of the boxes from the
+// third on to a message, one after another. Where axes have no end, positions go along by an
+// offset, and to `end_` at least, so that they are not inside by its rounding
+//   compute    float32
+//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
+//              boxes, border, cells, message; float64 offsets
+//   box        int32 found
+//   numbers    int ends; bool around; float32 end_x, end_y, end_z
+#include "columns"
+#include "in_cells"
+const float end[3] = {end_x, end_y, end_z};
+int* to = message;
+for (int b = 0; b < ends; ++b)
+    for (int e = 0; e < found[0]; ++e) {
+        if (!in_cells(cells + 3*e, boxes + 12 + 6*b, 0)) continue;
+        to_words(to, border[e]);
+        for (int d = 0; around && d < 3; ++d) {
+            const double offset = offsets[3*b + d];
+            float x; __builtin_memcpy(&x, to + 2 + d, 4);
+            x = (float)((double)x + offset);
+            x = offset > 0 && x < end[d] ? end[d] : x;
+            __builtin_memcpy(to + 2 + d, &x, 4); }
+        to += words; }
+
+// kernel warp_lcp.distributed.particles.unpack: Put the particles of messages behind the others
+//   compute    float32
+//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
+//              message
+//   box        int32 found
+//   numbers    int count, come
+#include "columns"
+for (int p = 0; p < come; ++p) from_words(message + (long long)words*p, count + p);
+
+// kernel warp_lcp.distributed.particles.settle: Put ghosts behind the particles of this rank, after
+// `unpack`: the last ones take the room of those that have left the second box, and of ghosts. Find
+// how many are this rank's, how many there are with ghosts, and in how much of their room others
+// are: the first of `others`
+//   compute    float32
+//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
+//              boxes, border, cells, message, others, ghosts, flags
+//   box        int32 found
+//   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z; float32 low_x,
+//              low_y, low_z, high_x, high_y, high_z, reach; int count, come
+#include "side_of_box"
+#include "columns"
+#include "in_cells"
+const int total = count + come;
+int gone = 0, near = 0, free = 0, moved = 0;
+for (int e = 0; e < found[0]; ++e) {
+    if (in_cells(cells + 3*e, boxes + 6, 0)) continue;
+    others[gone++] = border[e];
+    if (in_cells(cells + 3*e, boxes + 6, (int)reach)) ghosts[near++] = border[e]; }
+for (int p = count; p < total; ++p)
+    if (side_of_box((const T*)given.position.data + 3*(long long)p) == 2) { others[gone++] = p; ghosts[near++] = p; }
+const int own = total - gone, end = own + near;
+int *leaves = flags, *held = flags + gone;  // of the numbers from `own` on
+for (int e = 0; e < gone; ++e) leaves[e] = 0;
+for (int e = 0; e < near; ++e) held[e] = 0;
+for (int e = 0; e < gone; ++e) { if (others[e] < own) ++free; else leaves[others[e] - own] = 1; }
+for (int e = 0; e < near; ++e) if (ghosts[e] >= own && ghosts[e] < end) held[ghosts[e] - own] = 1;
+for (int e = 0; e < gone; ++e) if (!leaves[e]) to_words(message + (long long)words*moved++, own + e);
+for (int e = 0; e < near; ++e)
+    if (ghosts[e] < own || ghosts[e] >= end) to_words(message + (long long)words*moved++, ghosts[e]);
+moved = 0;
+for (int e = 0; e < free; ++e) from_words(message + (long long)words*moved++, others[e]);
+for (int e = 0; e < near; ++e) if (!held[e]) from_words(message + (long long)words*moved++, own + e);
+found[0] = own; found[1] = end; found[2] = free;

@@ -1,0 +1,234 @@
+"""Messages of particles between ranks: packed, unpacked and put in their place in native code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.distributed.decomposition import CellBox
+from warp_lcp.grid.particles import Particles
+from warp_lcp.rows import KernelFile, Rows
+from warp_lcp.rows.memory import Scalar, Slot
+from warp_lcp.rows.program import LaunchGraph
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.subdomain import Subdomain
+
+REACH = 1  # cells from a box within which particles touch its faces and cells
+ENDLESS = 1e30  # a coordinate beyond all
+COLUMNS = ("position", "velocity", "affine_0", "affine_1", "affine_2", "kept")
+PLACE_WORDS, COLUMN_WORDS = 2, 3  # of 4 bytes, of a particle in a message
+KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
+FIND_BORDER, PACK, UNPACK, SETTLE = (
+    KERNELS[f"warp_lcp.distributed.particles.{name}"] for name in ("find_border", "pack", "unpack", "settle")
+)
+
+
+class Buffer:
+    """Memory of the host that grows, for recorded launches.
+
+    Args:
+        dtype: of its elements, a Warp type.
+
+    Attributes:
+        array: the memory now.
+        host: the same as NumPy sees it.
+    """
+
+    def __init__(self, dtype: Any) -> None:
+        self._dtype, self._slot = dtype, Slot()
+        self._allocate(1)
+
+    def reserve(self, count: int, kept: int = 0) -> None:
+        """Make room for so many elements, and keep the first ones; the others hold anything."""
+        if count > len(self.host):
+            before = self.host
+            self._allocate(2 * count)
+            self.host[:kept] = before[:kept]
+
+    def take(self, values: np.ndarray) -> None:
+        """Hold these values."""
+        self.reserve(values.size)
+        self.host[: values.size] = values.ravel()
+
+    def _allocate(self, count: int) -> None:
+        self.array: wp.array[Any] = wp.empty(count, dtype=self._dtype, device="cpu")
+        self.host: np.ndarray = self.array.numpy()
+        self._slot.point_to(self.array)
+
+
+class ParticleMessages:
+    """Particles that a rank's neighbors must know, and those that come from them.
+
+    Args:
+        part: where this rank works.
+        particles: this rank's.
+        place: int64, of each particle in the order of all ranks' particles; grows with them.
+        neighbors: ranks, ascending.
+    """
+
+    def __init__(self, part: Subdomain, particles: Particles, place: Buffer, neighbors: Sequence[int]) -> None:
+        self.part, self._particles, self._place, self._neighbors = part, particles, place, neighbors
+        self._boxes, self._border, self._cells, self._found = (Buffer(wp.int32) for _ in range(4))
+        self._outgoing, self._incoming, self._others, self._ghosts, self._flags, self._moved = (Buffer(wp.int32) for _ in range(6))
+        self._offsets = Buffer(wp.float64)
+        self._device, self._count, self._come = wp.get_device("cpu"), Scalar(), Scalar()
+        self._bounds = bounds_of(part)
+        self._end = beyond(part.decomposition.counts, part.grid.spacing)
+        self._ends = self._take_boxes()
+        self._copies: dict[str, wp.array[Any]] = {}
+        copied = particles.grid.device.is_cuda  # others in each run
+        launches = self._launch_packing, self._launch_unpacking, self._launch_settling, self._launch_search
+        graphs = (LaunchGraph(self._device, launch, at_once=copied) for launch in launches)
+        self._packing, self._unpacking, self._settling, self._search = graphs
+
+    def _take_boxes(self) -> list[int]:
+        """Set the boxes that are searched, and return how many each neighbor has, this rank behind them.
+
+        Particles are in a neighbor's sight in its box and within REACH of it, at every periodic shift of it; in that of this rank itself
+        at those other than 0.
+        """
+        part, joined, mine = self.part, self.part.decomposition.joined, self.part.ranks.rank
+        counts, origin = np.array(part.grid.counts), np.array(part.grid.origin)
+        limits = [[0, 0, 0], part.decomposition.counts] if joined else [origin, origin + counts]
+        if part.grid.dimension == 2:
+            limits = [[*limits[0][:2], origin[2]], limits[1]]
+        shifts = part.decomposition.shifts
+        ranks = [*self._neighbors, mine] if joined else self._neighbors
+        seen = [(rank, shift) for rank in ranks for shift in shifts[rank == mine :]]
+        boxes = [part.decomposition.boxes[rank].grown(REACH).moved(shift, -1) for rank, shift in seen]
+        table = [limits, _corners(part.box), *map(_corners, boxes)]
+        self._boxes.take(np.array(table, dtype=np.int32))
+        self._offsets.take(np.array([shift for _, shift in seen], dtype=np.float64).reshape(-1, 3) * part.grid.spacing)
+        self._found.reserve(max(1 + len(seen), 3))
+        return [sum(rank == other for other, _ in seen) for rank in ranks]
+
+    def exchange(self, *, positions_only: bool) -> int:
+        """Exchange what neighbors must know, with what lies behind the others, and return how many particles have come; collective.
+
+        Args:
+            positions_only: positions and places come alone.
+        """
+        particles, count = self._particles, self._particles.count
+        self._fetch(positions_only=positions_only)
+        words = PLACE_WORDS + COLUMN_WORDS * (1 if positions_only else self._particles.column_count)
+        self._border.reserve(count)
+        self._cells.reserve(3 * count)
+        self._count.value = count
+        self._search.run()
+        inside = self._found.host[1 : 1 + sum(self._ends)]
+        self._outgoing.reserve(words * int(inside.sum()))
+        self._packing.run(positions_only, variant=positions_only)
+        sizes = words * np.add.reduceat(inside, np.cumsum([0, *self._ends[:-1]])) if len(inside) else []
+        messages = np.split(self._outgoing.host[: sum(sizes)], np.cumsum(sizes)[:-1]) if len(inside) else []
+        incoming = self.part.mailbox.swap(dict(zip(self._neighbors, messages, strict=False)))
+        incoming += messages[len(self._neighbors) :]
+        come = sum(map(len, incoming)) // words
+        self._take_in(incoming, come, words)
+        particles.make_room(come)
+        self._place.reserve(count + come, count)
+        self._come.value = come
+        self._fetch(positions_only=positions_only)
+        self._unpacking.run(positions_only, variant=positions_only)
+        self._send()
+        return come
+
+    def settle(self, come: int) -> tuple[int, int, np.ndarray]:
+        """Put ghosts behind this rank's particles, after `exchange` of all columns.
+
+        Args:
+            come: what `exchange` has returned.
+
+        Returns:
+            How many are this rank's, how many there are with ghosts, and the numbers of those before this rank's end that are others now.
+        """
+        found = self._found.host
+        most = int(found[0]) + come
+        for buffer in (self._others, self._ghosts):
+            buffer.reserve(most)
+        self._flags.reserve(2 * most)
+        self._moved.reserve(2 * most * (PLACE_WORDS + COLUMN_WORDS * len(COLUMNS)))
+        self._settling.run()
+        self._send()
+        own, end, free = found[:3].tolist()
+        return own, end, self._others.host[:free].astype(np.int64)
+
+    def _take_in(self, incoming: Sequence[np.ndarray], come: int, words: int) -> None:
+        self._incoming.reserve(come * words)
+        if come:
+            np.concatenate(incoming, out=self._incoming.host[: come * words])
+
+    def _fetch(self, *, positions_only: bool) -> None:
+        """Copy columns from a GPU."""
+        if self._particles.grid.device.is_cuda:
+            arrays = self._particles.arrays()
+            names = ["position"] if positions_only else list(arrays)
+            self._copies = {name: wp.array(arrays[name].numpy(), dtype=wp.vec3, device="cpu") for name in names}
+
+    def _send(self) -> None:
+        """Send the copies back."""
+        for name, column in self._copies.items():
+            self._particles.arrays()[name].assign(column)
+
+    def _columns(self, positions_only: bool = False) -> dict[str, wp.array[Any] | None]:
+        """Return the columns in the host's memory."""
+        arrays = self._copies or self._particles.arrays()
+        return dict.fromkeys(COLUMNS) | ({"position": arrays["position"]} if positions_only else arrays)
+
+    def _launch_search(self) -> None:
+        position = self._columns(positions_only=True)["position"]
+        numbers = {**self._bounds, "count": self._count, "ends": sum(self._ends)}
+        self._bind(FIND_BORDER, self._placed | numbers | self._border_found | {"position": position})
+
+    def _launch_packing(self, positions_only: bool) -> None:
+        end_x, end_y, end_z = map(float, self._end)
+        given = {"message": self._outgoing.array, "offsets": self._offsets.array, "place": self._place.array}
+        numbers = {"ends": sum(self._ends), "around": bool(self.part.decomposition.joined), "end_x": end_x, "end_y": end_y, "end_z": end_z}
+        self._bind(PACK, given | numbers | self._border_found | self._columns(positions_only))
+
+    def _launch_unpacking(self, positions_only: bool) -> None:
+        given = {"message": self._incoming.array, "found": self._found.array, "place": self._place.array}
+        self._bind(UNPACK, given | self._columns(positions_only) | {"count": self._count, "come": self._come})
+
+    def _launch_settling(self) -> None:
+        given = {"message": self._moved.array, "others": self._others.array, "ghosts": self._ghosts.array, "flags": self._flags.array}
+        given |= {"place": self._place.array, "count": self._count, "come": self._come}
+        self._bind(SETTLE, self._placed | self._bounds | self._border_found | given | self._columns())
+
+    @property
+    def _border_found(self) -> dict[str, wp.array[Any]]:
+        return {"boxes": self._boxes.array, "border": self._border.array, "cells": self._cells.array, "found": self._found.array}
+
+    @property
+    def _placed(self) -> dict[str, Any]:
+        placement = self.part.grid.placement
+        return {name: getattr(placement, name) for name in ("planes", "dx", "inverse_dx", "before_x", "before_y", "before_z")}
+
+    def _bind(self, kernel: Any, given: dict[str, Any]) -> None:
+        kernel.bind(Rows.entries(1, self._device), **given).launch()
+
+
+def bounds_of(part: Subdomain) -> dict[str, float]:
+    """Return what tells the side of a rank's box from the other, for kernels: sides that are not cut have no end."""
+    bits = [[part.cuts >> 2 * axis + side & 1 for axis in range(3)] for side in range(2)]
+    low = [box + 1 if cut else -ENDLESS for box, cut in zip(part.box.low, bits[0], strict=True)]
+    high = [box + 1 if cut else ENDLESS for box, cut in zip(part.box.high, bits[1], strict=True)]
+    names = ("low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
+    return {**dict(zip(names, map(float, low + high), strict=True)), "reach": float(REACH)}
+
+
+def beyond(counts: Sequence[int], spacing: float) -> np.ndarray:
+    """Return the least coordinates [m] for which kernels find the cell beyond the last along x, y, z, float32."""
+    one, inverse = np.float32(1.0), np.float32(1.0 / spacing)
+    end = np.array(counts, dtype=np.float32) * np.float32(spacing)
+    while (short := end * inverse + one < np.array(counts, dtype=np.float32) + one).any():
+        end[short] = np.nextafter(end[short], np.float32(np.inf))
+    return end
+
+
+def _corners(box: CellBox) -> list[Sequence[int]]:
+    return [box.low, box.high]
