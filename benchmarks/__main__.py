@@ -11,8 +11,9 @@ from pathlib import Path
 from warp_lcp.benchmarks.harness.timing import Options
 
 SUITES = (
-    "kernels", "solvers", "published", "scaling", "tank", "threads", "devices", "domains", "ranks", "peers", "sparse", "run", "host",
-    "sand", "contacts", "book", "models", "tradeoff", "validation", "extremes",
+    "kernels", "solvers", "choose", "published", "scaling", "tank", "threads", "devices",
+    "domains", "ranks", "peers", "sparse", "run", "host", "sand", "contacts", "book", "models",
+    "tradeoff", "validation", "extremes",
 )  # fmt: skip
 
 

@@ -94,6 +94,13 @@ SOLVERS = Suite(
     "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy; every method on small problems",
     "7 minutes",
 )
+CHOOSE = Suite(
+    "choose",
+    "rules of wl.recommend on random problems: how often a rule's method solves, its time over the best method's, its alternatives",
+    "6 minutes",
+    False,
+    seeded=True,
+)
 PUBLISHED = Suite(
     "published",
     "published methods for the pressure LCP, as published and as implemented here, on the same splash: iterations and seconds",

@@ -6,8 +6,8 @@ import scipy.sparse
 
 import warp_lcp as wl
 from oracle import natural_residual
-from recommendation_problems import FAMILIES, KINDS, draw, make
 from warp_lcp import gallery
+from warp_lcp.benchmarks.choose_problems import FAMILIES, KINDS, draw, make
 from warp_lcp.gallery.contact_models import BoxedModel
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING
 from warp_lcp.gallery.contact_stepper import ContactStepper

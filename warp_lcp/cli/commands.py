@@ -346,7 +346,7 @@ def bench(
     ] = Engine.SINGLE,
     seed: Annotated[
         int | None,
-        typer.Option(metavar="N", help="First seed of the random problems of the suite extremes. Default: new seeds.", show_default=False),
+        typer.Option(metavar="N", help="First seed of random problems, for choose and extremes. Default: the suite's.", show_default=False),
     ] = None,
     compare: Annotated[
         tuple[Path, Path] | None,

@@ -1,6 +1,6 @@
-"""Random problems that a recommendation is learned from and tried on: a family, a seed, and everything else follows.
+"""Random problems by kind and seed, on which rules of `wl.recommend` are measured and tested.
 
-Sizes are spread evenly in their logarithm; shares, conditions, bounds and the accuracy asked for are chosen by the seed as well.
+Sizes are spread evenly in their logarithm. The seed chooses shares, conditions, bounds and the accuracy, too.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ def membrane(rng: np.random.Generator) -> wl.LCP:
     return wl.LCP(A, b, 0.0, float(rng.uniform(0.05, 0.3)) if rng.random() < 0.5 else np.inf)
 
 
-KINDS: dict[str, Make] = {  # plain problems of many fields, all of which have solutions
+KINDS: dict[str, Make] = {  # problems of many fields; all have solutions
     "pressure": lambda r, s: liquid(r, 32),
     "membrane": lambda r, s: membrane(r),
     "low rank": lambda r, s: low_rank(r, 0.0),
@@ -290,8 +290,60 @@ KINDS: dict[str, Make] = {  # plain problems of many fields, all of which have s
 }
 
 
+def sign_error(rng: np.random.Generator, low: int, high: int) -> wl.LCP:
+    """Return -A of a definite A without upper bounds: no descent method can solve it."""
+    n = between(rng, low, high)
+    A = scipy.sparse.diags_array([1.0, -4.0, 1.0], offsets=[-1, 0, 1], shape=(n, n))
+    return wl.LCP(scipy.sparse.csr_array(A), rng.standard_normal(n))
+
+
+def negative_diagonal(rng: np.random.Generator, seed: int, *, boxed: bool) -> Problem:
+    """Return a dense random matrix with some negative diagonal entries, and a planted solution."""
+    n = between(rng, 5, 40)
+    A = rng.standard_normal((n, n)) + np.diag(np.where(rng.random(n) < 0.2, -1.0, 3.0) * n**0.5)
+    A[0, 0] = -1.0
+    return planted(A, np.random.default_rng(seed), Plant(active=0.4, boxed=boxed), name="negative diagonal", facts=frozenset())
+
+
+def wind(rng: np.random.Generator) -> wl.LCP:
+    """Return upwind convection and diffusion on a grid above an obstacle: an unsymmetric stencil."""
+    m, peclet = between(rng, 16, 128), 10.0 ** float(rng.uniform(-1, 2))
+    stencil = np.array([[0.0, -1.0, 0.0], [-1.0 - peclet, 4.0 + 2 * peclet, -1.0], [0.0, -1.0 - peclet, 0.0]])
+    A = wl.Stencil(np.full((m, m), wl.FLUID), stencil, outside=wl.AIR, device=DEVICE, dtype=wp.float64)
+    return wl.LCP(A, (1.0 + peclet) / m * rng.uniform(-2, 1, (m, m)))
+
+
+def dominant(rng: np.random.Generator, seed: int) -> Problem:
+    """Return a random sparse matrix whose diagonal is two to four times the rest of its row: sweeps converge fast."""
+    n, filler = between(rng, 300, 20000), np.random.default_rng(seed)
+    R = scipy.sparse.random_array((n, n), density=5 / n, rng=filler)
+    R.data -= 0.5
+    A = scipy.sparse.csr_array(R + scipy.sparse.diags_array(np.abs(R).sum(axis=1) * float(rng.uniform(2, 4)) + 0.05))
+    return planted(A, filler, plant(rng), name=f"dominant {n}", facts=frozenset({"p-matrix", "positive-diagonal"}))
+
+
+def large_game(rng: np.random.Generator) -> wl.LCP:
+    """Return a matrix game and its dual, a skew LCP, dense, with 410 to 500 unknowns."""
+    n = int(rng.integers(205, 250))
+    payoff = rng.uniform(1, 2, (n, n))
+    A = np.block([[np.zeros((n, n)), payoff], [-payoff.T, np.zeros((n, n))]])
+    return wl.LCP(A, np.concatenate([-np.ones(n), np.ones(n)]))
+
+
+RARE: dict[str, Make] = {  # for rules that no kind above meets; sign errors may have no solution
+    "sign error": lambda r, s: sign_error(r, 10, 500),
+    "large sign error": lambda r, s: sign_error(r, 1001, 3000),
+    "negative diagonal": lambda r, s: negative_diagonal(r, s, boxed=False),
+    "negative diagonal, boxed": lambda r, s: negative_diagonal(r, s, boxed=True),
+    "wind": lambda r, s: wind(r),
+    "large game": lambda r, s: large_game(r),
+    "dominant": dominant,
+}
+
+
 def draw(kind: str, seed: int) -> wl.LCP:
-    """Return a problem of a kind."""
-    number = 1000 * list(KINDS).index(kind) + seed
-    made = KINDS[kind](np.random.default_rng([number, 333]), number)
+    """Return a problem of a kind of KINDS or RARE."""
+    made_by = {**KINDS, **RARE}
+    number = 1000 * list(made_by).index(kind) + seed
+    made = made_by[kind](np.random.default_rng([number, 333]), number)
     return made if isinstance(made, wl.LCP) else made.lcp(device=DEVICE)

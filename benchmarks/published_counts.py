@@ -1,0 +1,253 @@
+"""Published iteration counts of named methods on problems that can be rebuilt exactly, and the counts of the methods here.
+
+Each runs with the settings, the start and the stopping rule of its source, in double precision; see `docs/published-methods.md`.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.benchmarks.book import appendix_c
+from warp_lcp.benchmarks.book.outcome import outcome
+from warp_lcp.benchmarks.book.problems import Scale, kinds
+from warp_lcp.gallery import Problem, ball_obstacle, journal_bearing
+from warp_lcp.gallery.obstacle import membrane_height
+
+WITHIN = 2  # iterations by which a count may differ
+P4PDES, DEALII, PERMON, BOOK = "p4pdes", "deal.II step-41", "PERMON", "[Book] table C.2"
+LEVELS = (17, 33, 65, 129, 257)  # nodes a side
+NEWTON: dict[str, Any] = {"monotone_cycles": 0, "eta": 1e-5, "precision": "double"}  # PETSc's tolerance of linear systems
+REDUCED = wl.MinimumMapNewton(safeguard=False, **NEWTON)
+SEMISMOOTH = wl.FischerNewton(safeguard=False, fischer_weight=1.0, **NEWTON)
+SOLVED = 1e-8  # PETSc's relative tolerance
+AT_BOUND = 1e-8  # from the bound, where PETSc's active set ends
+
+
+@dataclass(frozen=True)
+class Count:
+    """Published numbers of iterations and the function that counts them here.
+
+    Attributes:
+        method: name in `wl.METHODS`.
+        problem: problem, grids and start.
+        printed: the published numbers.
+        source: where they were read.
+        measure: counts iterations here, a number for each printed one.
+        reason: why a number here differs by more than WITHIN; empty: none does.
+        slow: whether that takes seconds.
+    """
+
+    method: str
+    problem: str
+    printed: tuple[float, ...]
+    source: str
+    measure: Callable[[], tuple[float, ...]]
+    reason: str = ""
+    slow: bool = False
+
+    def row(self, here: Sequence[float]) -> str:
+        """Return the row of docs/published-methods.md with the counts found here."""
+        printed, found = (", ".join(f"{n:.4g}" for n in numbers) for numbers in (self.printed, here))
+        return f"| `{self.method}` | {self.problem} | {printed} | {found} | {self.source} |"
+
+
+Small = Callable[[np.ndarray, np.ndarray], float]  # a norm of x and y, fields of the problem's shape
+
+
+def steps_until(
+    problem: wl.LCP, method: Any, norm: Small, tolerance: float, *, relative: bool = True, x0: np.ndarray | None = None
+) -> wl.SolveResult:
+    """Solve until a norm of (x, y) is at most `tolerance`, or that times its first value.
+
+    Raises:
+        RuntimeError: the method ends before.
+    """
+    work, norms = method.init(problem), list[float]()
+    unknown, b = (problem.layout.unload(stored).numpy() for stored in (problem.unknown, problem.b))
+
+    def look(record: wl.Record) -> None:
+        x = problem.layout.unload(work.x).numpy().astype(np.float64)
+        y = problem.A.apply(wp.array(x, dtype=wp.float64, device=problem.device)).numpy() + b
+        norms.append(norm(x, np.where(unknown == 1, y, 0.0)))
+        if norms[-1] <= tolerance * (norms[0] if relative else 1.0):
+            raise StopIteration
+
+    stopping = wl.StoppingCriteria(rtol=0.0, max_iterations=1000, patience=1000)
+    result = wl.solve(problem, method, x0=x0, stopping=stopping, workspace=work, callback=look)
+    if result.status is not wl.SolveStatus.STOPPED:
+        raise RuntimeError(f"{type(method).__name__} ends {result.status.name} at {norms[-1]:.1e}")
+    return result
+
+
+def reduced_norm(lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
+    """Return the norm of y off the active set (PETSc's SNESVINEWTONRSLS)."""
+    return float(np.linalg.norm(np.where((x <= lower + AT_BOUND) & (y > 0), 0.0, y)))
+
+
+def fischer_norm(lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
+    """Return the norm of the Fischer-Burmeister map of x - l and y (PETSc's SNESVINEWTONSSLS)."""
+    a = np.where(np.isfinite(lower), x - lower, 0.0)
+    return float(np.linalg.norm(a + y - np.hypot(a, y)))
+
+
+def projected_gradient_norm(lower: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
+    """Return the norm of the projected gradient: y off the bound, min(y, 0) at it."""
+    return float(np.linalg.norm(np.where(x > lower, y, np.minimum(y, 0.0))))
+
+
+@cache
+def hemisphere(n: int) -> Problem:
+    """Return PETSc's ex9.c: a ball obstacle whose height beyond r^2 = 0.9 is linear in r^2."""
+    s = np.linspace(-2, 2, n)
+    square = s[:, None] ** 2 + s**2
+    edge, height = 0.9, (1 - 0.9**2) ** 0.5
+    psi = np.where(square <= edge, np.sqrt(np.maximum(1 - square, 0)), height - edge / height * (square - edge))
+    return replace(ball_obstacle(n, device="cpu", dtype=wp.float64), lower=np.pad(psi[1:-1, 1:-1], 1))
+
+
+def _membrane(n: int, method: Any, norm: Any, x0: np.ndarray | None = None) -> wl.SolveResult:
+    problem = hemisphere(n)
+    return steps_until(problem.lcp(), method, partial(norm, np.asarray(problem.lower)), SOLVED, x0=x0)
+
+
+def cold_membrane(method: Any, norm: Any, levels: Sequence[int] = LEVELS) -> tuple[float, ...]:
+    """Return the iterations by grid from x = max(0, psi)."""
+    return tuple(_membrane(n, method, norm).iterations for n in levels)
+
+
+def sequenced_membrane(method: Any, norm: Any) -> tuple[float, ...]:
+    """Return the iterations by grid, each started from the bilinear interpolant of the coarser solution, 5^2 nodes first."""
+    counts, x, n = dict[int, float](), None, 5
+    while n <= LEVELS[-1]:
+        result = _membrane(n, method, norm, x)
+        counts[n] = result.iterations
+        s = np.linspace(-2, 2, n)
+        u = membrane_height(np.hypot(s[:, None], s))
+        u[1:-1, 1:-1] = result.x.numpy()[1:-1, 1:-1]
+        x, n = _refined(u), 2 * n - 1
+    return tuple(counts[n] for n in LEVELS)
+
+
+def _refined(u: np.ndarray) -> np.ndarray:
+    """Return the bilinear interpolant on the grid of half the spacing."""
+    n = len(u)
+    v = np.zeros((2 * n - 1, 2 * n - 1))
+    v[::2, ::2] = u
+    v[1::2, ::2] = (u[1:] + u[:-1]) / 2
+    v[:, 1::2] = (v[:, 2::2] + v[:, :-1:2]) / 2
+    return v
+
+
+def stairs_problem() -> tuple[wl.LCP, np.ndarray]:
+    """Return deal.II's step-41 and its obstacle: bilinear elements on 128^2 cells of [-1, 1]^2, load -10, u >= a stair of four steps."""
+    n = 129
+    x = np.linspace(-1, 1, n)
+    stair = np.broadcast_to(np.select([x < -0.5, x < 0.0, x < 0.5], [-0.2, -0.4, -0.6], -0.8), (n, n))
+    cells = np.pad(np.full((n - 2, n - 2), wl.FLUID), 1, constant_values=wl.AIR)
+    element = np.full((3, 3), -1 / 3)
+    element[1, 1] = 8 / 3
+    A = wl.Stencil(cells, element, outside=wl.AIR, device="cpu", dtype=wp.float64)
+    load = 10 * (2 / (n - 1)) ** 2
+    return wl.LCP(A, np.where(cells == wl.FLUID, load, 0.0), np.where(cells == wl.FLUID, stair, 0.0)), stair
+
+
+ACTIVE_SET = wl.PrimalDualActiveSet(monotone_cycles=0, eta=1e-3, precision="double")
+
+
+def stairs() -> tuple[float, ...]:
+    """Return the linear solves of the active set method on the stairs until the set stays the same.
+
+    An unknown is active where y > c h^2 (u - g), c = 100. The first solve has no active unknown.
+    """
+    problem, stair = stairs_problem()
+    weight = 100 * (2 / (len(stair) - 1)) ** 2
+    sets = [np.zeros(stair.shape, dtype=bool)]
+
+    def change(u: np.ndarray, y: np.ndarray) -> float:
+        sets.append(np.pad((y > weight * (u - stair))[1:-1, 1:-1], 1))
+        return 1.0 if len(sets) == 2 else float(np.count_nonzero(sets[-1] ^ sets[-2]))  # the start is no iterate
+
+    return (steps_until(problem, ACTIVE_SET, change, 0.0, relative=False).iterations,)
+
+
+def string_problem() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return A, b, the obstacle and the tolerance of PERMON's ex1.c: a string above a sine, 100 nodes."""
+    n = 100
+    h, i = 1 / (n - 1), np.arange(1, n - 1)
+    A = 2 * np.eye(n - 2) - np.eye(n - 2, k=1) - np.eye(n - 2, k=-1)
+    return A, np.full(n - 2, 30 * h**2), np.sin(4 * np.pi * i * h - np.pi / 6) / 2 - 2, 1e-5
+
+
+def bearing_problem(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return A, b, the bound and the tolerance of PERMON's jbearing2.c: a journal bearing of eccentricity 0.1."""
+    problem = journal_bearing(nx, ny, device="cpu").dense()
+    return problem.A, problem.b, np.asarray(problem.lower), 1e-6
+
+
+def gradient_steps(A: Any, b: np.ndarray, lower: np.ndarray, tolerance: float) -> float:
+    """Return MPRGP's steps to a projected gradient of `tolerance` times b; proportioning steps count apart, as in PERMON."""
+    norm = partial(projected_gradient_norm, lower)
+    method = wl.MPRGP(precision="double", monotone_cycles=0)
+    return steps_until(wl.LCP(A, b, lower), method, norm, tolerance * float(np.linalg.norm(b)), relative=False).linear_iterations
+
+
+def string() -> tuple[float, ...]:
+    """Return MPRGP's steps on the string."""
+    return (gradient_steps(*string_problem()),)
+
+
+def bearings(*sizes: tuple[int, int]) -> tuple[float, ...]:
+    """Return MPRGP's steps on journal bearings."""
+    return tuple(gradient_steps(*bearing_problem(*size)) for size in sizes)
+
+
+def recipe(kind: str, method: str, problems: int) -> tuple[float, ...]:
+    """Return the mean iterations by the book's tests on its random problems."""
+    solver, merit = appendix_c.METHODS[method]
+    make = kinds(Scale(problems, 10, 30, 100, (16,), (2,), 40))[kind]
+    found = outcome(method, [make(k) for k in range(problems)], solver, merit, "cpu")
+    return (statistics.fmean(found.accepted),)
+
+
+NEWTON_NAME, FISCHER_NAME, FLUID = "minimum-map-newton", "fischer-newton", "fluid, recipe"
+SCALED = "the map is scaled by A_ii here; unscaled, NumPy takes 11 steps on the first"
+JACOBI = "preconditioned by the diagonal here, which varies; without, NumPy takes 119"
+HALF_STEP = "the whole step is projected here; with a half step and a fixed step NumPy takes 184, or 181 if that is 0.5 % longer"
+GMRES = "the map is scaled by an equilibration of A here, random numbers and linear solver differ; not explained in full"
+COUNTS: tuple[Count, ...] = (
+    Count(NEWTON_NAME, "hemisphere, 17^2 to 257^2", (3, 6, 7, 12, 21), P4PDES, partial(cold_membrane, REDUCED, reduced_norm)),
+    Count(NEWTON_NAME, "the same, from the coarser grid", (3, 4, 2, 2, 3), P4PDES, partial(sequenced_membrane, REDUCED, reduced_norm)),
+    Count(FISCHER_NAME, "hemisphere, 17^2, 33^2", (7, 11), P4PDES, partial(cold_membrane, SEMISMOOTH, fischer_norm, (17, 33))),
+    Count(
+        FISCHER_NAME, "hemisphere, 65^2 to 257^2", (11, 16, 25), P4PDES,
+        partial(cold_membrane, SEMISMOOTH, fischer_norm, (65, 129, 257)), SCALED,
+    ),
+    Count(
+        FISCHER_NAME, "hemisphere, 17^2 to 257^2, from the coarser grid", (5, 8, 6, 6, 7), P4PDES,
+        partial(sequenced_membrane, SEMISMOOTH, fischer_norm),
+    ),
+    Count("primal-dual-active-set", "stairs, 129^2", (19,), DEALII, stairs),
+    Count("mprgp", "string, 100, projected expansion", (160,), PERMON, string),
+    Count("mprgp", "string, 100, half step and fixed step", (181,), PERMON, string, HALF_STEP),
+    Count("mprgp", "journal bearing, 8 x 12, 10 x 16", (23, 34), PERMON, partial(bearings, (8, 12), (10, 16))),
+    Count("mprgp", "journal bearing, 30 x 30", (119,), PERMON, partial(bearings, (30, 30)), JACOBI),
+    Count(FISCHER_NAME, "random fluid, 1000", (5.0,), BOOK, partial(recipe, FLUID, "Fischer-Newton", 20)),
+    Count(NEWTON_NAME, "random fluid, 1000", (4.07,), BOOK, partial(recipe, FLUID, "minimum map", 20)),
+    Count("psor", "random fluid, 1000, omega = 1.4", (25.29,), BOOK, partial(recipe, FLUID, "PSOR 1.4", 100), slow=True),
+    Count("psor", "random fluid, 1000, omega = 1", (49.38,), BOOK, partial(recipe, FLUID, "PGS", 100), slow=True),
+    Count(FISCHER_NAME, "random contacts, 180", (14.54,), BOOK, partial(recipe, "contact, recipe", "Fischer-Newton", 20), GMRES),
+)  # fmt: skip
+
+
+if __name__ == "__main__":  # the table of docs/published-methods.md
+    for count in COUNTS:
+        sys.stdout.write(f"{count.row(count.measure())}\n")
