@@ -158,7 +158,7 @@ def _collapse(size: int, model: str, options: Options) -> Record:
     good = [row["coupled_residual"] <= TOLERANCE for row in rows]
     figures = {
         "seconds_per_step": Figure(seconds / len(rows), "s"),
-        "iterations": Figure(float(np.mean([row["solve_iterations"] for row in rows]))),
+        "iterations": Figure(float(np.mean([row["staggering_iterations"] for row in rows]))),
         "share_converged": Figure(float(np.mean(good))),
         "runout": Figure(rows[-1]["runout"] / 0.25),
         "max_speed": Figure(rows[-1]["max_speed"], "m/s"),
@@ -177,7 +177,7 @@ def _steps(name: str, scene: SandScene, options: Options) -> Record:
         row = _step(simulation)
         if number > 0:
             seconds.append(time.perf_counter() - begun)
-            iterations.append(float(row["solve_iterations"]))
+            iterations.append(float(row["staggering_iterations"]))
     figures = {"seconds": Figure.of(seconds, "s"), "iterations": Figure.of(iterations), "particles": Figure(simulation.particles.count)}
     return Record(f"steps: {name}", figures)
 

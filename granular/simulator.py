@@ -57,7 +57,7 @@ FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as 
 JAMMED = "solids or a source may enclose sand: move them less or slower; deep sand may need more solver.max_iterations"
 STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
 DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # columns that nothing else needs
-COLUMNS = ("coupled_residual", *DIAGNOSTICS, "max_fraction", "runout", "height")
+COLUMNS = ("coupled_residual", "staggering_iterations", *DIAGNOSTICS, "max_fraction", "runout", "height")
 
 
 class SandSimulation(ParticleSimulation):
@@ -206,10 +206,10 @@ class SandSimulation(ParticleSimulation):
         """Return the log columns of stresses and shape of the sand.
 
         coupled_residual: natural residual of pressure and friction together, root mean square over the cells with sand, in units of
-        rho g dx; solve_residual: relative to that at the start of the solve; yielded, dissipation, predicted_excess: see
-        `SandReport.report`; max_fraction: of a cell at the start of the step, in units of the densest packing; runout [m]:
-        99th percentile of x less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s; kg/(s m) in 2-D]: mass below
-        the gauge, or without a gauge the mass that left through drains and open sides.
+        rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded,
+        dissipation, predicted_excess: see `SandReport.report`; max_fraction: of a cell at the start of the step, in units of
+        the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s;
+        kg/(s m) in 2-D]: mass below the gauge, or without a gauge the mass that left through drains and open sides.
         """
         columns = tuple(name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS)
         return (*columns, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else columns
@@ -362,6 +362,7 @@ class SandSimulation(ParticleSimulation):
             "solve_iterations": solved.iterations,
             "solve_residual": residual / first if first > 0.0 else 0.0,
             "coupled_residual": residual,
+            "staggering_iterations": solved.iterations,
         }
 
     def _begin_bodies(self) -> None:

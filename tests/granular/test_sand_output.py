@@ -33,7 +33,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_log_has_the_columns_of_sand(folder: Path) -> None:
     with open(folder / "log.csv", newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    for name in ("coupled_residual", "yielded", "dissipation", "predicted_excess", "max_fraction", "runout", "height"):
+    for name in (
+        "coupled_residual",
+        "staggering_iterations",
+        "yielded",
+        "dissipation",
+        "predicted_excess",
+        "max_fraction",
+        "runout",
+        "height",
+    ):
         assert all(np.isfinite(float(row[name])) for row in rows)
     assert {row["solver"] for row in rows} == {"accelerated-projection"}
     assert float(rows[-1]["runout"]) > float(rows[0]["runout"])
