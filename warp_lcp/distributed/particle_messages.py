@@ -123,7 +123,7 @@ class ParticleMessages:
         inside = self._found.host[1 : 1 + sum(self._ends)]
         self._outgoing.reserve(words * int(inside.sum()))
         self._packing.run(positions_only, variant=positions_only)
-        sizes = words * np.add.reduceat(inside, np.cumsum([0, *self._ends[:-1]])) if len(inside) else []
+        sizes: Any = words * np.add.reduceat(inside, np.cumsum([0, *self._ends[:-1]])) if len(inside) else []
         messages = np.split(self._outgoing.host[: sum(sizes)], np.cumsum(sizes)[:-1]) if len(inside) else []
         incoming = self.part.mailbox.swap(dict(zip(self._neighbors, messages, strict=False)))
         incoming += messages[len(self._neighbors) :]

@@ -400,5 +400,5 @@ class HostMap:
         n, data = len(x), self.data
         reals = (x, y, self.d, data.lower, data.upper, *self._element)
         share = 1.0 if smoothing else self.share
-        numbers = {"share": share, "over": 1 / self.scale, "kinks": KINK * self.scale, "twice_mu": 2 * smoothing}
+        numbers: dict[str, Any] = {"share": share, "over": 1 / self.scale, "kinks": KINK * self.scale, "twice_mu": 2 * smoothing}
         return HOST.run(reals, (), tasks=n, count=n, **numbers)[1]
