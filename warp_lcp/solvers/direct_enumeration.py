@@ -1,7 +1,5 @@
 """Direct enumeration of the active sets of tiny problems, one at a time or in batches."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
