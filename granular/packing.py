@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
 from warp_lcp.rows.layout import put
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch, perform
+from warp_lcp.rows.program import Launch, LaunchGraph, clear, launch
 from warp_lcp.rows.readings import Reading
 
 if TYPE_CHECKING:
@@ -75,7 +74,7 @@ class Packing:
         more = 1 if grid.dimension == 3 else 0
         self.nodes = Window(low, (high[0] + more, high[1] + 1, high[2] + 1), grid.device)
         self.counted = grid.part.owned
-        self._forest: Any = None  # of this step's sand, on ranks
+        self._forest: Any = None  # of this step's sand, on ranks; the same object in all steps, which recorded exchanges read
         self.strained, self.moved, self.stressed = self._around(0, 1), self._around(1, 1), self._around(1, 2)
         self._known = grid.part.stored
         self._rows = wp.zeros((2, *grid.shape[:2]), dtype=wp.float64, device=grid.device)  # count, largest fraction of each row
@@ -97,9 +96,12 @@ class Packing:
         self._rate.value = self.grid.spacing / dt
         self._update.run(density, velocity, solid, variant=tuple(field.ptr for field in (density, *velocity, *solid)))
         self._found.changed()
-        if self._forest is not None:
-            self._forest.free()
-            self._forest = None
+
+    def find_ghosts(self, layers: int) -> None:
+        """Find the ghost cells with sand that `join` fills in fields of so many layers of stresses; collective."""
+        if self.grid.part.across is not None:
+            sand = self.flags.numpy() != 0
+            self._forest = self.grid.part.forest(layers, REACH, which=sand, into=self._forest)
 
     @property
     def sand_cells(self) -> int:
@@ -164,20 +166,14 @@ class Packing:
         return window.common(self.nodes) or self.nodes
 
     def join(self, stress: wp.array, *, launch: Launch = launch) -> None:
-        """Fill `REACH` layers of ghost cells of a field of stresses; collective.
+        """Fill `REACH` layers of ghost cells of a field of stresses, after `find_ghosts`; collective.
 
         Also the cells beyond periodic sides. Cells without sand have stresses of 0 on all ranks.
         """
-        if self.grid.part.across is not None:
-            perform(partial(self._fill, stress), launch)
+        if self._forest is not None:
+            self.grid.part.filling(stress, forest=self._forest).launch(launch)
         if self.sides is not None:
             self.sides.wrap(stress, launch=launch)
-
-    def _fill(self, stress: wp.array) -> None:
-        part = self.grid.part
-        if self._forest is None:
-            self._forest = part.forest(stress.shape[0], REACH, which=self.flags.numpy() != 0)
-        part.fill(stress, forest=self._forest)
 
     @property
     def fields(self) -> SandFields:

@@ -100,7 +100,7 @@ class SandSimulation(ParticleSimulation):
         scene, self.solids = self.scene, parts.solids
         self._base, self.density = grid.field(wp.int8), grid.field()
         self._completion, self._density_to_grid = (
-            LaunchGraph(grid.device, record, at_once=grid.part.shared) for record in (self._launch_completion, self._launch_density)
+            LaunchGraph(grid.device, record, at_once=grid.part.at_once) for record in (self._launch_completion, self._launch_density)
         )
         self.packing = Packing(grid, self._base, self.boundary.capacity, sides=self.sides, cut=self.solids.cut)
         self.carried = None if self.bodies is None else SandBodies(grid, self.bodies.numbers)
@@ -323,7 +323,7 @@ class SandSimulation(ParticleSimulation):
         """Solve for the stresses and take over the velocity that they leave; return what the log wants to know of the solve."""
         packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
         with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
-            self._density_to_grid.run(window, variant=window.near is None)
+            self._density_to_grid.run(window, variant=(window.near is None, self.particles.runs is None))
             solids.begin_step(self.time, dt)
             if self.sources is not None:
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, self._base)

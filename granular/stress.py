@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import warp as wp
@@ -23,16 +22,18 @@ from warp_lcp.granular.stress_kernels import (
     REST,
     SHARE,
     STATE,
+    keep_step_kernel,
     momentum_kernel,
     numbers_kernel,
+    period_kernel,
     stress_passes,
 )
 from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
 from warp_lcp.grid.staggered import three_components
 from warp_lcp.rows import Rows
 from warp_lcp.rows.memory import Scalar
-from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch, launch_now, perform
-from warp_lcp.rows.vectors import Reduction
+from warp_lcp.rows.program import Launch, LaunchGraph, Program, copy, launch, launch_now
+from warp_lcp.rows.vectors import Reduction, add_across
 from warp_lcp.settings import renamed_method
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
@@ -153,8 +154,9 @@ class Stress(wl.VariationalInequality):
         self.momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
         self.total = self._sums if self._across is None else wp.zeros_like(self._sums)  # of all processes
+        self.counts = wp.zeros(1, dtype=wp.float64, device=grid.device) if self.shared else packing.counts  # `cells`, for kernels
         self._nothing = wp.zeros_like(self._sums)
-        self._found = np.zeros((PERIOD, 2 * COLUMNS))  # by the steps of a period on this rank
+        self._found = wp.zeros((PERIOD, 2 * COLUMNS), dtype=wp.float64, device=grid.device)  # by the steps of a period
         threads = int(np.prod(packing.grid.shape[:2])) * packing.counted.cells.chunks
         self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
         self._wall_sums: Reduction | None = None
@@ -168,7 +170,7 @@ class Stress(wl.VariationalInequality):
         self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # as before `begin`
         self._ratio = Scalar()  # of the time for which forces act to that in the last step
         self._admitting, self._restarting = (
-            LaunchGraph(grid.device, record, at_once=self.shared) for record in (self._launch_admission, self.start_from_now)
+            LaunchGraph(grid.device, record, at_once=grid.part.at_once) for record in (self._launch_admission, self.start_from_now)
         )
         self.set_walls(walls)
 
@@ -199,7 +201,10 @@ class Stress(wl.VariationalInequality):
         if self.packing.grid.device.is_cuda:
             for number, value in zip(self._yields, (*before, *after), strict=True):
                 number.value = value
-        self._cells = max(self._count(), 1) if self.shared else None
+        self._cells = None
+        if self.shared:
+            self.packing.find_ghosts(self.now.shape[0])
+            self.counts.fill_(self.cells)
         self.cold = kick_dt > GROWN * self.kick_dt
         self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
         self._admitting.run()
@@ -320,28 +325,12 @@ class Stress(wl.VariationalInequality):
         if self._across is None:
             self._choose_momentum(self.total, launch)
             return
-        perform(partial(self._keep, step), launch)
-        last = step == PERIOD - 1
+        device, last = self.packing.grid.device, step == PERIOD - 1
+        launch(keep_step_kernel, 2 * COLUMNS, [self._sums, self._found, step], device=device)
         if last:
-            perform(self._share_period, launch)
+            add_across(self._across, self._found.flatten(), slice(None), launch)
+            launch(period_kernel, COLUMNS, [self._found, self.total], device=device)
         self._choose_momentum(self.total if last else self._nothing, launch)
-
-    def _keep(self, step: int) -> None:
-        self._found[step] = self._sums.numpy()
-
-    def _share_period(self) -> None:
-        """Let the sums be those that a period's steps have found on all ranks, as the momentum would have added them up."""
-        assert self._across is not None
-        found = self._across.sum(self._found)
-        found = found[:, :COLUMNS] + found[:, COLUMNS:]
-        found[:, 6:] = np.sqrt(found[:, 6:])
-        total = found.sum(axis=0)
-        total[6:] **= 2  # of which the momentum takes the roots
-        self.total.assign(np.concatenate([total, np.zeros(COLUMNS)]))
-
-    def _share_sums(self) -> None:
-        assert self._across is not None
-        self.total.assign(self._across.sum(self._sums.numpy()))
 
     def _choose_momentum(self, sums: wp.array, launch: Launch) -> None:
         launch(momentum_kernel, 1, [sums, self.momentum], device=self.packing.grid.device)
@@ -389,7 +378,8 @@ class Stress(wl.VariationalInequality):
         """Launch the sums over cells and walls of all processes."""
         self._add_up_here(launch)
         if self._across is not None:
-            perform(self._share_sums, launch)
+            launch(keep_step_kernel, 2 * COLUMNS, [self._sums, self.total.reshape((1, -1)), 0], device=self.packing.grid.device)
+            add_across(self._across, self.total, slice(None), launch)
 
     def _add_up_here(self, launch: Launch) -> None:
         self._cell_sums.add_up(0, COLUMNS, launch=launch)

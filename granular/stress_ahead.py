@@ -25,7 +25,7 @@ class StressAhead:
     reads once. On the CPU a thread team works through the loop as one table.
 
     Args:
-        stress: the problem, in one process.
+        stress: the problem; on ranks, which decide alike by sums over all, on the CPU.
         method: settings of the steps.
     """
 
@@ -41,8 +41,9 @@ class StressAhead:
 
     @staticmethod
     def suits(stress: Stress) -> bool:
-        """Return whether the device can take steps without the host: where loops run on it, in one process."""
-        return not stress.shared and loops_on_device(stress.packing.grid.device)
+        """Return whether the device can take steps without the host: where loops run on it; of ranks, on the CPU."""
+        grid = stress.packing.grid
+        return loops_on_device(grid.device) and not (stress.shared and grid.device.is_cuda)
 
     def begin(self, tolerance: float, most: int) -> None:
         """Evaluate the residual of the stresses as they are, and take steps until it is due again.
@@ -90,7 +91,7 @@ class StressAhead:
         self._loop.extend(period)
         s, method = self._stress, self._method
         check, fields = method.check_every * kernels.PERIOD, [s.momentum, self._decisions.array, self._limits, self._going]
-        inputs = [s.packing.counts, s.numbers, *fields, check, method.patience, method.wait]
+        inputs = [s.counts, s.numbers, *fields, check, method.patience, method.wait]
         self._loop.launch(kernels.decide_kernel, 1, inputs, device=device)
         self._beginning.forget()
         self._resuming.forget()
@@ -100,7 +101,7 @@ class StressAhead:
         s, device = self._stress, self._stress.packing.grid.device
         pressure_step, shear_step, lookahead = self._method.steps(s)
         s.check().run()
-        fields = [s.total, s.packing.counts, s.numbers, s.momentum, self._decisions.array, self._going]
+        fields = [s.total, s.counts, s.numbers, s.momentum, self._decisions.array, self._going]
         given = [pressure_step, shear_step, lookahead, self._method.momentum, MOST_MOMENTUM, *self._given]
         launch(kernels.begin_steps_kernel, 1, [*fields, *given], device=device)
         s.start_from_now()

@@ -93,6 +93,32 @@ def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.f
         state[NEXT_X + block] = wp.min(state[BETA_X + block], (count + wp.float64(1.0)) / (count + wp.float64(4.0)))
 
 
+@forward_kernel(module="granular.momentum")
+def keep_step_kernel(sums: wp.array(dtype=wp.float64), found: wp.array2d(dtype=wp.float64), step: int):
+    """Keep the sums of a step of a period on this rank; a thread a column."""
+    c = wp.tid()
+    found[step, c] = sums[c]
+
+
+@forward_kernel(module="granular.momentum")
+def period_kernel(found: wp.array2d(dtype=wp.float64), total: wp.array(dtype=wp.float64)):
+    """Sums of a period of which the momentum makes those of its steps on all ranks, cells and walls; a thread a column.
+
+    The momentum adds up roots of columns 6 and 7, and takes the root of what it is given.
+    """
+    c = wp.tid()
+    value = wp.float64(0.0)
+    for step in range(PERIOD):
+        part = found[step, c] + found[step, COLUMNS + c]
+        if c >= 6:
+            part = wp.sqrt(part)
+        value += part
+    if c >= 6:
+        value *= value
+    total[c] = value
+    total[COLUMNS + c] = wp.float64(0.0)
+
+
 # Decisions of a solve. Steps: taken, when the estimate was best, when it or the momentum last changed, to be taken at least, at most.
 DONE, BEST_AT, CHANGED, LEAST, MOST = 0, 1, 2, 3, 4
 BEST, AIM, STILL = 5, 6, 7  # [m/s]: least estimate, what it is to fall below, below which `LEAST` does not count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import weakref
 from collections.abc import Sequence
@@ -224,17 +225,27 @@ class StarForest:
         made: the forest, of no use when this is gone.
 
     Attributes:
+        handle: PETSc's handle of it, which recorded exchanges read in each run.
         pairs: units and addresses of roots and leaves that recorded exchanges read, by what they hold.
     """
 
     def __init__(self, made: Any) -> None:
-        self.made, self.free = made, weakref.finalize(self, made.destroy)
+        self.handle, self.free = (ctypes.c_uint64 * 1)(), weakref.finalize(self, made.destroy)
+        self.made = made
+        self.handle[0] = made.handle
         self.pairs: dict[tuple[int, ...], Any] = {}
+
+    def replace(self, made: Any) -> None:
+        """Free the forest and use another one, in recorded exchanges too; collective."""
+        self.free()
+        self.made, self.free = made, weakref.finalize(self, made.destroy)
+        self.handle[0] = made.handle
 
 
 def star_forest(
     ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox], *, filled: CellBox | None = None, layers: int = 1,
     whole: CellBox | None = None, which: np.ndarray | None = None, shifts: Sequence[Triple] = ((0, 0, 0),),
+    into: StarForest | None = None,
 ) -> StarForest:  # fmt: skip
     """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
 
@@ -247,6 +258,7 @@ def star_forest(
         whole: the cells of other fields, in which what each rank knows is wanted, this one too; None: leaves lie among the roots.
         which: of the cells that this rank stores are wanted, bool of their shape (nz, ny, nx); None: all.
         shifts: cells along x, y, z by which what ranks know lies around this one again.
+        into: a forest that this one replaces, see `StarForest.replace`; None: there is none.
     """
     mine, roots = ranks.rank, layers * stored[ranks.rank].cells
     around = whole or stored[mine]
@@ -264,7 +276,10 @@ def star_forest(
                 remotes.append(_remote(rank, there + layer * remote.cells))
     forest = petsc().SF().create(comm=ranks.comm)
     forest.setGraph(roots, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
-    return StarForest(forest)
+    if into is None:
+        return StarForest(forest)
+    into.replace(forest)
+    return into
 
 
 def _elements(box: CellBox, within: CellBox) -> np.ndarray:

@@ -72,14 +72,17 @@ for (int i = 0; i < 2; ++i)
     for (int p = 0; p < count; ++p)
         if (!told[1]) {
             const unsigned long long* pair = pairs + 3*p;
-            told[1] = calls[i]((void*)forest_, (void*)pair[0], (const void*)pair[1], (void*)pair[2], (void*)replace_); }
+            told[1] = calls[i](*(void**)forest_, (void*)pair[0], (const void*)pair[1], (void*)pair[2], (void*)replace_); }
 __atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
 #endif
 """)
 def copy_to_leaves(
     begin_: wp.uint64, end_: wp.uint64, forest_: wp.uint64, pairs_: wp.uint64, replace_: wp.uint64, count: int, told_: wp.uint64
 ):  # fmt: skip
-    """Call PetscSFBcastBegin for each pair, a unit and the addresses of roots and leaves, then PetscSFBcastEnd."""
+    """Call PetscSFBcastBegin for each pair, a unit and the addresses of roots and leaves, then PetscSFBcastEnd.
+
+    `forest_` is the address of the star forest's handle, read in each run.
+    """
 
 
 @wp.func_native("""
@@ -174,7 +177,7 @@ def exchanging_all(forest: StarForest, pairs: Sequence[tuple[np.ndarray, np.ndar
     listed = [(library.units[a.dtype.itemsize].value, a.ctypes.data, b.ctypes.data) for a, b in pairs]
     key = tuple(word & (1 << 64) - 1 for pair in listed for word in pair)
     words = forest.pairs.setdefault(key, (ctypes.c_uint64 * len(key))(*key))
-    given = [*functions, forest.made.handle, ctypes.addressof(words), library.replace.value, len(pairs)]
+    given = [*functions, ctypes.addressof(forest.handle), ctypes.addressof(words), library.replace.value, len(pairs)]
     return _operation(exchange_kernel, given, (forest, words, pairs))
 
 

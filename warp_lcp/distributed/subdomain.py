@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, no_type_check
 
 import numpy as np
@@ -29,7 +30,8 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_pieces import Piece, fields_of
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import is_recording, launch, perform
+from warp_lcp.rows.program import Task, is_recording, launch
+from warp_lcp.rows.team import Operation
 from warp_lcp.rows.vectors import Across, convert
 
 DEFAULT_BALANCE = Balance()
@@ -71,6 +73,21 @@ def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
         launch(copy_kernel, to.shape[:2], [to, source], device=to.device)
     else:
         wp.copy(to, source)
+
+
+def _fill(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> None:
+    """Fill the ghost cells of fields that a star forest has as leaves."""
+    hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
+    exchange_all(forest, [(host, host) for host in hosts])
+    for field, host in zip(fields, hosts, strict=True):
+        if isinstance(field, wp.array) and field.device.is_cuda:
+            field.assign(host)
+
+
+def _filling(forest: StarForest, fields: Sequence[wp.array | np.ndarray]) -> Operation:
+    """Return `_fill` as an operation of the team."""
+    hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
+    return exchanging_all(forest, [(host, host) for host in hosts])
 
 
 class Subdomain(GridPart):
@@ -252,7 +269,9 @@ class Subdomain(GridPart):
         ends = [[n == 0 for n in box.low], [n == count for n, count in zip(box.high, counts, strict=True)]]
         return [[at and axis not in joined for axis, at in enumerate(end)] for end in ends]
 
-    def forest(self, layers: int = 1, width: int | None = None, parts: int = 1, which: np.ndarray | None = None) -> StarForest:
+    def forest(
+        self, layers: int = 1, width: int | None = None, parts: int = 1, which: np.ndarray | None = None, into: StarForest | None = None
+    ) -> StarForest:
         """Return the star forest of several ranks that fills ghost cells and the rings beside them; collective.
 
         Args:
@@ -260,13 +279,14 @@ class Subdomain(GridPart):
             width: how far from the box; None: all.
             parts: the fields are of `grid.refined(parts)`.
             which: of a field's cells, bool; None: all.
+            into: a forest that this one replaces, in recorded exchanges too; None: there is none.
         """
         boxes = self.decomposition.boxes
         owned = [self._with_sides(box, parts) for box in boxes]
         filled = None if width is None else self._refined(self.box.grown(width), parts)
         stored = [self._refined(self._cells(box), parts).grown(1) for box in boxes]
         shifts = [self._refined(CellBox(shift, shift), parts).low for shift in self.decomposition.shifts]
-        return star_forest(self.ranks, owned, stored, filled=filled, layers=layers, which=which, shifts=shifts)
+        return star_forest(self.ranks, owned, stored, filled=filled, layers=layers, which=which, shifts=shifts, into=into)
 
     def _refined(self, box: CellBox, parts: int) -> CellBox:
         """Return a box in cells that are cut into so many along each axis."""
@@ -294,20 +314,16 @@ class Subdomain(GridPart):
             parts: the fields are of `grid.refined(parts)`.
             forest: of `forest`, for such fields; None: one that is made once.
         """
-        if self.ranks.size == 1:
-            return
-        hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
-        if forest is None:
-            kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
-            forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
-        pairs = [(host, host) for host in hosts]
-        if is_recording():
-            perform(exchanging_all(forest, pairs), wp.launch)
-            return
-        exchange_all(forest, pairs)
-        for field, host in zip(fields, hosts, strict=True):
-            if isinstance(field, wp.array) and field.device.is_cuda:
-                field.assign(host)
+        if self.ranks.size > 1:
+            if forest is None:
+                kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
+                forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
+            self.filling(*fields, forest=forest).launch()
+
+    def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> Task:
+        """Return `fill` over a star forest of several ranks, to run now or within a recorded program."""
+        operation = None if self.grid.device.is_cuda else partial(_filling, forest, fields)
+        return Task(partial(_fill, forest, fields), operation)
 
     def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:
         """Write what the ranks know of fields of the part to fields of the whole grid, on every rank; collective."""

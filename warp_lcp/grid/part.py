@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.rows.program import Task
 from warp_lcp.rows.vectors import convert
 
 if TYPE_CHECKING:
@@ -336,13 +338,18 @@ class GridPart:
         low, high = self.owned.low, self.owned.high
         return field[(slice(None),) * (field.ndim - 3) + tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
 
-    def forest(self, layers: int = 1, width: int | None = None, *, which: np.ndarray | None = None) -> Any:
-        """Return what `fill` exchanges of some cells alone, to be freed by the caller; collective.
+    def filling(self, *fields: wp.array | np.ndarray, forest: Any) -> Task:
+        """Return `fill` of the cells of a `forest`, to run now or within a recorded program."""
+        return Task(partial(self.fill, *fields, forest=forest))
+
+    def forest(self, layers: int = 1, width: int | None = None, *, which: np.ndarray | None = None, into: Any = None) -> Any:
+        """Return what `fill` exchanges of some cells alone; collective.
 
         Args:
             layers: of a field.
             width: how far from the owned cells; None: all.
             which: of a field's cells, bool; None: all.
+            into: a forest that this one replaces, in recorded exchanges too; None: there is none.
         """
 
     def box_like(self, field: wp.array) -> wp.array:

@@ -332,9 +332,9 @@ class Program:
 
     @property
     def is_native(self) -> bool:
-        """Whether the team works through all of it, and none of it waits for other ranks."""
+        """Whether the team works through all of it."""
         if self._native is None:
-            self._native = all(isinstance(command, Operation) and command.check is None for command in self._commands)
+            self._native = all(isinstance(command, Operation) for command in self._commands)
         return self._native
 
     def fits(self) -> bool:
@@ -370,7 +370,8 @@ class Program:
         """Launch everything again and again while the condition is not 0; the launches update it.
 
         Where loops run on the device, they do not come back to the host: on CUDA, all but the first call are one graph, and return
-        before it has ended; on the CPU, the team looks after signals and the deadline.
+        before it has ended; on the CPU, the team looks after signals and the deadline. Ranks must find the same condition; they repeat the
+        launches without the host unless they have a deadline, which they look at together.
 
         Args:
             condition: shape (1,), wp.int32.

@@ -274,6 +274,8 @@ class Team:
             while unfinished := table.words[UNFINISHED]:  # the interpreter has looked after signals
                 if table.again is not None:
                     check_time()
+                    for check in table.checks:  # what has failed may keep the loop from ending
+                        check()
                 asked.share = share + (RESUMED if unfinished == WITHIN else 0)
                 asked.limit = patience(table)
                 self._do(asked)
