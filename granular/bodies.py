@@ -12,6 +12,7 @@ import warp as wp
 from warp_lcp.granular.bodies_kernels import (
     FieldShape,
     Places,
+    add_runs_kernel,
     body_kernels,
     flat_vector,
     force_kernel,
@@ -28,8 +29,9 @@ from warp_lcp.granular.yield_set import F64, I32, U8
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import Rows
 from warp_lcp.rows.host_array import HostArray
-from warp_lcp.rows.program import Launch, LaunchGraph, copy, launch, perform
+from warp_lcp.rows.program import Launch, LaunchGraph, copy, launch
 from warp_lcp.rows.readings import Reading
+from warp_lcp.rows.vectors import add_across
 
 if typing.TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity, Walls
@@ -83,7 +85,7 @@ class SandBodies:
         self._beginning = LaunchGraph(device, lambda: copy(self.velocity, self._start.array))
         self._total = wp.zeros_like(self._force)  # of all ranks
         self._each = wp.array(np.arange(count)[:, None] + [0, 1], dtype=wp.int32, device=device)  # its entries, as `_owned` has runs
-        self._met = False  # whether sand is beside a body on some rank; else no force is asked for in the step
+        self._met = wp.zeros(1, dtype=wp.int32, device=device)  # 1: sand is beside a body on some rank; else no force is asked for
         self.faces: BodyFaces | None = None
         self._walls: Walls
         self._faces, self._cells, self._edges = Places(), Places(), Places()
@@ -162,8 +164,7 @@ class SandBodies:
         self._active.assign(active)
         part = self.grid.part
         if part.across is not None:
-            self._met = part.ranks.any(bool(packing.flags.numpy().ravel()[self._trial.numpy()].any()))
-            self._total.zero_()
+            self._met.fill_(int(part.ranks.any(bool(packing.flags.numpy().ravel()[self._trial.numpy()].any()))))
 
     def forget(self, stress: StressFields) -> None:
         """Remove stresses where only the edge of a body is near."""
@@ -270,15 +271,12 @@ class SandBodies:
 
     def _forces(self, launch: Launch) -> tuple[wp.array, wp.array]:
         """Return the runs of each body, first and last, and what stresses do to the body in these; of ranks, the sums over all."""
-        if self.grid.part.across is None:
+        across, device = self.grid.part.across, self.grid.device
+        if across is None:
             return self._owned, self._partial
-        perform(self._add_up, launch)
+        launch(add_runs_kernel, self._total.shape, [self._owned, self._partial, self._met, self._total], device=device)
+        add_across(across, self._total.flatten(), slice(None), launch, condition=self._met)
         return self._each, self._total
-
-    def _add_up(self) -> None:
-        if self._met:
-            mine = self._partial.numpy()
-            self._total.assign(self._sum(np.array([mine[first:last].sum(axis=0) for first, last in self._owned.numpy()])))
 
     def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
         """Return runs of the lists of cells and edges that a thread adds up, first and last of both, and each body's runs."""

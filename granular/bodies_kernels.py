@@ -135,6 +135,17 @@ def force_kernel(grid: FieldShape, spans: _SPANS, stress: _SINGLE, cells: Places
 
 
 @forward_kernel(**options)
+def add_runs_kernel(parts: _SPANS, partial: _ROW, met: _INTS, total: _ROW):
+    """Sums of each body's runs on this rank, 0 where no force is asked for; a thread an entry."""
+    body, q = wp.tid()
+    value = wp.float64(0.0)
+    if met[0] != 0:
+        for part in range(parts[body, 0], parts[body, 1]):
+            value += partial[part, q]
+    total[body, q] = value
+
+
+@forward_kernel(**options)
 def respond_kernel(
     implicit: int, parts: _SPANS, partial: _ROW, start: _ROW, response: _MATS, correction: _MATS, force: _ROW, error: _ROW, velocity: _ROW
 ):

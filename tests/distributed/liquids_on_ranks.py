@@ -3,9 +3,11 @@
 import json
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+import warp as wp
 
 import small_liquids
 import small_sands
@@ -13,11 +15,14 @@ from code_blocks import blocks
 from small_liquids import box
 from warp_lcp.distributed.balance import Balance
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.waiting import waiting
 from warp_lcp.fluids import SIMULATOR, viscosity_multigrid
 from warp_lcp.frames.pieces import one_mesh
 from warp_lcp.frames.vtu import Mesh
+from warp_lcp.granular.coupled import HeavyBallProjectedGradient
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
+from warp_lcp.rows.team import Team
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 from warp_lcp.simulation import SimulationFailed, StepFailed
@@ -341,6 +346,27 @@ def fail(ranks: Ranks, folder: Path) -> None:
     ranks.agree("the message", str(failed.value))
 
 
+def launches(ranks: Ranks, folder: Path) -> None:
+    """Count what a step of sand has launched and exchanged from Python: as much with four times the steps of the stresses."""
+    for name in ("trickling sand", "ball on sand"):
+        found = []
+        for least in (100, 400):
+            simulation = start(ranks, name, solver={"tolerance": 0.9})  # met whenever the residual is due
+            advance(simulation, 3)
+            simulation.method = HeavyBallProjectedGradient(least=least, cold=least)
+            with (
+                patch.object(Team, "run", autospec=True, side_effect=Team.run) as tables,
+                patch.object(wp, "launch", wraps=wp.launch) as single,
+            ):
+                exchanges = waiting._count
+                (row,) = advance(simulation, 1)
+                exchanges = waiting._count - exchanges
+            assert row["solve_iterations"] == least, name
+            found.append((tables.call_count, single.call_count, exchanges))
+        assert found[0] == found[1], (name, found)
+        assert found[0][0] < 50, (name, found)
+
+
 def dam(ranks: Ranks, folder: Path) -> None:
     """Run the scene that comes with the package."""
     simulation = on_ranks(ranks, load_scene("dam-break"))
@@ -363,6 +389,7 @@ if __name__ == "__main__":
             "keep": keep,
             "go-on": go_on,
             "fail": fail,
+            "launches": launches,
             "differ": differ,
             "dam": dam,
             "wrap": wrap,

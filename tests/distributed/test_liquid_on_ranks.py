@@ -213,9 +213,9 @@ def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
             same(found, whole, 0.0 if ranks == 2 else CLOSE.get(name, 1e-6))
 
 
-def test_failures_are_those_of_all_ranks(mpi, tmp_path):
+def test_failures_are_those_of_all_ranks_and_steps_of_stresses_need_no_python(mpi, tmp_path):
     environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
-    assert mpi(2, PROGRAM, "fail,differ", tmp_path, environment=environment).returncode == 0
+    assert mpi(2, PROGRAM, "fail,differ,launches", tmp_path, environment=environment).returncode == 0
 
 
 def test_pieces_of_any_boxes_can_be_read():

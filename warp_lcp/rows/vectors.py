@@ -282,13 +282,29 @@ class Tally:
         return np.array([part.sum() if c < sums else part.max(initial=-np.inf) for c, part in enumerate(parts)])
 
 
-def add_across(across: Across, scalars: wp.array[wp.float64], slots: slice, launch: Launch = launch_now) -> None:
-    """Add what the others have summed, now or among the launches of a program."""
-    operation = (lambda: across.adding(scalars.numpy()[slots])) if scalars.device.is_cpu else None
-    Task(partial(_add_across, across, scalars, slots), operation).launch(launch)
+def add_across(
+    across: Across, scalars: wp.array[wp.float64], slots: slice, launch: Launch = launch_now, condition: wp.array[wp.int32] | None = None
+) -> None:
+    """Add what the others have summed, now or among the launches of a program.
+
+    Args:
+        across: the others.
+        scalars: sums of this process, which are replaced.
+        slots: of them, those that are added up.
+        launch: of a program.
+        condition: number, shape (1,), the same in all processes; where it is 0 nothing is done. None: always.
+    """
+
+    def operation() -> Operation:
+        adding = across.adding(scalars.numpy()[slots])
+        return adding if condition is None else adding.only_if(condition)
+
+    Task(partial(_add_across, across, scalars, slots, condition), operation if scalars.device.is_cpu else None).launch(launch)
 
 
-def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> None:
+def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice, condition: wp.array[wp.int32] | None) -> None:
+    if condition is not None and not condition.numpy()[0]:
+        return
     if scalars.device.is_cpu:
         sums = scalars.numpy()[slots]
         sums[...] = across.sum(sums)
