@@ -29,7 +29,8 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_pieces import Piece, fields_of
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import is_recording, launch, perform
+from warp_lcp.rows.program import LaunchGraph, is_recording, launch, perform
+from warp_lcp.rows.team import team
 from warp_lcp.rows.vectors import Across, convert
 
 DEFAULT_BALANCE = Balance()
@@ -63,6 +64,11 @@ def copy_kernel(to: wp.array3d(dtype=Any), source: wp.array3d(dtype=Any)):
 
 for _T in (wp.int8, wp.uint8, wp.float32, wp.float64):
     wp.overload(copy_kernel, [wp.array3d(dtype=_T), wp.array3d(dtype=_T)])
+
+
+def _stays(field: wp.array | np.ndarray) -> bool:
+    """Return whether a recorded launch may know a field by its address."""
+    return isinstance(field, wp.array) and field.device.is_cpu and not hasattr(field, "slot")
 
 
 def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
@@ -107,6 +113,7 @@ class Subdomain(GridPart):
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box, self.joined = decomposition.ranks, decomposition.box, tuple(decomposition.joined)
         self.balance, self.mailbox = balance, mailbox or MpiMailbox(self.ranks.comm)
+        self._filling = LaunchGraph(wp.get_device("cpu"), self._launch_filling)
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
         self._trees: TreesAtCuts | None = None
@@ -296,6 +303,9 @@ class Subdomain(GridPart):
         """
         if self.ranks.size == 1:
             return
+        if forest is None and not is_recording() and team() is not None and all(map(_stays, fields)):
+            self._filling.run(*fields, width, parts, variant=tuple(field.dtype for field in fields))  # type: ignore[union-attr]
+            return
         hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
         if forest is None:
             kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
@@ -308,6 +318,11 @@ class Subdomain(GridPart):
         for field, host in zip(fields, hosts, strict=True):
             if isinstance(field, wp.array) and field.device.is_cuda:
                 field.assign(host)
+
+    def _launch_filling(self, *arguments: Any) -> None:
+        """Fill fields, with what else `fill` takes, among recorded launches."""
+        *fields, width, parts = arguments
+        self.fill(*fields, width=width, parts=parts)
 
     def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:
         """Write what the ranks know of fields of the part to fields of the whole grid, on every rank; collective."""
