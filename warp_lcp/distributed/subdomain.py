@@ -29,11 +29,12 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_pieces import Piece, fields_of
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import LaunchGraph, is_recording, launch, perform
-from warp_lcp.rows.team import team
+from warp_lcp.rows.program import is_recording, launch, perform, run_table
+from warp_lcp.rows.team import Table, team
 from warp_lcp.rows.vectors import Across, convert
 
 DEFAULT_BALANCE = Balance()
+MOST_KEPT = 32  # exchanges of fields that are filled again and again
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
 
 
@@ -113,7 +114,7 @@ class Subdomain(GridPart):
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box, self.joined = decomposition.ranks, decomposition.box, tuple(decomposition.joined)
         self.balance, self.mailbox = balance, mailbox or MpiMailbox(self.ranks.comm)
-        self._filling = LaunchGraph(wp.get_device("cpu"), self._launch_filling)
+        self._fillings: dict[Any, Table] = {}
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
         self._trees: TreesAtCuts | None = None
@@ -303,13 +304,13 @@ class Subdomain(GridPart):
         """
         if self.ranks.size == 1:
             return
-        if forest is None and not is_recording() and team() is not None and all(map(_stays, fields)):
-            self._filling.run(*fields, width, parts, variant=tuple(field.dtype for field in fields))  # type: ignore[union-attr]
-            return
-        hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
         if forest is None:
             kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
             forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
+            if not is_recording() and team() is not None and all(map(_stays, fields)):
+                self._fill_again(forest, fields)
+                return
+        hosts = [field if isinstance(field, np.ndarray) else field.numpy() for field in fields]
         pairs = [(host, host) for host in hosts]
         if is_recording():
             perform(exchanging_all(forest, pairs), wp.launch)
@@ -319,10 +320,15 @@ class Subdomain(GridPart):
             if isinstance(field, wp.array) and field.device.is_cuda:
                 field.assign(host)
 
-    def _launch_filling(self, *arguments: Any) -> None:
-        """Fill fields, with what else `fill` takes, among recorded launches."""
-        *fields, width, parts = arguments
-        self.fill(*fields, width=width, parts=parts)
+    def _fill_again(self, forest: StarForest, fields: Sequence[Any]) -> None:
+        """Fill fields that have been filled before: the exchange is kept, with what it costs to make it."""
+        key = forest, *((field.ptr, field.dtype) for field in fields)
+        if key not in self._fillings:
+            if len(self._fillings) >= MOST_KEPT:
+                self._fillings.clear()
+            hosts = [field.numpy() for field in fields]
+            self._fillings[key] = Table([exchanging_all(forest, [(host, host) for host in hosts])])
+        run_table(self._fillings[key])
 
     def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:
         """Write what the ranks know of fields of the part to fields of the whole grid, on every rank; collective."""
