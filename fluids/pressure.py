@@ -187,8 +187,9 @@ class PressureProjection:
         self._ratio_cell, self._adhesion, self._threshold, self._limit = (Scalar() for _ in range(4))
         self._counting = LaunchGraph(grid.device, lambda: self._count.take(self._cells, kind=self._unknown))
         self._preparation = LaunchGraph(grid.device, self._launch_preparation)
-        launches = self._launch_projection, self._copy_cells
-        self._projection, self._copying = (LaunchGraph(grid.device, f, at_once=part.at_once) for f in launches)
+        launches = self._launch_projection, self._copy_cells, self._copy_faces
+        graphs = (LaunchGraph(grid.device, f, at_once=part.at_once) for f in launches)
+        self._projection, self._copying, self._copying_faces = graphs
         self._everyone: int | None = None  # unknowns of all processes in this step, once they are asked for
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
@@ -273,7 +274,7 @@ class PressureProjection:
         """Take the cells, and where bodies meet them."""
         self._copying.run()
         if self.boundary.moves:
-            self._copy_faces()
+            self._copying_faces.run()
         self._operator.update(self._kinds)
         if self.coupling is not None:
             self.coupling.take(self._unknown)

@@ -31,6 +31,8 @@ def too_far(part: Subdomain, velocity: Sequence[wp.array], dt: float) -> float:
         if not any(sides):
             continue
         host, others = field.numpy(), tuple(n for n in range(3) if n != 2 - axis)
+        if max(host.max(), -host.min()) * (dt / part.grid.spacing) <= most:  # usual, and cheap
+            continue
         way = np.maximum(host.max(axis=others), -host.min(axis=others)) * (dt / part.grid.spacing)
         face = np.arange(len(way))
         inside = [face - part.owned.low[2 - axis], part.owned.high[2 - axis] - face]

@@ -210,10 +210,15 @@ class ParticleMigration(ParticleExchange):
         if ranks.size == 1:
             self._counts, self._expected = [n], before + added
             return own
-        ends = own.max_speed, *(-own.low if n else [-np.inf] * 3), *(own.high if n else [-np.inf] * 3)
+        mine = np.full(18, -np.inf)
+        mine[:3], mine[10] = (n, own.bad_positions, own.bad_velocities), added
+        mine[3:10] = own.mean_square_speed, *own.center.tolist(), *own.velocity.tolist()
+        mine[11] = own.max_speed
+        if n:
+            mine[12:15], mine[15:] = -own.low, own.high
         with np.errstate(invalid="ignore"):
-            means = n * own.mean_square_speed, *(n * own.center), *(n * own.velocity)
-            everyone = ranks.gather(np.array([n, own.bad_positions, own.bad_velocities, *means, added, *ends]))
+            mine[3:10] *= n
+            everyone = ranks.gather(mine)
         sums, most, self._counts = everyone.sum(axis=0), everyone[:, -7:].max(axis=0), everyone[:, 0].astype(np.int64).tolist()
         count, self._expected = int(sums[0]), before + int(sums[10])
         if count == 0:

@@ -30,11 +30,12 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_pieces import Piece, fields_of
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.rows.compiler import forward_kernel
-from warp_lcp.rows.program import Task, is_recording, launch
-from warp_lcp.rows.team import Operation
+from warp_lcp.rows.program import Task, is_recording, launch, run_table
+from warp_lcp.rows.team import Operation, Table, team
 from warp_lcp.rows.vectors import Across, convert
 
 DEFAULT_BALANCE = Balance()
+MOST_KEPT = 32  # exchanges of fields that are filled again and again
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
 
 
@@ -65,6 +66,11 @@ def copy_kernel(to: wp.array3d(dtype=Any), source: wp.array3d(dtype=Any)):
 
 for _T in (wp.int8, wp.uint8, wp.float32, wp.float64):
     wp.overload(copy_kernel, [wp.array3d(dtype=_T), wp.array3d(dtype=_T)])
+
+
+def _stays(field: wp.array | np.ndarray) -> bool:
+    """Return whether a recorded launch may know a field by its address."""
+    return isinstance(field, wp.array) and field.device.is_cpu and not hasattr(field, "slot")
 
 
 def copy_cells(to: wp.array[Any], source: wp.array[Any]) -> None:
@@ -124,6 +130,7 @@ class Subdomain(GridPart):
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box, self.joined = decomposition.ranks, decomposition.box, tuple(decomposition.joined)
         self.balance, self.mailbox = balance, mailbox or MpiMailbox(self.ranks.comm)
+        self._fillings: dict[Any, Table] = {}
         self._forests: dict[tuple[int, int | None, int], StarForest] = {}
         self._gathering: Any = None
         self._trees: TreesAtCuts | None = None
@@ -314,16 +321,30 @@ class Subdomain(GridPart):
             parts: the fields are of `grid.refined(parts)`.
             forest: of `forest`, for such fields; None: one that is made once.
         """
-        if self.ranks.size > 1:
-            if forest is None:
-                kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
-                forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
-            self.filling(*fields, forest=forest).launch()
+        if self.ranks.size == 1:
+            return
+        if forest is None:
+            kind = 1 if fields[0].ndim == 3 else fields[0].shape[0], width, parts
+            forest = self._forests[kind] = self._forests.get(kind) or self.forest(*kind)
+            if not is_recording() and team() is not None and all(map(_stays, fields)):
+                self._fill_again(forest, fields)
+                return
+        self.filling(*fields, forest=forest).launch()
 
     def filling(self, *fields: wp.array | np.ndarray, forest: StarForest) -> Task:
         """Return `fill` over a star forest of several ranks, to run now or within a recorded program."""
         operation = None if self.grid.device.is_cuda else partial(_filling, forest, fields)
         return Task(partial(_fill, forest, fields), operation)
+
+    def _fill_again(self, forest: StarForest, fields: Sequence[Any]) -> None:
+        """Fill fields that have been filled before: the exchange is kept, with what it costs to make it."""
+        key = forest, *((field.ptr, field.dtype) for field in fields)
+        if key not in self._fillings:
+            if len(self._fillings) >= MOST_KEPT:
+                self._fillings.clear()
+            hosts = [field.numpy() for field in fields]
+            self._fillings[key] = Table([exchanging_all(forest, [(host, host) for host in hosts])])
+        run_table(self._fillings[key])
 
     def collect(self, fields: Sequence[wp.array], whole: Sequence[wp.array]) -> None:
         """Write what the ranks know of fields of the part to fields of the whole grid, on every rank; collective."""

@@ -218,6 +218,7 @@ class CutCells:
         """Enter the solids that move into the distances, and mark again the cells that only their centers tell about."""
         rotations, translations = self.motions.poses([time])
         self._poses = rotations[0], translations[0]
+        self._placed_at: dict[int, Geometry] = {}
         for run in self._runs:
             if not isinstance(run, int):
                 run.place(rotations[0, run.places], translations[0, run.places])
@@ -252,9 +253,12 @@ class CutCells:
         return None if still is None else FlatCells(self.grid, [*still, *moving])
 
     def _placed(self, place: int) -> Geometry:
-        """Return a solid that moves where it is, by its place among those."""
-        rotations, translations = self._poses
-        return self.solids[self._moving[place] - 1].geometry.moved(Pose(rotations[place], translations[place]))
+        """Return a solid that moves where it is, by its place among those; the same object until it moves again."""
+        if place not in self._placed_at:
+            rotations, translations = self._poses
+            pose = Pose(rotations[place], translations[place])
+            self._placed_at[place] = self.solids[self._moving[place] - 1].geometry.moved(pose)
+        return self._placed_at[place]
 
     def _all_placed(self) -> list[Geometry]:
         """Return all solids where they are."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
@@ -171,6 +172,10 @@ class _Shape(ABC):
 
     def bounds(self) -> np.ndarray | None:
         """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""
+        return None if self._bounds is None else self._bounds.copy()
+
+    @cached_property
+    def _bounds(self) -> np.ndarray | None:
         if self.invert:
             return None
         corners, margin = self.hull()

@@ -226,8 +226,9 @@ class DensityCorrection:
         self._copied_faces: list[tuple[wp.array, wp.array]] = []
         self._guess = grid.part.box_like(self.x).flatten()
         self._way = Scalar()  # by which the displacement is multiplied [m]
-        launches = self._launch_preparation, self._launch_displacement, self._copy_cells
-        self._preparation, self._displacing, self._copying = (LaunchGraph(grid.device, f, at_once=grid.part.at_once) for f in launches)
+        launches = self._launch_preparation, self._launch_displacement, self._copy_cells, self._copy_faces
+        graphs = (LaunchGraph(grid.device, f, at_once=grid.part.at_once) for f in launches)
+        self._preparation, self._displacing, self._copying, self._copying_faces = graphs
 
     def apply(
         self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None, share: float = 1.0
@@ -342,7 +343,7 @@ class DensityCorrection:
         """Give the problem the cells, and where solids meet them."""
         self._copying.run()
         if self.boundary.moves:
-            self._copy_faces()
+            self._copying_faces.run()
         self._operator.update(self._cells)
 
     def _make_problem(self) -> wl.LCP:

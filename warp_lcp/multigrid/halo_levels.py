@@ -7,12 +7,16 @@ those of others are computed again, or ahead.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, no_type_check
+
+import warp as wp
 
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.cycle import CycleStage, Leg
 from warp_lcp.operators.padded_stencil import PaddedStencil
 from warp_lcp.rows import Bound, Rows
+from warp_lcp.rows.compiler import forward_kernel
+from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import CONVERT
 
 if TYPE_CHECKING:
@@ -28,29 +32,57 @@ def whole_counts(stencil: PaddedStencil) -> tuple[int, int, int]:
     return stencil.padding.counts if stencil.ghosts is None else stencil.ghosts.whole
 
 
-def share_changes(level: StencilLevel) -> None:
+@forward_kernel(module="warp_lcp.multigrid.halo_levels")
+@no_type_check
+def keep_side_kernel(d: wp.array3d(dtype=Any), axis: int, at: int, known: wp.array2d(dtype=Any)):
+    """Keep a layer of ghost cells across an axis."""
+    a, b = wp.tid()
+    if axis == 0:
+        known[a, b] = d[a + 1, b + 1, at]
+    elif axis == 1:
+        known[a, b] = d[a + 1, at, b + 1]
+    else:
+        known[a, b] = d[at, a + 1, b + 1]
+
+
+@forward_kernel(module="warp_lcp.multigrid.halo_levels")
+@no_type_check
+def mark_side_kernel(
+    d: wp.array3d(dtype=Any), axis: int, at: int, row: int, known: wp.array2d(dtype=Any), changed: wp.array2d(dtype=wp.uint8)
+):
+    """Mark rows beside ghost cells that differ from those that are known."""
+    a, b = wp.tid()
+    if axis == 0:
+        if d[a + 1, b + 1, at] != known[a, b]:
+            changed[a, b] = wp.uint8(1)
+    elif axis == 1:
+        if d[a + 1, at, b + 1] != known[a, b]:
+            changed[a, row] = wp.uint8(1)
+    else:
+        if d[at, a + 1, b + 1] != known[a, b]:
+            changed[row, a] = wp.uint8(1)
+
+
+for _T in (wp.uint8, wp.float32, wp.float64):
+    _sides = [wp.array3d(dtype=_T), int, int, wp.array2d(dtype=_T)]
+    wp.overload(keep_side_kernel, _sides)
+    wp.overload(mark_side_kernel, [*_sides[:3], int, _sides[3], wp.array2d(dtype=wp.uint8)])
+
+
+def share_changes(level: StencilLevel, launch: Launch) -> None:
     """Fill the diagonal's ghost cells; mark rows beside those that changed: their faces depend on them."""
-    s, inner = level.stencil, slice(1, -1)
+    s, counts = level.stencil, level.stencil.padding.counts
     assert s.ghosts is not None
-    sides = []
+    d, sides = s.d.reshape(s.padding.shape), []
     for axis, end in s.ghosts.cuts:
-        place: list[Any] = [inner] * 3
-        place[2 - axis] = -end
-        sides.append((tuple(place), axis, -end))
-    shape = s.padding.shape
-    known = [s.d.numpy().reshape(shape)[side].copy() for side, _, _ in sides]
-    s.ghosts.fill(s.d)
-    d, changed = s.d.numpy().reshape(shape), level.changed.numpy()
-    for (side, axis, end), old in zip(sides, known, strict=True):
-        differs = d[side] != old
-        if axis == 0:
-            changed |= differs
-        elif axis == 1:
-            changed[:, end] |= differs.any(axis=1)
-        else:
-            changed[end] |= differs.any(axis=1)
-    if s.device.is_cuda:
-        level.changed.assign(changed)
+        across = [n for a, n in enumerate(counts) if a != 2 - axis]
+        at, row = (s.padding.shape[2 - axis] - 1, counts[2 - axis] - 1) if end else (0, 0)
+        sides.append((axis, at, row, wp.empty(across, dtype=s.d.dtype, device=s.device)))
+    for axis, at, _, known in sides:
+        launch(keep_side_kernel, known.shape, [d, axis, at, known], device=s.device)
+    s.ghosts.filling(s.d).launch(launch)
+    for axis, at, row, known in sides:
+        launch(mark_side_kernel, known.shape, [d, axis, at, row, known, level.changed], device=s.device)
 
 
 def beside_cuts(stencil: PaddedStencil, depth: int) -> list[tuple[Corner, Corner]]:

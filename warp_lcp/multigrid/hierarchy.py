@@ -23,7 +23,7 @@ from warp_lcp.multigrid.stencil_level import Pair, StencilLevel
 from warp_lcp.operators.padded_stencil import PaddedStencil, coarsen_spans_kernel
 from warp_lcp.rows import Bound, Rows, Wave
 from warp_lcp.rows.fields import Padding, zeros
-from warp_lcp.rows.program import Program
+from warp_lcp.rows.program import Program, copy, recording
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import convert
 
@@ -192,7 +192,7 @@ class Hierarchy:
         alone = len(self.levels) if self.device.is_cpu else self._first_small + 1
         for fine, coarse in zip(self.levels, self.levels[1:alone], strict=False):
             if fine.stencil.ghosts is not None:
-                program.record(partial(share_changes, fine))
+                share_changes(fine, program.launch)
             for stage in fine.coarsened(coarse):
                 stage.launch(program.launch)
         if self._small is not None and alone < len(self.levels):
@@ -203,17 +203,20 @@ class Hierarchy:
         if self._gathered is None:
             self._dense.record(program, by_block=self.device.is_cuda and self._small is not None)
         else:
-            program.record(self._rebuild_gathered)
+            self._rebuild_gathered(program)
         return program
 
-    def _rebuild_gathered(self) -> None:
-        """Gather the last level's stencil, and build the levels below it."""
+    def _rebuild_gathered(self, program: Program) -> None:
+        """Record what gathers the last level's stencil, and builds the levels below it."""
         assert self._gathered is not None
-        ours, theirs = self.levels[-1].stencil, self._gathered.finest.stencil
+        ours, finest = self.levels[-1].stencil, self._gathered.finest
         gathering: Any = ours.ghosts.gathering  # type: ignore[union-attr]
+        theirs = finest.stencil
         for mine, whole in zip((ours.d, *(ours.weights or ())), (theirs.d, *(theirs.weights or ())), strict=True):
-            gathering.collect(mine, whole)
-        self._gathered.rebuild()
+            gathering.collecting(mine, whole).launch(program.launch)
+        with recording(program):
+            copy(finest.changed, wp.full_like(finest.changed, 1))
+        program.extend(self._gathered.rebuilding)
 
     @cached_property
     def cycle(self) -> Program:

@@ -79,21 +79,25 @@ def value_of(number: Any) -> Any:
 class Slot:
     """Address of an array that other arrays replace between runs; the current array has it as attribute `slot`."""
 
-    __slots__ = ("_length", "_memory", "address")
+    __slots__ = ("_held", "_length", "_memory", "address")
 
     def __init__(self) -> None:
         self._memory = ctypes.create_string_buffer(ARRAY_BYTES)
         self.address = ctypes.addressof(self._memory)
         self._length = ctypes.c_int32.from_buffer(self._memory, SHAPE_OFFSET)
+        self._held: Any = None  # the store that `point_to_first` has been given last
 
     def point_to(self, array: wp.array[Any]) -> None:
         """Have recorded launches use this array from now on."""
+        self._held = None
         ctypes.memmove(self.address, ctypes.addressof(array.__ctype__()), ARRAY_BYTES)
         array.slot = self
 
     def point_to_first(self, count: int, store: wp.array[Any]) -> None:
         """Have recorded launches use the first elements of an array of one axis from now on."""
-        ctypes.memmove(self.address, ctypes.addressof(store.__ctype__()), ARRAY_BYTES)
+        if self._held is not store:
+            ctypes.memmove(self.address, ctypes.addressof(store.__ctype__()), ARRAY_BYTES)
+            self._held = store
         self._length.value = count
 
 
