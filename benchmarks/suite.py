@@ -97,7 +97,7 @@ SOLVERS = Suite(
 CHOOSE = Suite(
     "choose",
     "rules of wl.recommend on random problems: how often a rule's method solves, its time over the best method's, its alternatives",
-    "6 minutes",
+    "10 minutes",
     False,
     seeded=True,
 )

@@ -145,7 +145,7 @@ def test_the_reference_has_every_public_name():
     assert {f"warp_lcp.gallery.{path.stem}" for path in Path(gallery.__file__).parent.glob("[a-z]*.py")} <= set(NAMED)
 
 
-@pytest.mark.parametrize("name", ["scene_keys", "method_settings", "device_figures", "published_figures"])
+@pytest.mark.parametrize("name", ["scene_keys", "method_settings", "device_figures", "published_figures", "choice_figures"])
 def test_generated_pages_are_up_to_date(name):
     spec = importlib.util.spec_from_file_location(name, DOCS / "generate" / f"{name}.py")
     generator = importlib.util.module_from_spec(spec)
