@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 import warp_lcp as wl
 from oracle import boxed, natural_residual
-from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch, enumeration_kernels
+from warp_lcp.reduced.enumeration_kernels import enumeration_kernels
+from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
 
 TIGHT = wl.StoppingCriteria(rtol=1e-12)
 

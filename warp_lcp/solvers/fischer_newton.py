@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import scipy.linalg
 import warp as wp
 
-from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
@@ -19,12 +18,13 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import NoTranspose
-from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
+from warp_lcp.problem.solve import IterateMemory, Precision, Step
 from warp_lcp.reduced.dense_problem import DenseWorkspace
 from warp_lcp.reduced.descent import DECREASE, NonmonotoneSearch
 from warp_lcp.reduced.nonsmooth_map import FiniteDifferenceSystem, HostMap, Kink, KinkName, MapForm, NonsmoothMap
 from warp_lcp.reduced.principal_system import GridSystem, principal_system
-from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll, renamed
+from warp_lcp.reduced.settings import NewtonSettings
+from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
@@ -41,7 +41,7 @@ DESCENT = 1e-10  # a direction whose slope is less than this times ||dx||^2.1 is
 
 @renamed(share="fischer_weight")
 @dataclass(frozen=True, kw_only=True)
-class FischerNewton(Settings):
+class FischerNewton(NewtonSettings):
     """Nonsmooth Newton method on the Fischer-Burmeister map, plain or penalized.
 
     It solves f(x) = 0 ([Book] 2.4.2-3, algorithm 12).
@@ -87,13 +87,8 @@ class FischerNewton(Settings):
     kink: KinkName = "perturbation"
     fischer_weight: ShareOrAll | None = None
     safeguard: bool = True
-    precision: PrecisionName = "mixed"
     warm_start: CountOrZero = 0
-    monotone_cycles: CountOrZero = 2
-    eta: Share = 0.1
-    max_linear_iterations: Count = 200
     memory: Count = 8
-    cycle: CycleSettings = field(default_factory=CycleSettings)
 
     def descent(self, problem: LCP) -> GradientDescent:
         """Return the gradient descent on this method's map for a problem.

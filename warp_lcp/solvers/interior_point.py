@@ -9,25 +9,25 @@ condensed where the step ends, the others over flat fields.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.reduced.equilibrated import EquilibratedWorkspace
 from warp_lcp.reduced.principal_system import GridSystem, principal_system
+from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.rows import KernelFile, Known, Wave
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
-from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
+from warp_lcp.settings import Count, Positive, Share, ShareOrZero
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 
@@ -47,7 +47,7 @@ NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the resid
 
 
 @dataclass(frozen=True, kw_only=True)
-class InteriorPoint(Settings):
+class InteriorPoint(NewtonSettings):
     """Primal-dual interior-point method: follow the central path to the solution.
 
     [Book] 2.3, eq. 2.105-2.114, algorithm 9; by default Mehrotra's predictor-corrector (1992).
@@ -90,17 +90,13 @@ class InteriorPoint(Settings):
     needs: ClassVar[str] = "A positive semi-definite; it need not be symmetric"
     definite: ClassVar[bool] = True
 
-    precision: PrecisionName = "mixed"
     mehrotra: bool = True
     horizon: Count = 100
     backoff: Share = 0.995
     crossover: ShareOrZero = 0.0
     start: Positive = 15.0
-    monotone_cycles: CountOrZero = 2
     predictor_eta: Share = 0.3
     eta: Share = 0.2
-    max_linear_iterations: Count = 200
-    cycle: CycleSettings = field(default_factory=CycleSettings)
 
     def init(self, problem: LCP) -> InteriorPointWorkspace | EquilibratedWorkspace:
         """Return a workspace: for dense and sparse problems one that equilibrates them."""

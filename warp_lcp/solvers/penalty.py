@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.reduced.principal_system import ON_FREE, principal_system
+from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
-from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share
+from warp_lcp.settings import Positive, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 
@@ -33,7 +33,7 @@ EARLY = 10  # steps in which the set may wander while the residual rises
 
 
 @dataclass(frozen=True, kw_only=True)
-class Penalty(Settings):
+class Penalty(NewtonSettings):
     """Penalty method with policy iteration (Lai et al. 2020).
 
     It replaces the bounds by springs and solves the piecewise linear equations.
@@ -71,11 +71,7 @@ class Penalty(Settings):
     definite: ClassVar[bool] = True
 
     rho: Positive = 1e6
-    precision: PrecisionName = "mixed"
-    monotone_cycles: CountOrZero = 2
     eta: Share = 0.01
-    max_linear_iterations: Count = 200
-    cycle: CycleSettings = field(default_factory=CycleSettings)
 
     def init(self, problem: LCP) -> PenaltyWorkspace:
         """Return a workspace."""
