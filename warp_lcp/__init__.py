@@ -6,6 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from warp_lcp.default import default_method, solve
+from warp_lcp.default_chain import default_chain
 from warp_lcp.gradients.vjp import Gradients, vjp
 from warp_lcp.linear_complementarity import linear_complementarity
 from warp_lcp.monitor import plot_convergence, print_progress
@@ -37,6 +38,7 @@ from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjected
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
 from warp_lcp.solvers.coupled_problem import CoupledBlock, CoupledResult, StaggeredRound, solve_coupled
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
+from warp_lcp.solvers.fallback import Fallback, FallbackEntry, crawls, fails, slow_linear_solves, stalls
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
@@ -50,6 +52,7 @@ from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
+from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.solvers.psor import ProjectedSOR, advised_omega
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.registry import METHODS
@@ -99,6 +102,8 @@ __all__ = [
     "CycleSettings",
     "DenseOperator",
     "DirectEnumeration",
+    "Fallback",
+    "FallbackEntry",
     "FischerNewton",
     "FrictionalContact",
     "GradientDescent",
@@ -120,6 +125,7 @@ __all__ = [
     "ProjectedMultigrid",
     "ProjectedSOR",
     "ProximalGaussSeidel",
+    "ProximalPoint",
     "QuadraticProgram",
     "Recommendation",
     "Record",
@@ -136,8 +142,11 @@ __all__ = [
     "SumOperator",
     "VariationalInequality",
     "advised_omega",
+    "crawls",
+    "default_chain",
     "default_method",
     "enumerate_batch",
+    "fails",
     "get_threads",
     "linear_complementarity",
     "plot_convergence",
@@ -146,7 +155,9 @@ __all__ = [
     "recommend",
     "release_workspace",
     "set_threads",
+    "slow_linear_solves",
     "solve",
     "solve_coupled",
+    "stalls",
     "vjp",
 ]

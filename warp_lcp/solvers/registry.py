@@ -29,6 +29,7 @@ from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
+from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.staggering import Staggering
@@ -52,6 +53,7 @@ METHODS.update(
         "projected-jacobi": ProjectedJacobi,
         "projected-multigrid": ProjectedMultigrid,
         "proximal-gauss-seidel": ProximalGaussSeidel,  # of `FrictionalContact`
+        "proximal-point": ProximalPoint,
         "psor": ProjectedSOR,
         "quadratic-program": QuadraticProgram,
         "staggering": Staggering,
