@@ -50,7 +50,7 @@ class GridOutcome(Outcome):
     def heading(self) -> str:
         """Return a line that says what was solved."""
         cells = " x ".join(map(str, reversed(self.shape)))
-        line = f"{self.unknowns} unknowns, {cells} cells, by {self.name} on {self.problem.device}"
+        line = f"{self.unknowns} unknowns, {cells} cells, by {self.methods} on {self.problem.device}"
         if self.decomposition is None:
             return line
         boxes = " x ".join(map(str, self.decomposition.processes))

@@ -274,11 +274,6 @@ class FallbackWorkspace:
         given = {"floating": floating} if takes_floating(type(self._first)) else {}
         return self._first.start(warm=warm, tolerance=tolerance, **given)
 
-    def forget_solve(self) -> None:
-        """Free what only the last solve needed."""
-        self._works, self._best = {0: self._first}, None
-        self._first.forget_solve()
-
     def keep(self) -> None:
         """Remember x as the best iterate."""
         self._at_best, self._best_norm = True, self.residual.norm
@@ -407,7 +402,10 @@ class FallbackWorkspace:
         work.keep()
         given = {"floating": self._floating} if takes_floating(type(work)) else {}
         work.start(warm=not restart, tolerance=self._progress.tolerance, **given)
-        self._progress.record(residual.norm)
+        if work is not self._first:
+            self._take(work)
+            self.residual.evaluate(self.x)
+        self._progress.record(self.residual.norm)
 
     def _advance(self) -> Step:
         """Take a step, or a batch of steps, of the method at work; write the iterate to x."""
@@ -417,10 +415,14 @@ class FallbackWorkspace:
         self._since += 1
         done = self._one_step(entry.method, work) if entry.batch == 1 else self._batch(entry, work)
         if work is not first:
-            wp.copy(first.x, work.x)
-            first.round_iterate()
-            first.residual.current = False
+            self._take(work)
         return done
+
+    def _take(self, work: Any) -> None:
+        """Write the iterate of the method at work to x."""
+        wp.copy(self.x, work.x)
+        self._first.round_iterate()
+        self.residual.current = False
 
     def _one_step(self, method: Solver, work: Any) -> Step:
         work.residual.current = False

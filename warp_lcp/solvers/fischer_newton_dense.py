@@ -123,7 +123,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         super().__init__(problem, settings.precision)
         self.settings, self._descent = settings, settings.descent(problem)
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
-        self.active_set: Any = None
+        self.cold_start: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
         self._gradient: DescentWorkspace | None = None
 
