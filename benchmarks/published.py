@@ -76,10 +76,6 @@ class TruncatedMultigrid(wl.ProjectedMultigrid):
 class TruncatedWorkspace(MultigridWorkspace):
     """Memory of the method for one problem."""
 
-    def crawls(self) -> bool:
-        """Return False: the method has cycles alone."""
-        return False
-
     def wants_monotone_cycle(self) -> bool:
         """Return False, and forget the direction, so that the next one is the cycle's correction."""
         self._forget()

@@ -103,7 +103,7 @@ def make_pressure(
         weights: of the particles on the faces of each component.
         bodies: rigid bodies among the solids; None: there are none.
     """
-    solver, coupling = wl.METHODS[scene.solver.method](precision=scene.solver.precision), None
+    solver, coupling = wl.default_chain(wl.METHODS[scene.solver.method](precision=scene.solver.precision)), None
     tolerance, most = scene.solver.tolerance, scene.solver.max_iterations
     gravity = float(np.linalg.norm(scene.physics.gravity))
     if bodies is not None:

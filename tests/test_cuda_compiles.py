@@ -146,7 +146,6 @@ def use_newton_kernels(reals):
             for precision in ("mixed", "double"):
                 for method in (wl.MinimumMapNewton, wl.FischerNewton, wl.InteriorPoint, wl.Penalty):
                     assert wl.solve(problem, method(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-4)), (A, method, precision)
-                assert wl.solve(problem, wl.InteriorPoint(precision=precision, crossover=1e-1), stopping=wl.StoppingCriteria(rtol=1e-4))
 
 
 @wp.func

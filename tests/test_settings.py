@@ -117,7 +117,7 @@ def test_precisions_may_be_members_of_their_enumeration():
         (lambda: wl.ProjectedSOR(omega=2), "omega = 2: must be in (0, 2) or None"),
         (lambda: wl.ProjectedJacobi(omega=0), "omega = 0: must be a finite number > 0 or None"),
         (lambda: wl.FischerNewton(fischer_weight=0.0), "fischer_weight = 0.0: must be in (0, 1] or None"),
-        (lambda: wl.InteriorPoint(crossover=1.0), "crossover = 1.0: must be in [0, 1)"),
+        (lambda: wl.InteriorPoint(backoff=1.0), "backoff = 1.0: must be in (0, 1)"),
         (lambda: wl.SubspaceMinimization(backtracks=-2), "backtracks = -2: must be an integer >= -1"),
         (lambda: wl.StoppingCriteria(max_seconds=0), "max_seconds = 0: must be > 0 or inf"),
         (lambda: wl.StoppingCriteria(divergence=1), "divergence = 1: must be > 1 or inf"),

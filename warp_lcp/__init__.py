@@ -6,6 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from warp_lcp.default import default_method, solve
+from warp_lcp.default_chain import default_chain
 from warp_lcp.gradients.vjp import Gradients, vjp
 from warp_lcp.linear_complementarity import linear_complementarity
 from warp_lcp.monitor import plot_convergence, print_progress
@@ -37,6 +38,7 @@ from warp_lcp.rows.team import get_threads, set_threads
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
+from warp_lcp.solvers.fallback import Fallback, FallbackEntry, crawls, fails, slow_linear_solves, stalls
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
@@ -50,6 +52,7 @@ from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
+from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.solvers.psor import ProjectedSOR, advised_omega
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.registry import METHODS
@@ -96,6 +99,8 @@ __all__ = [
     "CycleSettings",
     "DenseOperator",
     "DirectEnumeration",
+    "Fallback",
+    "FallbackEntry",
     "FischerNewton",
     "FrictionalContact",
     "GradientDescent",
@@ -117,6 +122,7 @@ __all__ = [
     "ProjectedMultigrid",
     "ProjectedSOR",
     "ProximalGaussSeidel",
+    "ProximalPoint",
     "QuadraticProgram",
     "Recommendation",
     "Record",
@@ -132,8 +138,11 @@ __all__ = [
     "SumOperator",
     "VariationalInequality",
     "advised_omega",
+    "crawls",
+    "default_chain",
     "default_method",
     "enumerate_batch",
+    "fails",
     "get_threads",
     "linear_complementarity",
     "plot_convergence",
@@ -142,6 +151,8 @@ __all__ = [
     "recommend",
     "release_workspace",
     "set_threads",
+    "slow_linear_solves",
     "solve",
+    "stalls",
     "vjp",
 ]

@@ -12,6 +12,7 @@ from typing import Any, Never
 import scipy.sparse
 import warp as wp
 
+from warp_lcp.default_chain import default_chain
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.matrix_stencil import stencil_of
 from warp_lcp.operators.renumbering import Renumbering
@@ -24,6 +25,7 @@ from warp_lcp.problem.solve import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.recommend import Recommendation, method_for, recommend, steps_allowed
 from warp_lcp.rows.fields import Array
+from warp_lcp.solvers.fallback import Fallback
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.registry import method_of
@@ -54,17 +56,18 @@ def default_method(problem: LCP) -> Solver:
 
 def solve(
     problem: LCP | VariationalInequality, solver: Solver | str | None = None, *, stopping: StoppingCriteria | MeanCriteria | None = None,
-    x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None, **misplaced: Never,
+    x0: Array | None = None, workspace: Workspace | None = None, callback: Callable[[Record], None] | None = None, fallback: bool = True,
+    **misplaced: Never,
 ) -> SolveResult:  # fmt: skip
     """Solve a problem by a method.
 
     Args:
         problem: the LCP, or a problem over another convex set than a box.
         solver: the method, such as `wl.MinimumMapNewton()`, or its name in `wl.METHODS` for its default
-            settings, such as "psor". None: the method of `wl.recommend`, and if that fails, its
-            alternatives, each from the same start. `stopping` limits the sum of their steps;
-            the history has all of them, and the result's `method` names the one that
-            found x. Sparse matrices that are a compact stencil on a box of cells in its natural
+            settings, such as "psor": it alone is used. None: the method of `wl.recommend`; where it stops, the methods of its
+            chain (`wl.default_chain`) go on from its iterate, and if these fail, its alternatives begin from the same start.
+            `stopping` limits the sum of their steps; the history has all of them, each record names its method, and the result's
+            `method` names the one that found x. Sparse matrices that are a compact stencil on a box of cells in its natural
             order, x first, are then solved as a grid problem; the result's `grid` has its shape.
         stopping: the criteria; `StoppingCriteria()` if None, with the limit of steps that `wl.recommend` gives if there is no solver.
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
@@ -72,6 +75,7 @@ def solve(
             `wl.release_workspace`.
         callback: called with each Record, such as `wl.print_progress`; if it raises StopIteration,
             the solve ends with STOPPED.
+        fallback: False: without a method, the solve ends with the recommended one, however it ends.
         misplaced: other options are refused, with a hint where they belong.
 
     Returns:
@@ -94,10 +98,23 @@ def solve(
     check_criteria(stopping)
     method: Any = method_of(solver, "solver")
     if method is None and isinstance(problem, LCP):
-        return _solve_by_choice(problem, stopping, x0, callback)
+        return _solve_by_choice(problem, stopping, x0, callback) if fallback else _solve_by_first(problem, stopping, x0, callback)
     if workspace is None and isinstance(problem, LCP) and method is not None:
         return _solve_in_order(problem, method, stopping, x0, callback)
     return solve_by(problem, method, stopping=stopping, x0=x0, workspace=workspace, callback=callback)
+
+
+def _solve_by_first(
+    problem: LCP, stopping: StoppingCriteria | MeanCriteria | None, x0: Array | None, callback: Callable[[Record], None] | None
+) -> SolveResult:
+    """Solve by the recommended method alone."""
+    accuracy = _accuracy(stopping)
+    advice = recommend(problem, accuracy=accuracy)
+    grid = None if advice.name == "psor" else _as_grid(problem)
+    if grid is not None:
+        by_grid = recommend(grid, accuracy=accuracy)
+        return _solve_as_grid(problem, grid, by_grid.method, stopping or by_grid.stopping, x0, callback)
+    return _solve_in_order(problem, advice.method, stopping or advice.stopping, x0, callback)
 
 
 def _solve_by_choice(
@@ -110,14 +127,14 @@ def _solve_by_choice(
     grid = None if advice.name == "psor" else _as_grid(problem)  # a few sweeps need no hierarchy
     if grid is not None:
         by_grid = recommend(grid, accuracy=accuracy)
-        attempt = partial(_solve_as_grid, problem, grid, by_grid.method)
+        attempt = partial(_solve_as_grid, problem, grid, by_grid.chain)
         criteria = _left(stopping or by_grid.stopping, begun, results, reserve=stopping is not None)
         if _try(results, by_grid.name, attempt, criteria, x0, callback, begun):
             return _best(results)
     criteria = stopping or advice.stopping
     spent = [] if stopping is None else results  # without limits that were given each attempt has its own
     reserve = stopping is not None and bool(advice.alternatives) and advice.traits.kind in ("dense", "sparse")
-    attempt = partial(_solve_in_order, problem, advice.method)
+    attempt = partial(_solve_in_order, problem, advice.chain)
     if not _try(results, advice.name, attempt, _left(criteria, begun, spent, reserve=reserve), x0, callback, begun):
         _try_alternatives(problem, advice, results, stopping, x0, callback, begun)
     return _best(results)
@@ -153,7 +170,7 @@ def _try_alternatives(
         )
         if criteria.max_iterations == 0:
             return
-        attempt = partial(run, problem, method_for(name, advice.traits))
+        attempt = partial(run, problem, default_chain(method_for(name, advice.traits), problem))
         if name == "fischer-newton":
             attempt = partial(_solve_in_form, _as_dense, run, problem, method_for(name, advice.traits))
         try:
@@ -181,7 +198,7 @@ def _try(
     """Make an attempt and add its result; return whether that ends the solve."""
     shifted = partial(_after, results[-1].history[-1] if results else None, name, time.perf_counter() - begun)
     result = attempt(criteria, x0, None if callback is None else lambda record: callback(shifted(record)))
-    results.append(replace(result, method=name, history=[shifted(record) for record in result.history]))
+    results.append(replace(result, method=result.method or name, history=[shifted(record) for record in result.history]))
     return result.status in ENDED
 
 
@@ -276,7 +293,8 @@ def _solve_in_order(
     callback: Callable[[Record], None] | None,
 ) -> SolveResult:  # fmt: skip
     """Solve a problem; matrices numbered at random in the order of Cuthill and McKee."""
-    plain = problem.bounds.affine is None and problem.preconditioner is None and isinstance(solver, ANY_NUMBERING)
+    first = solver.entries[0].method if isinstance(solver, Fallback) else solver
+    plain = problem.bounds.affine is None and problem.preconditioner is None and isinstance(first, ANY_NUMBERING)
     begun = time.perf_counter()
     found = problem.A.renumbered() if plain and isinstance(problem.A, SparseOperator) else None
     if found is not None:

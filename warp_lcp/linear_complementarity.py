@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.default import default_method, solve, solve_by_alternatives
+from warp_lcp.default import solve, solve_by_alternatives
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP, as_operator
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
 from warp_lcp.problem.solve import Solver, Workspace
 from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.recommend import recommend
 from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
 from warp_lcp.solvers.registry import method_of
@@ -98,7 +99,7 @@ def linear_complementarity(
     lower, upper = _sides_of(bounds, fields.given)
     lower, upper = _bound(fields.load(lower, "bounds, lo"), "lo", np.inf), _bound(fields.load(upper, "bounds, hi"), "hi", -np.inf)
     problem = LCP(operator, fields.load(b, "b"), lower, upper, preconditioner=preconditioner)
-    solver = default_method(problem) if method is None else _method(method)
+    solver = recommend(problem).chain if method is None else _method(method)
     stopping = StoppingCriteria(rtol=rtol, atol=least, max_iterations=most, patience=max(30, most // 10))
     works = list[Workspace]()  # the last one has the iterate
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Literal
 
+from warp_lcp.default_chain import default_chain
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.solve import Solver, solve
 from warp_lcp.problem.stopping import StoppingCriteria
@@ -64,7 +65,7 @@ class Recommendation:
 
     Args:
         name: of the method in METHODS.
-        method: the method with its settings.
+        method: the method with its settings, alone.
         stopping: criteria for the requested accuracy, with a suitable limit of steps.
         reasons: one sentence for each reason.
         expected: expected cost of the solve, None if unknown.
@@ -79,6 +80,11 @@ class Recommendation:
     expected: str | None
     alternatives: tuple[str, ...]
     traits: Traits
+
+    @property
+    def chain(self) -> Solver:
+        """The method with those that go on where it stops: a `wl.Fallback`, or the method itself if none does."""
+        return default_chain(self.method, self.traits.problem)
 
 
 @dataclass(frozen=True)

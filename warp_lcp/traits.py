@@ -48,6 +48,11 @@ class Traits:
     def __init__(self, problem: LCP, accuracy: float, *, trial: bool = True) -> None:
         self._problem, self._accuracy, self._trial = problem, accuracy, trial
 
+    @property
+    def problem(self) -> LCP:
+        """The problem."""
+        return self._problem
+
     @cached_property
     def kind(self) -> str:
         """Return "grid", "sparse", "dense", or "operator" of products only or on ranks."""

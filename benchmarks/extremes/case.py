@@ -151,7 +151,7 @@ def interrupted_after(seconds: float) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SolveCase(Case):
-    """A problem given to a method, in the precisions the method has; "double" of one that has no choice."""
+    """A problem given to a method and those that take over, in the precisions it has; "double" if it has no choice."""
 
     problem: Callable[[], Problem]  # makes the problem
     method: str = "projected-multigrid"  # of `wl.METHODS`
@@ -160,6 +160,7 @@ class SolveCase(Case):
     stopping: Mapping[str, Any] = field(default_factory=dict)  # criteria besides rtol and max_iterations, or instead of them
     x0: np.ndarray | None = None  # a guess
     solve: Callable[..., wl.SolveResult] = wl.solve  # stands in for `wl.solve`, where something wrong is to be caught
+    alone: bool = False  # whether the method's default chain is left out
 
     def __post_init__(self) -> None:
         """Fill in the precisions."""
@@ -173,6 +174,7 @@ class SolveCase(Case):
         begun = time.perf_counter()
         solver = method(precision=precision) if self.precisions == PRECISIONS else method()
         lcp = problem.lcp(device, wp.float32 if precision == "single" else wp.float64)
+        solver = solver if self.alone else wl.default_chain(solver, lcp)
         result = self.solve(lcp, solver, stopping=wl.StoppingCriteria(**criteria), x0=self.x0)
         wp.synchronize_device(device)
         return checked(problem, result, criteria, time.perf_counter() - begun, precision)

@@ -13,7 +13,7 @@ from warp_lcp.solvers.interior_point import InteriorPoint
 TIGHT = wl.StoppingCriteria(rtol=1e-10)
 N = 40
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-METHODS = [InteriorPoint(), InteriorPoint(mehrotra=False), InteriorPoint(crossover=1e-2), wl.MinimumMapNewton(), wl.PrimalDualActiveSet()]
+METHODS = [InteriorPoint(), InteriorPoint(mehrotra=False), wl.MinimumMapNewton(), wl.PrimalDualActiveSet()]
 
 
 def name(method):

@@ -1,4 +1,4 @@
-"""Domains on which cycles of blocks are slow: the solve goes on by steps on the matrix."""
+"""Domains on which cycles of blocks are slow: the default goes on by steps on the matrix."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble
 from warp_lcp.operators.grid_matrix import grid_matrix
-from warp_lcp.solvers.phases import FIRST, Pace
+from warp_lcp.solvers.fallback import FIRST
 
 
 def spiral(n):
@@ -60,6 +60,7 @@ def test_channels_and_random_coefficients(make, load, lower):
     assert relative_residual(A, b, lower, result.x.numpy()) <= 1.01e-6
     assert FIRST < result.iterations <= 60
     assert result.history[-1].step != "truncated cycle"
+    assert result.method == "minimum-map-newton"
 
 
 def test_spiral_is_one_channel():
@@ -77,13 +78,3 @@ def test_easy_solves_stay_on_the_grid():
     result = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), np.where(cells == 1, -1.0, 0.0)), stopping=wl.StoppingCriteria(rtol=0.0))
     assert result.status is wl.SolveStatus.FLOOR
     assert {record.step for record in result.history} == {"start", "monotone cycle", "truncated cycle"}
-
-
-@pytest.mark.parametrize(("factor", "tolerance", "crawls"), [(0.5, 1e-6, False), (0.9, 1e-6, True), (1.0, 1e-6, True), (0.2, 0.0, False),
-                                                             (0.9, 0.1, False)])  # fmt: skip
-def test_pace(factor, tolerance, crawls):
-    pace = Pace(tolerance)
-    for k in range(FIRST + 1):
-        assert not pace.crawls
-        pace.record(factor**k)
-    assert pace.crawls is crawls

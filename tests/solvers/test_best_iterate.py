@@ -81,7 +81,7 @@ def test_cycles_that_serve_another_method_keep_no_iterate(solver):
     result = wl.solve(problem, solver, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-6))
     assert result, result.status
     assert [record.step for record in result.history].count("monotone cycle") >= 2
-    assert work.active_set._best is None
+    assert work.cold_start._best is None
 
 
 def test_the_carried_curvature_is_that_of_the_direction():

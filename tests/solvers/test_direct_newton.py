@@ -147,14 +147,15 @@ def test_cycles_are_handed_over():
         (np.zeros((2, 2)), np.array([1.0, -1.0]), 0.0),
     ],
 )
-def test_other_matrices_end_as_by_the_method_alone(A, b, lower):
-    """Singular blocks, none that solves, skew, negative, empty rows: the same status, dense and sparse.
+def test_other_matrices_end_as_by_the_safeguarded_steps(A, b, lower):
+    """Singular blocks, none that solves, skew, negative, empty rows: the same status, dense and sparse, with what takes over.
 
-    Where the method alone stops at a negative diagonal entry, the default's pivots prove that there is no solution.
+    Where the method stops at a negative diagonal entry, the default's pivots prove that there is no solution.
     """
     proved = wl.SolveStatus.NEGATIVE_CURVATURE, wl.SolveStatus.INFEASIBLE
     for form in (A, scipy.sparse.csr_array(A)):
-        ours, alone = (wl.solve(wl.LCP(form, b, lower), method) for method in (None, wl.MinimumMapNewton()))
+        problem = wl.LCP(form, b, lower)
+        ours, alone = (wl.solve(problem, method) for method in (None, wl.default_chain(wl.MinimumMapNewton(), problem)))
         assert ours.status is alone.status or (alone.status, ours.status) == proved
         if ours:
             assert natural_residual(A, b, lower, np.inf, ours.x.numpy()) <= 1e-6

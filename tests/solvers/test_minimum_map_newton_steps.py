@@ -176,15 +176,6 @@ def test_newton_alone_fails_on_contacts_and_says_so():
     assert max(failed) <= 20
 
 
-def test_newton_alone_resorts_to_nothing_where_it_crawls():
-    p = contact(6, seed=1)
-    for safeguard in (True, False):
-        problem = wl.LCP(wl.DenseOperator(p.A, device="cpu"), p.b)
-        work = MinimumMapNewton(safeguard=safeguard).init(problem)
-        work.residual.evaluate(work.x)
-        assert work._may_resort() is safeguard
-
-
 def test_newton_alone_may_go_round_in_no_circle():
     """On the matrix of period three whole steps cycle; searched they cannot, and end where no share of one leads down."""
     result = wl.solve(wl.LCP(wl.DenseOperator(PERIOD_THREE, device="cpu"), -np.ones(3)), MinimumMapNewton(safeguard=False))

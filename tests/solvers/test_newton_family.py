@@ -36,10 +36,15 @@ def random_boxed(rng, n=6):
     return B @ B.T + 0.2 * np.eye(n) + C - C.T, 2 * rng.standard_normal(n), lower, upper
 
 
+def is_near(progress):
+    """Crossover: the active set is known where the residual has fallen to a hundredth."""
+    return progress.norms[-1] <= 1e-2 * progress.norms[0]
+
+
 METHODS = [
     InteriorPoint(),
     InteriorPoint(mehrotra=False),
-    InteriorPoint(crossover=1e-2),
+    wl.Fallback(InteriorPoint(), (wl.MinimumMapNewton(), is_near)),
     *(FischerNewton(kink=k, safeguard=s, fischer_weight=c) for k in KINKS for s, c in ((True, 0.95), (False, 1.0))),
     FischerNewton(warm_start=3),
 ]
@@ -264,7 +269,7 @@ def test_crossover_hands_over_to_the_active_set():
     rng = np.random.default_rng(2267)
     B = rng.standard_normal((30, 30))
     A, b = B @ B.T / 30 + np.eye(30), rng.standard_normal(30)
-    result = wl.solve(dense(A, b), InteriorPoint(crossover=1e-2), stopping=TIGHT)
+    result = wl.solve(dense(A, b), wl.Fallback(InteriorPoint(), (wl.MinimumMapNewton(), is_near)), stopping=TIGHT)
     names = [record.step for record in result.history]
     assert "predictor-corrector" in names
     assert names[-1] == "newton"

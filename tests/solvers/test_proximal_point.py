@@ -1,4 +1,4 @@
-"""Problems whose free blocks are singular: what the active-set methods go on with, and what they say where nothing helps."""
+"""Problems whose free blocks are singular: by the proximal-point method, and by the chains of active-set methods."""
 
 import numpy as np
 import pytest
@@ -8,16 +8,21 @@ import warp as wp
 import warp_lcp as wl
 from oracle import lemke, natural_residual
 from warp_lcp.gallery import semidefinite
-from warp_lcp.solvers.phases import ProximalPoint
 
 METHODS = [wl.MinimumMapNewton(), wl.PrimalDualActiveSet()]
 NAMES = ["newton", "active-set"]
+ALL, ALL_NAMES = [*METHODS, wl.ProximalPoint()], [*NAMES, "proximal-point"]
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 
 
 def problem(A, b, kind, lower=0.0, upper=np.inf):
     operator = wl.DenseOperator(A, device="cpu") if kind == "dense" else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
     return wl.LCP(operator, b, lower, upper)
+
+
+def solved(p, method, **more):
+    """By a method and those that take over."""
+    return wl.solve(p, wl.default_chain(method, p), **more)
 
 
 def program(rng, m, n):
@@ -29,22 +34,22 @@ def program(rng, m, n):
     return A, np.r_[c, -h]
 
 
-@pytest.mark.parametrize("method", METHODS, ids=NAMES)
+@pytest.mark.parametrize("method", ALL, ids=ALL_NAMES)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_a_quarter_turn(kind, method):
-    """y = (x_2 - 1, 1 - x_1): free blocks of one unknown are 0, and both methods once stayed at x = 0."""
-    result = wl.solve(problem(TURN, np.array([-1.0, 1.0]), kind), method, stopping=wl.StoppingCriteria(rtol=1e-9))
+    """y = (x_2 - 1, 1 - x_1): free blocks of one unknown are 0, and active-set methods alone stay at x = 0."""
+    result = solved(problem(TURN, np.array([-1.0, 1.0]), kind), method, stopping=wl.StoppingCriteria(rtol=1e-9))
     assert result, result.status
     np.testing.assert_allclose(result.x.numpy(), [1.0, 1.0], atol=1e-8)
     assert result.iterations <= 30
 
 
-@pytest.mark.parametrize("method", METHODS, ids=NAMES)
+@pytest.mark.parametrize("method", ALL, ids=ALL_NAMES)
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 @pytest.mark.parametrize("b", [(-1.0, -1.0), (1.0, -1.0)])
 def test_no_solution_is_proved(b, kind, method):
     """y_2 = -x_1 - 1 < 0 whatever x >= 0 is."""
-    assert wl.solve(problem(TURN, np.array(b), kind), method).status is wl.SolveStatus.INFEASIBLE
+    assert solved(problem(TURN, np.array(b), kind), method).status is wl.SolveStatus.INFEASIBLE
 
 
 @pytest.mark.parametrize("method", METHODS, ids=NAMES)
@@ -53,7 +58,7 @@ def test_linear_programs(kind, method):
     rng = np.random.default_rng(97)
     for _ in range(6):
         A, b = program(rng, 6, 9)
-        result = wl.solve(problem(A, b, kind), method)
+        result = solved(problem(A, b, kind), method)
         assert result, result.status
         x, c, h = result.x.numpy(), b[:9], -b[9:]
         assert x.min() >= -1e-6
@@ -66,7 +71,7 @@ def test_semidefinite_matrices_are_solved(zeros, method):
     """With 80 % zero eigenvalues 1 of 20 once was, by either method."""
     for seed in range(10):
         p = semidefinite(100, zeros=zeros, seed=seed)
-        result = wl.solve(problem(p.A, p.b, "dense"), method)
+        result = solved(problem(p.A, p.b, "dense"), method)
         assert result, (seed, result.status)
         assert result.residual == pytest.approx(natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy()), rel=1e-6, abs=1e-14)
         np.testing.assert_allclose(p.A @ (result.x.numpy() - p.solution), 0.0, atol=1e-4)  # y is unique
@@ -77,7 +82,7 @@ def test_regular_problems_take_no_proximal_step():
     B = rng.standard_normal((30, 30))
     A, b = B @ B.T / 30 + 0.1 * np.eye(30), rng.standard_normal(30)
     for method in METHODS:
-        result = wl.solve(problem(A, b, "dense"), method, stopping=wl.StoppingCriteria(rtol=1e-10))
+        result = solved(problem(A, b, "dense"), method, stopping=wl.StoppingCriteria(rtol=1e-10))
         assert "proximal point" not in {r.step for r in result.history}
         np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-8)
 
@@ -86,22 +91,37 @@ def test_the_rounding_floor_is_no_reason_for_it():
     rng = np.random.default_rng(103)
     B = rng.standard_normal((30, 30))
     p = problem(B @ B.T / 30 + 0.1 * np.eye(30), rng.standard_normal(30), "dense")
-    result = wl.solve(p, wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-30))
+    result = solved(p, wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-30))
     assert result.status is wl.SolveStatus.FLOOR
     assert "proximal point" not in {r.step for r in result.history}
 
 
-def test_operators_that_cannot_be_assembled_are_left_alone():
+def test_operators_that_cannot_be_assembled_are_refused():
     grid = wl.LCP(wl.GridPoisson(np.array([[1, 1, 0]]), device="cpu"), np.array([[1.0, -1.0, 0.0]]))
-    assert not ProximalPoint.suits(grid)
-    assert ProximalPoint.suits(problem(TURN, np.ones(2), "sparse"))
+    products = wl.LCP(wl.LinearOperator(lambda x: TURN @ x, shape=(2,)), np.ones(2))
+    for p in (grid, products):
+        with pytest.raises(ValueError, match="ProximalPoint needs"):
+            wl.solve(p, wl.ProximalPoint())
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_the_method_alone_against_lemke(kind):
+    """Semi-definite matrices of half the rank: y is unique, and x is where y = 0."""
+    for seed in range(3):
+        p = semidefinite(40, zeros=0.5, seed=seed)
+        result = wl.solve(problem(p.A, p.b, kind), wl.ProximalPoint(), stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=400))
+        assert result, result.status
+        assert {record.step for record in result.history[1:]} == {"proximal point"}
+        assert natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy()) <= 1e-7 * np.linalg.norm(p.b)
+        np.testing.assert_allclose(p.A @ (result.x.numpy() - p.solution), 0.0, atol=1e-5)
 
 
 def test_a_workspace_begins_anew():
     """After a solve that ended in the proximal-point iteration the next one, with another b, takes none."""
     b = wp.array([-1.0, 1.0], dtype=wp.float64, device="cpu")
     p = wl.LCP(wl.DenseOperator(TURN + 0.5 * np.diag([0.0, 1.0]), device="cpu"), b)
-    for method in METHODS:
+    for first in METHODS:
+        method = wl.default_chain(first, p)
         work = method.init(p)
         b.assign([-1.0, 1.0])
         assert wl.solve(p, method, workspace=work), method

@@ -52,7 +52,12 @@ class Outcome:
         A = self.problem.A
         kind = f"{A.nnz} entries, " if isinstance(A, SparseOperator) else "dense, "
         symmetry = "symmetric" if A.symmetric else "unsymmetric"
-        return f"{self.problem.layout.size} unknowns, {kind}{symmetry}, by {self.name} on {self.problem.device}"
+        return f"{self.problem.layout.size} unknowns, {kind}{symmetry}, by {self.methods} on {self.problem.device}"
+
+    @property
+    def methods(self) -> str:
+        """Names of the methods that were used, in order."""
+        return ", then ".join(dict.fromkeys(record.method or self.name for record in self.result.history))
 
     def table(self) -> Table:
         """Return the history as a table."""

@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_lcp.cli.solve_file import Outcome, criteria, method_named
 from warp_lcp.default import solve
+from warp_lcp.default_chain import default_chain
 from warp_lcp.files.atomic import replacing, replacing_by_name
 from warp_lcp.gallery.recorded import cell_counts, load_part
 from warp_lcp.operators import GridPoisson
@@ -23,7 +24,6 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import FLOAT32_ROUNDING
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
-from warp_lcp.solvers.registry import METHODS
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.decomposition import Decomposition
@@ -50,7 +50,7 @@ class GridOutcome(Outcome):
     def heading(self) -> str:
         """Return a line that says what was solved."""
         cells = " x ".join(map(str, reversed(self.shape)))
-        line = f"{self.unknowns} unknowns, {cells} cells, by {self.name} on {self.problem.device}"
+        line = f"{self.unknowns} unknowns, {cells} cells, by {self.methods} on {self.problem.device}"
         if self.decomposition is None:
             return line
         boxes = " x ".join(map(str, self.decomposition.processes))
@@ -100,8 +100,9 @@ def solve_recorded(
         ProblemError: the file or an option is wrong.
     """
     stopping = criteria(tolerance, max_iterations, max_seconds)
-    solver = ProjectedMultigrid() if method is None else method_named(method, "grid", shared=ranks is not None and ranks.size > 1)
-    name = next(name for name, kind in METHODS.items() if type(solver) is kind)
+    solver = default_chain(ProjectedMultigrid())
+    if method is not None:
+        solver = method_named(method, "grid", shared=ranks is not None and ranks.size > 1)
     try:
         shape = cell_counts(path)
         decomposition = None if ranks is None else _decomposition(shape, ranks)
@@ -109,7 +110,7 @@ def solve_recorded(
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
-    return GridOutcome(problem, solver, name, result, shape, problem.A.unknowns, decomposition)  # type: ignore[attr-defined]
+    return GridOutcome(problem, solver, method or str(result.method), result, shape, problem.A.unknowns, decomposition)  # type: ignore[attr-defined]
 
 
 def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, upper: str | None, out: Path | None) -> None:

@@ -78,7 +78,7 @@ class MethodOfChoice:
         system = contact_system(problem)
         lcp = self._model.problem(system).lcp(device=self._device)
         x0 = self._model.guess(system, start.ravel())
-        result = wl.solve(lcp, self._method(system), stopping=self._stopping, x0=x0)
+        result = wl.solve(lcp, wl.default_chain(self._method(system), lcp), stopping=self._stopping, x0=x0)
         self.status = result.status
         impulses = self._model.impulses(system, result.x.numpy()).reshape(start.shape)
         return ContactImpulses(impulses, float(result.relative_residual), result.iterations)

@@ -14,6 +14,7 @@ import scipy.interpolate
 import warp as wp
 
 from warp_lcp.default import solve
+from warp_lcp.default_chain import default_chain
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.problem.lcp import LCP
@@ -165,7 +166,8 @@ class Heston:
         payoff = np.broadcast_to(np.maximum(self.strike - S, 0) * (S[-1] > S), cells.shape)
         u, times = payoff.copy(), self.expiry * (np.arange(steps + 1) / steps) ** 2
         b = A.layout.load(u, wp.float64).reshape(A.layout.stored_shape)
-        problem, method = LCP(A, b, payoff if american else -np.inf), MinimumMapNewton()
+        problem = LCP(A, b, payoff if american else -np.inf)
+        method = default_chain(MinimumMapNewton(), problem)
         work = method.init(problem)
         for step, (before, after) in enumerate(pairwise(times)):
             share = 1.0 if step < IMPLICIT else 0.5

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from warp_lcp.default_chain import default_chain
 from warp_lcp.gallery.articulated_figure import ArticulatedFigure
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
@@ -122,7 +123,7 @@ class InverseKinematics(Settings):
     `curvature` adds -sum_k (g - f)_k f_k'' and shifts the sum to be definite.
 
     Args:
-        method: of the LCPs; the default takes any damping; with `multipliers` it must be one for semi-definite A.
+        method: of the LCPs, with its default chain; the default takes any damping; with `multipliers` it must be one for semi-definite A.
         damping: mu in units of reach^2, >= 0.
         radius: first largest change of an angle in a step [rad], > 0.
         tolerance: of the projected gradient [rad], > 0.
@@ -210,7 +211,7 @@ class InverseKinematics(Settings):
     def _step(self, model: StepProblem) -> tuple[Vector, bool, float]:
         """Return a step within its bounds, whether its LCP converged, and by how much its solution left the bounds."""
         problem = model.multipliers(device=self.device) if self.multipliers else model.lcp(device=self.device)
-        result = solve(problem, self.method, stopping=INNER)
+        result = solve(problem, default_chain(self.method, problem), stopping=INNER)
         x = result.x.numpy().astype(np.float64)
         d = model.step(x) if self.multipliers else x
         inside = np.clip(d, model.lower, model.upper)

@@ -332,7 +332,7 @@ def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary:
     settings = scene.correction
     if settings is None:
         raise ValueError("density_correction.every = 0: must be at least 1")
-    solver = wl.ProjectedMultigrid(precision=scene.solver.precision)
+    solver = wl.default_chain(wl.ProjectedMultigrid(precision=scene.solver.precision))
     return DensityCorrection(
         grid, boundary, solver, particles_a_cell=scene.particles.per_axis**grid.dimension,
         max_density=settings.largest(scene.particles.per_axis), every=settings.every, gain=scene.correction_gain, even=scene.keeps_volume,

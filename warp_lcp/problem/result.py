@@ -69,6 +69,7 @@ class Record:
         step: kind of the last step ("newton", "monotone cycle", "sweep", ...).
         seconds: wall time since the start of the solve.
         merits: the book's merit functions, with `StoppingCriteria(merits=True)`.
+        method: name in `wl.METHODS` of the method that has taken the last step.
     """
 
     iteration: int
@@ -78,6 +79,7 @@ class Record:
     step: str
     seconds: float
     merits: Merits | None = None
+    method: str | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class SolveResult(FieldsOnHost):
         history: a Record for the start and one for each step.
         grid: cells (nz, ny, nx) or (ny, nx), if a sparse matrix was recognized as a compact stencil and solved on its grid;
             else None.
-        method: name in `wl.METHODS` of the method that found x, where `wl.solve` has chosen it; None where one was given.
+        method: name in `wl.METHODS` of the method that found x.
         problem: the problem solved, for `wl.vjp`; None in a pickled result.
         version: of the problem's operator then, None where it has none.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -72,6 +73,7 @@ class Step:
         iterations: steps that it stands for, of a method that takes several at once.
         due: the residual is worth recomputing; else nothing is recorded and the solve goes on, unless a limit has come.
         final: the iterate is the result so far, though an earlier one may have had a smaller residual.
+        method: name of the method that has taken it; None: that of the solve.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Step:
     iterations: int = 1
     due: bool = True
     final: bool = False
+    method: str | None = None
 
 
 class VariationalInequality:
@@ -235,6 +238,16 @@ class Solver(Protocol):
         """Move x once. `work.residual` is current at x; leave `work.residual.current` False unless it is at the new x."""
 
 
+@cache
+def _name_of_class(name: str) -> str:
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
+
+
+def method_name(method: Any) -> str:
+    """Return a method's name: its `name` if it has one, else the words of its class, joined by hyphens."""
+    return getattr(method, "name", None) or _name_of_class(type(method).__name__)
+
+
 class Spare(Protocol):
     """A workspace of an earlier solve that has taken a problem's data.
 
@@ -267,18 +280,10 @@ def solve(
         kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"
         raise ValueError(f"solver is {kind}: expected a name in wl.METHODS or a method with its settings, such as wl.MinimumMapNewton()")
     check_criteria(stopping)
-    taken: type = getattr(solver, "problems", LCP)
-    if not isinstance(problem, taken):
-        raise ValueError(f"{type(solver).__name__} takes problems of the class {taken.__name__}: this is a {type(problem).__name__}")
-    across, loop = None, _Loop
-    if isinstance(problem, LCP):
-        across, loop = problem.layout.across, _LoopInBox
-        if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
-            raise ValueError(f"{type(solver).__name__} cannot use bounds that are affine in x: use ProjectedSOR or another sweeping method")
-        if problem.preconditioner is not None and not getattr(solver, "preconditioned", False):
-            raise ValueError(f"preconditioner: {type(solver).__name__} does not use one: use MinimumMapNewton or PrimalDualActiveSet")
-        if across is not None and not getattr(solver, "distributed", False):
-            raise ValueError(f"{type(solver).__name__} does not work on several ranks: use ProjectedMultigrid or MinimumMapNewton")
+    reason = refusal(problem, solver)
+    if reason is not None:
+        raise ValueError(reason)
+    across, loop = (problem.layout.across, _LoopInBox) if isinstance(problem, LCP) else (None, _Loop)
     stopping = stopping or StoppingCriteria()
     deadline = Deadline(stopping.max_seconds if isinstance(stopping, StoppingCriteria) else math.inf, across)
     if workspace is None and isinstance(solver, KeepsWorkspace) and (spare := solver.spare(problem)) is not None:
@@ -287,6 +292,28 @@ def solve(
         return result
     work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
     return loop(problem, solver, stopping, deadline, work, callback).run(x0)
+
+
+def refusal(problem: LCP | VariationalInequality, solver: Solver, *, preconditioned: bool = True) -> str | None:
+    """Return why a method does not take a problem, whatever its operator; None if it does.
+
+    Args:
+        problem: the problem.
+        solver: the method.
+        preconditioned: whether the method has to use the problem's preconditioner.
+    """
+    kind, taken = type(solver).__name__, getattr(solver, "problems", LCP)
+    if not isinstance(problem, taken):
+        return f"{kind} takes problems of the class {taken.__name__}: this is a {type(problem).__name__}"
+    if not isinstance(problem, LCP):
+        return None
+    if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
+        return f"{kind} cannot use bounds that are affine in x: use ProjectedSOR or another sweeping method"
+    if preconditioned and problem.preconditioner is not None and not getattr(solver, "preconditioned", False):
+        return f"preconditioner: {kind} does not use one: use MinimumMapNewton or PrimalDualActiveSet"
+    if problem.layout.across is not None and not getattr(solver, "distributed", False):
+        return f"{kind} does not work on several ranks: use ProjectedMultigrid or MinimumMapNewton"
+    return None
 
 
 def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
@@ -313,10 +340,14 @@ def _workspaces_of(method: type) -> tuple[type, ...]:
     return tuple(kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and kind is not type(None))
 
 
+def takes_floating(work: Workspace) -> bool:
+    """Return whether `start` of a workspace takes the operator's floating components."""
+    return _kind_takes_floating(type(work))
+
+
 @cache
-def _takes_floating(workspace: type) -> bool:
-    """Return whether `start` of a kind of workspace takes the operator's floating components."""
-    return "floating" in inspect.signature(workspace.start).parameters  # type: ignore[attr-defined]
+def _kind_takes_floating(kind: type) -> bool:
+    return "floating" in inspect.signature(kind.start).parameters  # type: ignore[attr-defined]
 
 
 class _Loop:
@@ -332,8 +363,10 @@ class _Loop:
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
         self.linear = 0
+        self.name = method_name(solver)
         self.floating: Any = None  # components of the operator
         self.best_iteration, self.best_norm, self.progress, self.stopped = 0, math.inf, 0, False
+        self.best_method = self.name
 
     def run(self, x0: Array | None) -> SolveResult:
         """Solve from where the workspace's iterate is, from x0 or, in a box, from clip(0, l, u)."""
@@ -342,7 +375,7 @@ class _Loop:
             return self._finish(ended, 0)
         try:
             with self.deadline:
-                given = {"floating": self.floating} if _takes_floating(type(self.work)) else {}
+                given = {"floating": self.floating} if takes_floating(self.work) else {}
                 wanted = self.work.start(warm=self.warm, tolerance=self.tolerance, **given) and self.stopping.max_iterations > 0
                 return self._iterate(None if wanted and not self.stopped else self._status(0, None))
         except TimeIsUp:  # within a step, of which nothing is left
@@ -433,7 +466,8 @@ class _Loop:
 
     def _record(self, iteration: int, step: Step) -> None:
         seconds = time.perf_counter() - self.begun
-        record = Record(iteration, self.residual.norm, self.linear, step.active, step.name, seconds, self._merits())
+        method = step.method or self.name
+        record = Record(iteration, self.residual.norm, self.linear, step.active, step.name, seconds, self._merits(), method)
         self.history.append(record)
         if self.callback is not None:
             try:
@@ -449,6 +483,7 @@ class _Loop:
         """Remember the iterate as the best one."""
         self.work.keep()
         self.best_iteration, self.best_norm = iteration, self.residual.norm
+        self.best_method = self.history[-1].method or self.name
 
     def _restore(self) -> None:
         """Take the best iterate back."""
@@ -460,8 +495,9 @@ class _Loop:
             self._restore()
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0
-        of = {"problem": self.problem, "version": version_of(self.problem.A) if isinstance(self.problem, LCP) else None}
-        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history, **of)
+        of: dict[str, Any] = {"method": self.best_method, "problem": self.problem}
+        version = version_of(self.problem.A) if isinstance(self.problem, LCP) else None
+        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history, **of, version=version)
 
     def _found(self) -> wp.array[Any]:
         """Return x as the result has it: in place."""
@@ -567,7 +603,7 @@ class _LoopInBox(_Loop):
     def _found(self) -> wp.array[Any]:
         """Return x in the layout that the problem was given in, rounded to its precision."""
         layout, x = self.problem.layout, self.work.x
-        if self.problem.in_place and isinstance(self.work, IterateMemory):
+        if self.problem.in_place and hasattr(self.work, "solution"):
             return self.work.solution()
         if self.problem.in_place:
             out = x.reshape(layout.stored_shape)

@@ -33,12 +33,13 @@ from warp_lcp.problem.preconditioner import Preconditioner
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.reduced.dense_problem import equilibration, factored
 from warp_lcp.reduced.fused_conjugate_gradient import FusedConjugateGradient
+from warp_lcp.reduced.grid_step_kernels import GAPS, SIZE
 from warp_lcp.reduced.low_rank_correction import LowRankCorrection
 from warp_lcp.reduced.sparse_system import GuardedSystem, MatrixSystem, SparseSystem
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.program import Launch, Program, launch_now
-from warp_lcp.rows.vectors import rows_of
+from warp_lcp.rows.vectors import Reduction, rows_of
 
 NUDGES = (0.0, 1e-12, 1e-9, 1e-6)  # shifts of a singular banded block, in units of the matrix's largest column sum
 
@@ -394,3 +395,30 @@ def principal_system(
     if terms is not None:
         return CoupledGridSystem(A, *terms, real, settings=settings, shifted=shifted)  # type: ignore[arg-type]
     return DiagonalSystem(problem, shifted=shifted)
+
+
+def projected_cycle(
+    problem: LCP, system: GridSystem, x: wp.array[Any], y: wp.array[Any], size: float, free: wp.array[Any], sums: Reduction, *,
+    restrict: bool = True,
+) -> None:  # fmt: skip
+    """Run one from x: the correction is `system.z` times `size`.
+
+    Args:
+        problem: a grid's.
+        system: of its corrections.
+        x: where to begin, a stored field like y and free.
+        y: A x + b.
+        size: what the right-hand side is divided by.
+        free: every unknown's, when this is done.
+        sums: memory; `SIZE` of its scalars is written.
+        restrict: whether the system does not have all unknowns yet.
+    """
+    rows, finest = Rows.flat(problem.layout.size, problem.device), system.hierarchy.finest
+    ALL_FREE.bind(rows, unknown=problem.unknown, free=free).launch()
+    if restrict:
+        system.restrict(free)
+    ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
+    sums.scalars[int(SIZE) : int(SIZE) + 1].fill_(size)
+    bounds, lo, hi = problem.bounds.operands, finest.lower, finest.upper
+    GAPS.bind(rows, bounds=bounds, x=x, unknown=problem.unknown, lo=lo, hi=hi, scalars=sums.scalars).launch()
+    system.monotone_cycle()

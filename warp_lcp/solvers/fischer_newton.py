@@ -25,9 +25,8 @@ from warp_lcp.reduced.nonsmooth_map import FiniteDifferenceSystem, HostMap, Kink
 from warp_lcp.reduced.principal_system import GridSystem, principal_system
 from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
+from warp_lcp.solvers.cold_start import ColdStart
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
-from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27
@@ -127,12 +126,11 @@ class FischerWorkspace(IterateMemory):
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
         self.settings, self.kink, layout = settings, Kink(settings.kink), problem.layout
-        self.active_set: GridNewtonWorkspace | None = None
+        self.cold_start: ColdStart | None = None
         if takes_points(problem.A) and self.kink is not Kink.APPROXIMATION:
-            newton = MinimumMapNewton(precision=settings.precision, monotone_cycles=settings.monotone_cycles, cycle=settings.cycle)
-            self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
-            self.scratch = self.active_set.scratch
-        shared: dict[str, Any] = {"x": self.active_set.x, "residual": self.active_set.residual} if self.active_set else {}
+            self.cold_start = ColdStart(problem, problem.A, settings)
+            self.scratch = self.cold_start.scratch
+        shared: dict[str, Any] = {"x": self.cold_start.x, "residual": self.cold_start.residual} if self.cold_start else {}
         super().__init__(problem, settings.precision, **shared)
         self._from, self._shift = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self.free = layout.zeros(wp.uint8)
@@ -143,7 +141,7 @@ class FischerWorkspace(IterateMemory):
             if self.kink is Kink.APPROXIMATION
             else principal_system(
                 problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True,
-                hierarchy=self.active_set.hierarchy if self.active_set else None,
+                hierarchy=self.cold_start.hierarchy if self.cold_start else None,
             )
         )  # fmt: skip
         self.map = NonsmoothMap(problem, self.residual, map_, share, self.kink)
@@ -158,14 +156,14 @@ class FischerWorkspace(IterateMemory):
         """Forget the last solve; the operator may have changed."""
         self.floating = floating
         s = self.settings
-        self.cycles_left = s.monotone_cycles if self.active_set is not None and self.problem.bounded and not warm else 0
+        self.cycles_left = s.monotone_cycles if self.cold_start is not None and self.problem.bounded and not warm else 0
         self.descents_left, self.steps, self.target = s.warm_start, 0, tolerance
         self._scale = self._merit = self._gone = 0.0
         self._search.forget()
         self.map.begin()
         self.system.refresh()
-        if self.active_set is not None:
-            self.active_set.start(warm=warm, tolerance=tolerance, floating=floating)
+        if self.cold_start is not None:
+            self.cold_start.start(warm=warm, tolerance=tolerance, floating=floating)
         if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
             p = self.problem
             free = (p.unknown.numpy() == 1) & np.isinf(p.lower.numpy()) & np.isinf(p.upper.numpy())
@@ -173,8 +171,8 @@ class FischerWorkspace(IterateMemory):
 
     def monotone_step(self) -> Step:
         """Projected multigrid cycle on all unknowns."""
-        assert self.active_set is not None
-        return self.active_set.monotone_step()
+        assert self.cold_start is not None
+        return self.cold_start.monotone_step()
 
     @property
     def _fused(self) -> bool:
@@ -185,7 +183,7 @@ class FischerWorkspace(IterateMemory):
         """Solve for the direction, and search along it."""
         s, fused = self.settings, self._fused
         if self._scale == 0:
-            if not fused and self.active_set is not None:
+            if not fused and self.cold_start is not None:
                 self.residual.affine(x)
             self._condense(x)
         size, merit = 1 / self._scale, self._merit
@@ -258,7 +256,7 @@ class FischerWorkspace(IterateMemory):
 
     def descend(self, x: wp.array[Any]) -> Step:
         """Go down the gradient of the same map once."""
-        shared = self.active_set is None  # a grid's own residual does not keep y
+        shared = self.cold_start is None  # a grid's own residual does not keep y
         if self._gradient is None:
             self._gradient = DescentWorkspace(self.problem, self._descent, self.residual if shared else NaturalResidual(self.problem))
             self._gradient.start(warm=True, tolerance=self.target)
@@ -301,7 +299,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         super().__init__(problem, settings.precision)
         self.settings, self._descent = settings, settings.descent(problem)
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
-        self.active_set: Any = None
+        self.cold_start: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
         self._gradient: DescentWorkspace | None = None
 

@@ -27,9 +27,8 @@ from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.rows import KernelFile, Known, Wave
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums, rows_of
-from warp_lcp.settings import Count, Positive, Share, ShareOrZero
-from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
-from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
+from warp_lcp.settings import Count, Positive, Share
+from warp_lcp.solvers.cold_start import ColdStart
 
 LARGEST_START = 1e6  # of the residual's norm: ||b|| up to which it gives the start's size
 
@@ -70,7 +69,6 @@ class InteriorPoint(NewtonSettings):
         mehrotra: predictor and corrector; False: the book's step rule.
         horizon: N of the book's rule, the number of steps in which it reaches the boundary.
         backoff: share of the longest step that is taken, in (0, 1).
-        crossover: hand over to MinimumMapNewton when the residual is below this multiple of the first one; 0: never.
         start: a cold start has w A_ii and s at least this multiple of the root mean square of b, or of the residual at clip(0, l, u) if
             that is larger.
         monotone_cycles: projected multigrid cycles of a cold start on a grid, from which the path is joined where it is near.
@@ -93,7 +91,6 @@ class InteriorPoint(NewtonSettings):
     mehrotra: bool = True
     horizon: Count = 100
     backoff: Share = 0.995
-    crossover: ShareOrZero = 0.0
     start: Positive = 15.0
     predictor_eta: Share = 0.3
     eta: Share = 0.2
@@ -105,19 +102,12 @@ class InteriorPoint(NewtonSettings):
         return InteriorPointWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle, a path-following step, or a Newton step.
-
-        Cycles come first, while the start is cold; Newton steps come after the crossover.
-        """
+        """Take a monotone cycle while the start is cold, else a path-following step."""
         if isinstance(work, EquilibratedWorkspace):
             return work.step(self.step)
         if work.cycles_left > 0:
             work.cycles_left -= 1
             return work.monotone_step(x)
-        if not work.crossed and work.begun and work.residual.norm <= self.crossover * work.first_norm:
-            work.cross()
-        if work.crossed:
-            return work.newton_step(x)
         if not work.begun:
             work.begin(x)
         return work.path_step(x)
@@ -191,26 +181,19 @@ class InteriorPointWorkspace(IterateMemory):
 
     Attributes:
         mu: mean of the products w s and v t, units of x y.
-        active_set: the method that makes monotone cycles and takes over at the crossover; it works on this one's residual.
+        cold_start: monotone cycles, on a grid with bounds.
     """
 
     def __init__(self, problem: LCP, settings: InteriorPoint) -> None:
         self.settings, layout = settings, problem.layout
-        self.active_set: GridNewtonWorkspace | NewtonWorkspace | None = None
-        newton = MinimumMapNewton(
-            precision=settings.precision, monotone_cycles=settings.monotone_cycles, max_linear_iterations=settings.max_linear_iterations,
-            cycle=settings.cycle,
-        )  # fmt: skip
+        self.cold_start: ColdStart | None = None
+        shared = None
         if takes_points(problem.A) and problem.bounded:
-            grid = self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
-            self.scratch, shared = grid.scratch, grid.hierarchy
-            super().__init__(problem, settings.precision, x=grid.x, residual=grid.residual)
+            cycles = self.cold_start = ColdStart(problem, problem.A, settings)
+            self.scratch, shared = cycles.scratch, cycles.hierarchy
+            super().__init__(problem, settings.precision, x=cycles.x, residual=cycles.residual)
         else:
-            shared = None
             super().__init__(problem, settings.precision)
-            if problem.bounded and settings.crossover > 0:
-                self.active_set = NewtonWorkspace(problem, newton)
-                self.active_set.residual = self.residual
         self.system: Any = principal_system(
             problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded, hierarchy=shared
         )
@@ -225,8 +208,8 @@ class InteriorPointWorkspace(IterateMemory):
         self._sums, self._longest = Sums(rows_of(self.x), 3), wp.zeros(1, dtype=wp.float64, device=problem.device)
         self._grid_sums = Sums(problem.A.stencil.rows, 3) if self._fusable else self._sums  # type: ignore[attr-defined]
         self.cycles_left = self.steps = self.count = 0
-        self.near = self.begun = self.crossed = False
-        self.mu = self.target = self.first_norm = self.size = 0.0
+        self.near = self.begun = False
+        self.mu = self.target = self.size = 0.0
 
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the path; the operator may have changed."""
@@ -235,35 +218,21 @@ class InteriorPointWorkspace(IterateMemory):
         cold_grid = self.problem.bounded and self._carries and not warm
         self.cycles_left = s.monotone_cycles if cold_grid else 0
         self.near = warm or self.cycles_left > 0
-        self.begun = self.crossed = False
+        self.begun = False
         self.steps, self.mu, self.count, self.target = 0, 0.0, 0, tolerance
-        self.first_norm = self.residual.norm
         self.system.refresh()
-        if self.active_set is not None:
-            self.active_set.start(warm=not cold_grid, tolerance=tolerance, floating=floating)
+        if self.cold_start is not None:
+            self.cold_start.start(warm=not cold_grid, tolerance=tolerance, floating=floating)
 
     def monotone_step(self, x: wp.array[Any]) -> Step:
         """Projected multigrid cycle on all unknowns."""
-        assert isinstance(self.active_set, GridNewtonWorkspace)
-        return self.active_set.monotone_step()
-
-    def cross(self) -> None:
-        """Hand over to the active-set method."""
-        assert self.active_set is not None
-        self.crossed = True
-        if isinstance(self.active_set, GridNewtonWorkspace):
-            self.active_set.classify()
-        self.active_set.start(warm=True, tolerance=self.target, floating=self.floating)
-
-    def newton_step(self, x: wp.array[Any]) -> Step:
-        """Take a step of the active-set method."""
-        assert self.active_set is not None
-        return self.active_set.step(x)
+        assert self.cold_start is not None
+        return self.cold_start.monotone_step()
 
     @property
     def is_grid(self) -> bool:
         """Whether the residual is a grid's own, which does not keep y."""
-        return isinstance(self.active_set, GridNewtonWorkspace)
+        return self.cold_start is not None
 
     @property
     def _fused(self) -> bool:

@@ -10,54 +10,42 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.multigrid.aggregates import MonotoneAggregation, suits_multigrid
+from warp_lcp.multigrid.aggregates import MonotoneAggregation
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.line_hierarchy import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
-from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.reduced.dense_problem import incompatible
 from warp_lcp.reduced.grid_step_kernels import SLOTS
 from warp_lcp.reduced.principal_system import (
     CLASSIFY,
     ON_FREE,
-    BandedSystem,
     DenseSystem,
     GridSystem,
     LineSystem,
     PrincipalSystem,
     principal_system,
+    projected_cycle,
     projected_move,
 )
 from warp_lcp.reduced.sparse_system import SparseSystem
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
+from warp_lcp.solvers.minimum_map_newton_coarse import CoarseProblem, CoarseStencilProblem
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.phases import (
-    PATH_IDLE,
-    AlgebraicSteps,
-    CoarseProblem,
-    CoarseStencilProblem,
-    GradientPhase,
-    InteriorSteps,
-    Pace,
-    ProximalPoint,
-    projected_cycle,
-)
 
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
 # unknowns from which that is six cycles for each on a grid: one costs a fifth of a Newton step, which moves the set by a row, and rows are
 # many. With 4, 8, 16 and 32 cycles a membrane on 600,000 nodes takes 16, 15, 12 and 6 Newton steps, 7.0, 5.4, 4.8 and 4.4 s
 HUGE = 1 << 16
-WEAK = 30  # iterations of a linear solve that say that its preconditioner is weak
 # growth of the residual by which a projected cycle on an operator that is not symmetric is undone, on a grid over the last one's, on a
 # matrix over the start's: torsion with wind on 250^2 nodes takes it to 11 times that, and the more nodes the more, to good effect
 RISEN, RISEN_ON_MATRIX = 10.0, 1000.0
-STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
+PROGRESS = 0.999  # equations whose residual is above this part of the smallest so far may have no solution
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
 
@@ -71,13 +59,12 @@ class MinimumMapNewton(Settings):
     Unknown i is held where x_i - y_i / d_i, with the natural residual's d, is outside [l_i, u_i]. Cold, the first steps on a grid are
     projected multigrid cycles, which find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a
     step. Each Newton correction is solved inexactly in the corrections' precision, and the step is shortened along its projection onto the
-    bounds if the residual would exceed the largest of the last `memory` ones. On a large sparse matrix, an active set that creeps all the
-    same is moved by a problem on coarse points if A is nearly a diagonally dominant M-matrix; other symmetric A whose linear solves are
-    slow get conjugate gradients within the bounds (MPRGP). Converges on a grid in a few steps; on other matrices A should be a P-matrix.
-    Where it is not, free blocks may be singular and steps fail: dense and sparse problems then continue by interior-point steps if
-    A is not symmetric, as in linear programs, and by the proximal-point iteration, whose problems have A + eps D: a P-matrix if A is
-    positive semi-definite, skew, or any other P0-matrix. Where that gains nothing either, the status says so: STAGNATED, NON_DESCENT, or
-    INFEASIBLE if a linear program proves it.
+    bounds if the residual would exceed the largest of the last `memory` ones (Grippo, Lampariello, Lucidi 1986). On a large sparse matrix,
+    an active set that creeps all the same is moved by a problem on coarse points (Brandt and Cryer 1983) if A is nearly a diagonally
+    dominant M-matrix. Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it is not, free blocks may be
+    singular and steps fail: dense problems try Levenberg-Marquardt steps of the minimum map, others end with NON_DESCENT, or with
+    STAGNATED where steps repeat themselves; INFEASIBLE if equations have no solution. `wl.solve` without a method goes on by other
+    methods (`wl.default_chain`).
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
@@ -137,18 +124,7 @@ class MinimumMapNewton(Settings):
 
 
 class NewtonWorkspace(IterateMemory):
-    """Memory of the method for one problem.
-
-    Attributes:
-        last_resort: whether another iteration takes over where steps lead nowhere, if A's entries are at hand.
-        resort: that iteration, once it has.
-        descends: whether linear solves are slow, and conjugate gradients that know the bounds have taken over.
-    """
-
-    last_resort = True
-    resort: AlgebraicSteps | InteriorSteps | ProximalPoint | None = None
-    descends = False
-    gradients: GradientPhase | None = None
+    """Memory of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
         super().__init__(problem, settings.precision)
@@ -178,17 +154,16 @@ class NewtonWorkspace(IterateMemory):
             self.cycles_left = (2 if self.problem.A.shape[0] < HUGE else 6) * self.settings.monotone_cycles
         if self.coarse is not None:
             self.coarse.start()
-        self.descends, self._may_descend, self._norm_at_start = False, self._minimizes(), 0.0
+        self._norm_at_start = 0.0
         self.free.zero_()
         self.stale = True
         self.norms: list[float] = []
         self.target = tolerance
         # dense equations, of which it is not known yet whether they have a solution; a damped step has reduced the residual
         self._equations, self._damped = isinstance(self.system, DenseSystem) and not self.bounded, False
-        self.resort, self._smallest, self._waited, self._shrinks, self._active = None, math.inf, 0, False, math.inf
+        self._least, self._shrinks, self._active = math.inf, False, math.inf
         # with an M-matrix each active set of whole steps is part of the one before, whatever the residual does
         self._monotone = isinstance(self.system, SparseSystem) and self.system.cycled and not self.problem.A.symmetric
-        self._pace = Pace(tolerance) if AlgebraicSteps.suits(self.problem) else None
         self.system.refresh()
 
     def step(self, x: wp.array[Any]) -> Step:
@@ -220,22 +195,17 @@ class NewtonWorkspace(IterateMemory):
             self.cycles_left, residual.current = 0, False
         if self.cycles_left > 0:
             self.stale = self.aggregates is not None
-        return Step("monotone cycle", 1, None)
+        return Step("monotone cycle", 1, None, interim=True)
 
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Classify, solve on the free set, move along the projected step."""
         p, residual = self.problem, self.residual
-        step = self._gradient_step(x) if self.descends else None
-        if step is None and self._may_descend and self._knows_null_space:
-            step = self._descend(x)
-        if step is not None:
-            return step
-        if self.resort is not None or (self._stalls() and self._may_resort()):
-            return self._resort(x)
-        if self._equations and (self._waited > 0 or self._damped) and residual.norm > self.target:
+        falls = residual.norm <= PROGRESS * self._least
+        if self._equations and (self._damped or not falls) and residual.norm > self.target:
             self._equations = False
             if incompatible(p):
                 return Step("newton", 0, 0, SolveStatus.INFEASIBLE)
+        self._least = min(residual.norm, self._least)
         self.norms = [*self.norms, residual.norm][-(self.settings.memory if self.settings.safeguard else 1) :]
         size = residual.norm
         moved, active, shifted, square = self._sums.of(
@@ -254,38 +224,8 @@ class NewtonWorkspace(IterateMemory):
         if square == 0:
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
-        if self._may_descend and iterations >= WEAK:
-            return self._descend(x, spent=iterations) or self.newton_step(x)
-        return self._move(x, size, iterations, int(active))
-
-    def _minimizes(self) -> bool:
-        """Return whether conjugate gradients within the bounds may take over: A has an energy, and is no matrix for coarse problems."""
-        A = self.problem.A
-        if self.coarse is None or not isinstance(self.system, SparseSystem) or not A.symmetric or self.problem.preconditioner is not None:
-            return False
-        host = A.matrix()  # type: ignore[attr-defined]
-        return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
-
-    @property
-    def _knows_null_space(self) -> bool:
-        """Whether cycles are so good that conjugate gradients within the bounds take as many as a linear solve: about one Newton step's."""
-        return isinstance(self.problem.A, SparseOperator) and self.problem.A.near_null_space is not None
-
-    def _descend(self, x: wp.array[Any], spent: int = 0) -> Step | None:
-        """Let conjugate gradients that know the bounds take over at x."""
-        self.descends, self._may_descend = True, False
-        self.gradients = self.gradients or GradientPhase(self.problem, self.system, self.settings.precision)  # type: ignore[arg-type]
-        self.gradients.start(x, self.floating, self.target)
-        return self._gradient_step(x, spent=spent)
-
-    def _gradient_step(self, x: wp.array[Any], spent: int = 0) -> Step | None:
-        """Take a batch of conjugate gradients; None, and Newton's steps again, where they lead nowhere."""
-        assert self.gradients is not None
-        step, self.stale = self.gradients.step(x, self.settings.eta, self.settings.max_linear_iterations), True
-        if step is None:
-            self.descends, self.norms = False, []
-            self.residual.evaluate(x)
-        return step and replace(step, linear_iterations=step.linear_iterations + spent)
+        step = self._move(x, size, iterations, int(active))
+        return replace(step, interim=step.interim or self._shrinks)
 
     def _coarse_step(self, x: wp.array[Any], active: int) -> Step:
         """Correct x, with held unknowns at their bounds, by the coarse problem."""
@@ -294,7 +234,7 @@ class NewtonWorkspace(IterateMemory):
         residual.affine(x)
         self.trial.assign(self.coarse.correction(p, x.numpy(), residual.y.numpy()))
         self._correct(x, self.trial, 1.0, x)
-        self.norms, self.stale, self._smallest, self._waited = [], True, math.inf, 0
+        self.norms, self.stale, self._least = [], True, math.inf
         return Step("coarse problem", 1, active, interim=True)
 
     def _solve(self, norm: float, size: float, *, settled: bool) -> int:
@@ -303,8 +243,7 @@ class NewtonWorkspace(IterateMemory):
         if self.floating is not None:
             self.floating.project(self.system.r, self.free)
         target = 0.3 * self.target / size
-        most = min(s.max_linear_iterations, WEAK) if self._may_descend else s.max_linear_iterations
-        return self.system.solve(max((s.eta**2 if settled else s.eta) * norm, target), most)[0]
+        return self.system.solve(max((s.eta**2 if settled else s.eta) * norm, target), s.max_linear_iterations)[0]
 
     def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
         """Accept the longest of the halved, projected steps that the safeguard allows."""
@@ -338,39 +277,7 @@ class NewtonWorkspace(IterateMemory):
         wp.copy(x, self.trial)
         descended = isinstance(self.system, DenseSystem) and self._regularized(x, limit)
         residual.evaluate(x)
-        if not descended and self._may_resort():
-            return self._resort(x)
         return Step("regularized", iterations, active, None if descended else SolveStatus.NON_DESCENT)
-
-    def _stalls(self) -> bool:
-        """Return whether no residual of the last steps is below all those before, or on a grid they fall too slowly."""
-        norm = self.residual.norm
-        if self._pace is not None:
-            self._pace.record(norm)
-            if self._pace.crawls:
-                return True
-        self._waited = 0 if norm <= 0.999 * self._smallest or self._shrinks else self._waited + 1
-        self._smallest = min(self._smallest, norm)
-        return self._waited >= STALLED
-
-    def _may_resort(self) -> bool:
-        """Return whether another iteration can be had, and the residual is above what rounding leaves."""
-        if not self.settings.safeguard:
-            return False
-        floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
-        return self.last_resort and self.residual.norm > floor and (ProximalPoint.suits(self.problem) or AlgebraicSteps.suits(self.problem))
-
-    def _resort(self, x: wp.array[Any]) -> Step:
-        """Take a step of the last resort."""
-        if self.resort is None:
-            if AlgebraicSteps.suits(self.problem):
-                self.resort = AlgebraicSteps(self.problem, self.problem.A, x, self.target)  # type: ignore[arg-type]
-            else:
-                patience = StoppingCriteria.patience if isinstance(self.system, BandedSystem) else PATH_IDLE  # where steps are cheap
-                self.resort = InteriorSteps(self.problem, self.residual, self.target, patience=patience)
-        step = self.resort.step(x)
-        self._round(x)
-        return step
 
     def _regularized(self, x: wp.array[Any], limit: float) -> bool:
         """Take the shortest of some Levenberg-Marquardt steps of the minimum map that reduces its norm; return whether one does.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -216,14 +215,11 @@ class DirectNewtonWorkspace(IterateMemory):
             if taken is not None:
                 return taken
             self._hand_over(x)
-        step: Step = self.settings.step(self.problem, self.rest, x)
-        self._grace -= 1
-        return replace(step, interim=step.interim or self._grace >= 0)
+        return self.settings.step(self.problem, self.rest, x)
 
     def _hand_over(self, x: wp.array[Any]) -> None:
         """Let safeguarded steps go on from the best iterate."""
         self.restore()
-        self._grace = IDLE
         self.residual.evaluate(x)
         self.residual.current = False
         self.rest = self.settings.safeguarded(self.problem)

@@ -72,14 +72,11 @@ class GridNewtonWorkspace(MultigridWorkspace):
         problem: the problem.
         A: its operator.
         settings: the method.
-        serves: whether another method makes the cold start or ends with this one, on the same x, residual and hierarchy, whose finest
-            diagonal then takes its shifts, and keeps the best iterate.
     """
 
-    def __init__(self, problem: LCP, A: HasStencil, settings: MinimumMapNewton, *, serves: bool = False) -> None:
-        super().__init__(problem, A, settings, shifted=serves)  # type: ignore[arg-type]
-        self._newton, self._norms, self._target, self._serves = settings, list[float](), 0.0, serves
-        self._stored = serves  # elsewhere
+    def __init__(self, problem: LCP, A: HasStencil, settings: MinimumMapNewton) -> None:
+        super().__init__(problem, A, settings)  # type: ignore[arg-type]
+        self._newton, self._norms, self._target = settings, list[float](), 0.0
 
     def _residual(self, problem: LCP, rounded: bool) -> MinimumMapResidual:
         return MinimumMapResidual(problem, self.A, self.hierarchy, rounded=rounded)
@@ -87,9 +84,6 @@ class GridNewtonWorkspace(MultigridWorkspace):
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the search direction and the residuals; the operator may have changed."""
         self._norms, self._target = [], tolerance
-        if self._serves:  # who shares the hierarchy may have written its finest diagonal since it was coarsened
-            self.hierarchy.finest.changed.fill_(1)
-            self.distrust_hierarchy()
         super().start(warm=warm, tolerance=tolerance, floating=floating)
 
     def wants_monotone_cycle(self) -> bool:
@@ -122,13 +116,6 @@ class GridNewtonWorkspace(MultigridWorkspace):
         if sinks or not residual.norm > (1 - DECREASE) * limit or not math.isfinite(residual.norm) or not self.bounded:
             return Step("newton", iterations, active, interim=sinks)
         return self._shorten(limit, iterations, active)
-
-    def classify(self) -> None:
-        """Evaluate the residual and the active set at an x that another method has made."""
-        residual = self.residual
-        residual.set(engine.STEP, 0.0)
-        residual.set(engine.SIZE, residual.norm)
-        residual.evaluate(self.x, classify=True)
 
     def _creeps(self) -> bool:
         """Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard has the word."""

@@ -24,13 +24,12 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
 from warp_lcp.reduced import grid_step_kernels as engine
 from warp_lcp.reduced.descent import Descent
-from warp_lcp.reduced.principal_system import DiagonalSystem, principal_system, projected_move
+from warp_lcp.reduced.principal_system import DiagonalSystem, principal_system, projected_cycle, projected_move
 from warp_lcp.reduced.sparse_system import SparseSystem
 from warp_lcp.rows import KernelFile, Rows
 from warp_lcp.rows.fields import zeros_like
 from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
-from warp_lcp.solvers.phases import projected_cycle
 from warp_lcp.sweeps.sweep import Diagonal
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/gradient_projection.h")
@@ -78,23 +77,25 @@ class MPRGP(Settings):
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
-    def init(self, problem: LCP, system: SparseSystem | None = None) -> MPRGPWorkspace:
+    def init(self, problem: LCP) -> MPRGPWorkspace:
         """Return a workspace.
-
-        Args:
-            problem: the problem.
-            system: a sparse matrix's principal system to share, by a method that has checked A.
 
         Raises:
             ValueError: A is not symmetric, or has a negative diagonal entry.
         """
-        if system is not None:
-            return MPRGPWorkspace(problem, self, system)
+        return self._checked(problem, None)
+
+    def init_after(self, problem: LCP, before: Any) -> MPRGPWorkspace:
+        """Return a workspace with the preconditioner of the method before, if that is a sparse matrix's; raises as `init`."""
+        system = getattr(before, "system", None)
+        return self._checked(problem, system if isinstance(system, SparseSystem) else None)
+
+    def _checked(self, problem: LCP, system: SparseSystem | None) -> MPRGPWorkspace:
         if not problem.A.symmetric:
             raise ValueError(
                 "A is not symmetric: MPRGP minimizes an energy that exists only for a symmetric A; use MinimumMapNewton or Lemke"
             )
-        work = MPRGPWorkspace(problem, self)
+        work = MPRGPWorkspace(problem, self, system)
         negative = np.count_nonzero(Diagonal(problem, work.residual).values() < 0)
         if negative:
             raise ValueError(f"A has {negative} negative diagonal entries: MPRGP needs a positive semi-definite A")

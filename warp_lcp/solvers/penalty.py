@@ -19,8 +19,7 @@ from warp_lcp.reduced.settings import NewtonSettings
 from warp_lcp.rows import KernelFile
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Positive, Share
-from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
+from warp_lcp.solvers.cold_start import ColdStart
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]
@@ -95,16 +94,15 @@ class PenaltyWorkspace(IterateMemory):
 
     def __init__(self, problem: LCP, settings: Penalty) -> None:
         self.settings, layout = settings, problem.layout
-        self.active_set: GridNewtonWorkspace | None = None
+        self.cold_start: ColdStart | None = None
         if takes_points(problem.A):
-            newton = MinimumMapNewton(precision=settings.precision, monotone_cycles=settings.monotone_cycles, cycle=settings.cycle)
-            self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
-            self.scratch = self.active_set.scratch
-        shared: dict[str, Any] = {"x": self.active_set.x, "residual": self.active_set.residual} if self.active_set else {}
+            self.cold_start = ColdStart(problem, problem.A, settings)
+            self.scratch = self.cold_start.scratch
+        shared: dict[str, Any] = {"x": self.cold_start.x, "residual": self.cold_start.residual} if self.cold_start else {}
         super().__init__(problem, settings.precision, **shared)
         self.system: Any = principal_system(
             problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True,
-            hierarchy=self.active_set.hierarchy if self.active_set else None,
+            hierarchy=self.cold_start.hierarchy if self.cold_start else None,
         )  # fmt: skip
         self.side, self._shift = layout.zeros(wp.int8), layout.zeros(wp.float64)
         self._free, self._inside = layout.zeros(wp.uint8), layout.zeros(wp.uint8)
@@ -115,18 +113,18 @@ class PenaltyWorkspace(IterateMemory):
         """Forget the set and the last stiffness; the operator may have changed."""
         self.floating = floating
         s = self.settings
-        self.cycles_left = s.monotone_cycles if self.active_set is not None and self.problem.bounded and not warm else 0
+        self.cycles_left = s.monotone_cycles if self.cold_start is not None and self.problem.bounded and not warm else 0
         self.rho, self.steps, self.target = s.rho, 0, tolerance
         self._excess, self._moved, self._stale = 0.0, math.inf, True
         self.side.zero_()
         self.system.refresh()
-        if self.active_set is not None:
-            self.active_set.start(warm=warm, tolerance=tolerance, floating=floating)
+        if self.cold_start is not None:
+            self.cold_start.start(warm=warm, tolerance=tolerance, floating=floating)
 
     def monotone_step(self) -> Step:
         """Projected multigrid cycle on all unknowns."""
-        assert self.active_set is not None
-        return self.active_set.monotone_step()
+        assert self.cold_start is not None
+        return self.cold_start.monotone_step()
 
     def policy_step(self, x: wp.array[Any]) -> Step:
         """Solve with a penalty on the unknowns beyond their bounds, then update that set."""

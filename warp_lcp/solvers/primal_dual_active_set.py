@@ -15,13 +15,13 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasScale, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.reduced.dense_problem import DenseProblem, pivots_of
 from warp_lcp.reduced.principal_system import projected_move
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
-from warp_lcp.solvers.phases import ProximalPoint
 
 LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
 STUCK = 2  # steps on one set that leave the residual where it is: its free block is singular
@@ -38,11 +38,11 @@ class PrimalDualActiveSet(Settings):
 
     With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it is above, else free: y_i = 0 there. This
     is MinimumMapNewton's step without search or projection, and shares its implementation. Started anywhere it ends after finitely many
-    steps if A is an M-matrix;
-    on other P-matrices it may cycle. If a set recurs without a smaller residual, dense problems continue by
-    least-index principal pivoting (Murty; with bounds Judice and Pires), which is finite for every P-matrix but may be slow; others by
-    MinimumMapNewton's safeguarded steps. If a free block is singular (never in a P-matrix), dense and sparse problems continue by the
-    proximal-point iteration. Cold, the first steps on a grid are projected multigrid cycles.
+    steps if A is an M-matrix; on other P-matrices it may cycle. If a set recurs without a smaller residual, dense problems continue by
+    least-index principal pivoting (Murty 1974; with bounds Judice and Pires 1992), which is finite for every P-matrix but may be slow;
+    others end with STAGNATED. So does a solve that meets a singular free block (never in a P-matrix): its set stays while the residual
+    does not fall, the residual grows by 1e7, or the block's condition number exceeds 1e12. Cold, the first steps on a grid are
+    projected multigrid cycles.
 
     `linear_iterations` counts as in MinimumMapNewton; a least-index pivot counts one.
 
@@ -53,6 +53,8 @@ class PrimalDualActiveSet(Settings):
         eta: each linear solve reduces its residual by this factor, or to the accuracy that the whole solve still needs.
         max_linear_iterations: maximum number of conjugate-gradient iterations of one step.
         cycle: settings of multigrid cycles.
+        stop_if_singular: end with STAGNATED where a free block is singular; False: pivot on by least squares, for matrices that are
+            regular but for rounding.
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
@@ -64,10 +66,11 @@ class PrimalDualActiveSet(Settings):
     eta: Share = 0.01
     max_linear_iterations: Count = 200
     cycle: CycleSettings = field(default_factory=CycleSettings)
+    stop_if_singular: bool = True
 
     def as_newton(self) -> MinimumMapNewton:
         """Return the MinimumMapNewton method for operators that are not dense."""
-        return MinimumMapNewton(**{f.name: getattr(self, f.name) for f in fields(self)})
+        return MinimumMapNewton(**{f.name: getattr(self, f.name) for f in fields(self) if f.name != "stop_if_singular"})
 
     def init(self, problem: LCP) -> ActiveSetWorkspace:
         """Return a workspace.
@@ -75,13 +78,10 @@ class PrimalDualActiveSet(Settings):
         Raises:
             ValueError: as in MinimumMapNewton.
         """
-        return ActiveSetWorkspace(problem, self.as_newton())
+        return ActiveSetWorkspace(problem, self.as_newton(), stop_if_singular=self.stop_if_singular)
 
     def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a full step.
-
-        After a recurring set the step is safeguarded.
-        """
+        """Take a monotone cycle while the start is cold, else a full step, or least-index pivots after a recurring set."""
         return work.step(x)
 
 
@@ -96,6 +96,10 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
     places: np.ndarray | None = None
 
+    def __init__(self, problem: LCP, settings: MinimumMapNewton, *, stop_if_singular: bool) -> None:
+        self._stops, self._watched = stop_if_singular, stop_if_singular and has(problem.A, HasRows) and has(problem.A, HasScale)
+        super().__init__(problem, settings)
+
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the sets; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance, floating=floating)
@@ -109,37 +113,35 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if self.places is not None:
             return self.least_index_step(x)
         step = super().newton_step(x)
-        if step.linear_iterations == 0 and self.resort is None and self._cycles(x) and isinstance(self.problem.A, DenseOperator):
-            return self.least_index_step(x)  # every unknown is held
+        held = step.linear_iterations == 0 and step.failure is None  # every unknown is
+        if held and self._cycles(x) and isinstance(self.problem.A, DenseOperator):
+            return self.least_index_step(x)
         return step
-
-    def _stalls(self) -> bool:
-        """Return whether safeguarded steps stall; whole ones may take the residual up on the way."""
-        return self.cycled and super()._stalls()
 
     def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
         """Take the whole step, without a search: the base class has classified, and solved on the free set."""
         p = self.problem
         cycles = self._cycles(x)
-        if self._stuck >= STUCK and self._may_resort():
-            return self._resort(x)
+        if self._stops and self._stuck >= STUCK:
+            return Step("active set", iterations, active, SolveStatus.STAGNATED)
+        if cycles and isinstance(p.A, DenseOperator):
+            return self.least_index_step(x)
         if cycles:
-            return self.least_index_step(x) if isinstance(p.A, DenseOperator) else super()._move(x, size, iterations, active)
-        watched = ProximalPoint.suits(p) and self.last_resort
-        if watched:
+            return Step("active set", iterations, active, SolveStatus.STAGNATED)
+        if self._watched:
             wp.copy(self.trial, x)
         bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
         projected_move(self._sums.rows, bounds, x, self.system.e, size, x)
         self._finish_move(x)
         norm = self.residual.evaluate(x)
-        if watched and not norm <= BLOWN * self.first:  # the free block is all but singular
+        if self._watched and not norm <= BLOWN * self.first:  # the free block is all but singular
             wp.copy(x, self.trial)
             self.residual.evaluate(x)
-            return self._resort(x)
+            return Step("active set", iterations, active, SolveStatus.STAGNATED)
         if norm <= self.target:  # x may miss its bounds by what the criteria allow
             self.residual.start(x, keep=True)
             self._round(x)
-        return Step("active set", iterations, active, interim=watched and self._moved)  # whole steps may first take the residual up
+        return Step("active set", iterations, active, interim=self._watched and self._moved)  # whole steps may first take the residual up
 
     def _cycles(self, x: wp.array[Any]) -> bool:
         """Return whether the set has come again, now or before, without a residual much smaller than then."""
@@ -159,8 +161,6 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
     def least_index_step(self, x: wp.array[Any]) -> Step:
         """Some pivots of the first unknown that violates its condition; interim until none does."""
-        if self.resort is not None:
-            return self._resort(x)
         own = DenseProblem.read(self.problem)
         data, units = own.scaled()
         if self.places is None:
@@ -168,15 +168,13 @@ class ActiveSetWorkspace(NewtonWorkspace):
             self.places = np.where(free, FREE, np.where(at == own.upper, UPPER, LOWER))
         pivots, most = 0, pivots_of(None, len(data.b)) * 8
         values, violated, singular = _basic_solution(data, self.places)
-        while violated.size and pivots < most and not (singular and self.last_resort) and not time_is_up():
+        while violated.size and pivots < most and not (singular and self._stops) and not time_is_up():
             self.places[violated[0]] = _other_place(data, self.places, values, int(violated[0]))
             values, violated, singular = _basic_solution(data, self.places)
             pivots += 1
         self._pivots += pivots
         lost = singular or not np.isfinite(values).all() or self._pivots > PIVOTS * len(data.b)
-        if lost and violated.size and self._may_resort():  # A is no P-matrix
-            return self._resort(x)
-        if not np.isfinite(values).all() or (lost and not self.last_resort):
+        if not np.isfinite(values).all() or (lost and violated.size):  # A is no P-matrix
             return Step("least index", pivots, None, SolveStatus.STAGNATED)
         stored = x.numpy().copy()
         stored[own.rows] = units * np.clip(values, data.lower, data.upper)

@@ -11,6 +11,7 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasColumns, HasStencil, check_taken, has
+from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.problem.spare_workspace import SpareWorkspace, lend
 from warp_lcp.settings import Count, CountOrZero, Settings
@@ -30,8 +31,9 @@ class ProjectedMultigrid(Settings):
     the step onto the bounds. There are no inner tolerances: without bounds this is preconditioned conjugate gradients with a true
     residual, and the same code is the linear solver. Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`): where it falls evenly
     while the free set moves, a contact's boundary creeps by a layer of cells a step, and a monotone cycle follows; where `patience` steps
-    set no new least energy, monotone cycles follow, twice as many each time. Where cycles are slow (channels a cell wide, coefficients that
-    are random over decades), the solve continues by `MinimumMapNewton` on the grid's matrix, if it is not distributed over ranks.
+    set no new least energy, monotone cycles follow, twice as many each time; beside rigid bodies the third run of them ends the solve with
+    STAGNATED. Cycles are slow in channels a cell wide and where coefficients are random over decades: `wl.solve` without a method then
+    goes on by `MinimumMapNewton` on the assembled matrix (`wl.default_chain`).
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
@@ -79,10 +81,11 @@ class ProjectedMultigrid(Settings):
         """Take a monotone cycle or a truncated one.
 
         Monotone cycles come while the start is cold and where steps do not lower the energy;
-        truncated ones otherwise, on the matrix if they are slow.
+        truncated ones otherwise.
         """
-        if work.crawls():
-            return work.algebraic_step()
+        if work.goes_in_circles:
+            work.residual.current = True
+            return Step("truncated cycle", 0, work.residual.active, SolveStatus.STAGNATED)
         if work.wants_monotone_cycle():
             return work.monotone_step()
         return work.truncated_step()

@@ -11,7 +11,6 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
-from warp_lcp.problem.solve import Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as kernels
 from warp_lcp.reduced import low_rank_correction as coupling
@@ -19,15 +18,13 @@ from warp_lcp.reduced.low_rank_correction import LowRankCorrection
 from warp_lcp.rows.program import Launch, LaunchGraph, Program, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.vectors import CONVERT, rows_of
-from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.phases import Inner
 from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 
-RELAPSES = 3  # runs of monotone cycles that were due, from which on steps are Newton's
+RELAPSES = 3  # runs of monotone cycles that were due, after which the free set goes round in circles
 
 
 class CoupledResidual(AssessedResidual):
@@ -90,8 +87,6 @@ class CoupledWorkspace(MultigridWorkspace):
         self.readings = (low.products, *self.correction.readings)
         self._prepared = False  # whether potentials have been made as the solve began
         low.products_of = self.x if problem.layout.across is None else None
-        self._newton: Inner | None = None
-        self._searches = False  # whether steps are Newton's
 
     def _residual(self, problem: LCP, rounded: bool) -> CoupledResidual:
         return CoupledResidual(problem, self.A, self._low, self.hierarchy, rounded=rounded)
@@ -99,7 +94,7 @@ class CoupledWorkspace(MultigridWorkspace):
     def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> None:
         """Forget the search direction; operator and bodies may have changed."""
         super().start(warm=warm, tolerance=tolerance, floating=floating)
-        self._fresh, self._searches = True, False
+        self._fresh = True
 
     def begin_ahead(self, guess: wp.array[Any] | None, criteria: StoppingCriteria | MeanCriteria, steps: int) -> float | None:
         """Begin a solve, and take steps, without the host, see `MultigridWorkspace`."""
@@ -109,27 +104,14 @@ class CoupledWorkspace(MultigridWorkspace):
         self._prepared = reference is not None and self.correction.is_made_ahead
         return reference
 
-    def crawls(self) -> bool:
-        """Take note of the pace; bodies have no part in the grid's matrix, so it is Newton's steps that take over."""
-        self._pace.record(self.residual.norm)
-        return False
-
     @property
-    def _fails(self) -> bool:
-        """Whether truncated steps go round in circles or hardly move."""
-        return self._searches or self.descent.runs >= RELAPSES or self._pace.crawls
+    def goes_in_circles(self) -> bool:
+        """Whether the free set keeps coming again.
 
-    def wants_monotone_cycle(self) -> bool:
-        """Return whether the next step is none of truncated multigrid."""
-        return self._fails or super().wants_monotone_cycle()
-
-    def monotone_step(self) -> Step:
-        """Projected cycle of the grid on all unknowns, and as much of it as lowers the energy of grid and bodies most.
-
-        Where the free set keeps going round in circles, a Newton step instead, which searches along its path: what a projection does to
-        the force on a body that weighs next to nothing is a leap each time, and the energy lets projected cycles of the grid hardly move.
+        What a projection does to the force on a body that weighs next to nothing is a leap each time, and the energy of grid and bodies
+        lets projected cycles of the grid hardly move.
         """
-        return self._newton_step() if self._fails else super().monotone_step()
+        return self.descent.runs >= RELAPSES
 
     def _begin_cycles(self, count: int) -> None:
         self._cycles_left = count
@@ -151,22 +133,6 @@ class CoupledWorkspace(MultigridWorkspace):
     def _plan_monotone_step(self, launch: Launch) -> None:
         self._sum_products(launch=launch)
         launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars, True], device=self.problem.device)
-
-    def _newton_step(self) -> Step:
-        """Take a step of Newton's method on the minimum map, whose memory is made when the first solve needs it."""
-        p, settings = self.problem, MinimumMapNewton(precision=self.precision.value, cycle=self.settings.cycle)
-        newton = self._newton = self._newton or Inner(settings, p)
-        if not self._searches:
-            self.restore()
-            self._searches = True
-            newton.begin(self.x, self._tolerance, floating=self.floating)
-        self._store()
-        self._past += 1
-        self.free_set_noted = False
-        done = newton.step()
-        wp.copy(self.x, newton.work.x)
-        self.residual.evaluate(self.x)
-        return done
 
     def rebuild(self, *, classify: bool) -> None:
         """Follow the free set, with the correction too."""

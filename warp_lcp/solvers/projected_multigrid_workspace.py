@@ -18,7 +18,7 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
+from warp_lcp.problem.solve import IterateMemory, Precision, Step
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.reduced import grid_step_kernels as kernels
 from warp_lcp.reduced.descent import Descent
@@ -28,12 +28,13 @@ from warp_lcp.rows.program import Launch, Program, as_one_table, launch_now
 from warp_lcp.rows.program import launch as launch_recorded
 from warp_lcp.rows.readings import Reading
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers.phases import FIRST, AlgebraicSteps, Pace
 from warp_lcp.solvers.projected_multigrid_ahead import RunAhead
 
 if TYPE_CHECKING:
     from warp_lcp.reduced.low_rank_correction import LowRankCorrection
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+
+AHEAD = 20  # steps that the device may take without the host: then their pace is looked at
 
 
 class AssessedResidual(NaturalResidual):
@@ -208,8 +209,7 @@ class MultigridWorkspace(IterateMemory):
         self.scratch = self._scratch() if real is wp.float32 else None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
         self._cycles_left, self.descent = 0, Descent(self.precision.epsilon)
-        self._tolerance, self._pace = 0.0, Pace(0.0)
-        self._algebraic: AlgebraicSteps | None = None
+        self._tolerance, self._taken = 0.0, 0  # steps of this solve
         self._ahead = RunAhead(self) if type(self) is MultigridWorkspace and RunAhead.suits(self) else None
         self._built = 0  # the version of the free set that the hierarchy has
         self._budget, self._begun = 0, False  # steps that the device may take without the host; whether it has begun the solve
@@ -225,7 +225,7 @@ class MultigridWorkspace(IterateMemory):
 
     def forget_solve(self) -> None:
         """Free what only the last solve needed, and the search direction, which no step must see again."""
-        self._algebraic = self.floating = None
+        self.floating = None
         self._p.zero_()
         if self._ahead is not None:
             self._ahead.forget_guess()
@@ -242,7 +242,7 @@ class MultigridWorkspace(IterateMemory):
         if self._ahead is None or guess is None or guess.ptr == self.x.ptr or steps <= 0:
             return None
         self.floating = None
-        reference = self._ahead.begin(guess, criteria, min(steps, FIRST))
+        reference = self._ahead.begin(guess, criteria, min(steps, AHEAD))
         self._begun = reference is not None
         return reference
 
@@ -317,7 +317,7 @@ class MultigridWorkspace(IterateMemory):
         self.floating = floating
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self.descent.start(self.residual.energy, self.residual.norm)
-        self._tolerance, self._pace, self._algebraic = tolerance, Pace(tolerance), None
+        self._tolerance, self._taken = tolerance, 0
         if self._begun:
             self._begun = False
             return
@@ -335,25 +335,15 @@ class MultigridWorkspace(IterateMemory):
         elif rescale or (classify and not self.residual.classified and self.bounded):
             self.residual.evaluate(self.x, classify)
 
-    def crawls(self) -> bool:
-        """Return whether cycles have been too slow for the tolerance, above what rounding leaves, where a matrix can be had."""
-        if self._algebraic is not None:
-            return True
-        self._pace.record(self.residual.norm)
-        if not self._pace.crawls or not self.exact or self.problem.layout.across is not None:
-            return False
-        return self.residual.norm > FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
+    @property
+    def goes_in_circles(self) -> bool:
+        """Whether steps have been found to lead nowhere."""
+        return False
 
-    def algebraic_step(self) -> Step:
-        """Newton step on the grid's matrix, from the iterate on that has the least energy, nearly, whatever its residual."""
-        if self._algebraic is None:
-            self._algebraic = AlgebraicSteps(self.problem, self.A, self.x, self._tolerance)
-        self._store()
-        self._past += 1
-        done = self._algebraic.step(self.x)
-        self._round(self.x)
-        self.residual.evaluate(self.x, classify=True)
-        return done
+    @property
+    def is_ahead(self) -> bool:
+        """Whether the device has taken steps that the host does not know of yet."""
+        return self._ahead is not None and bool(self._ahead.rows)
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
@@ -374,6 +364,7 @@ class MultigridWorkspace(IterateMemory):
         descent = self.descent
         self._leave()
         self._budget -= 1
+        self._taken += 1
         classify = self._cycles_left == 1  # truncated cycles come next
         plain = type(self) is MultigridWorkspace and self._ahead is not None  # others read on the way
         with as_one_table(self.problem.device, self.problem.layout.across) if plain else nullcontext():
@@ -406,6 +397,7 @@ class MultigridWorkspace(IterateMemory):
         active = self.residual.active
         self._leave()
         self._budget -= 1
+        self._taken += 1
         if not self._has_run_ahead():
             self.rebuild(classify=True)
             if self.floating is None:
@@ -425,7 +417,7 @@ class MultigridWorkspace(IterateMemory):
 
     def _has_run_ahead(self) -> bool:
         """Let the device take a step, and those that follow it; return whether it has, and take over what came of one."""
-        ahead, left = self._ahead, min(self._budget + 1, FIRST - self._pace.taken)
+        ahead, left = self._ahead, min(self._budget + 1, AHEAD - self._taken)
         if ahead is None or self.floating is not None:
             return False
         starts = left > 0 and (self._rounded is None or self._past == 1)  # from the best iterate, where steps cannot be taken back

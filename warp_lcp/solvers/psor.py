@@ -56,6 +56,7 @@ class ProjectedSOR(Settings):
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
     """
 
+    name: ClassVar[str] = "psor"
     supports: ClassVar = (Relaxes, HasRows)
     needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
     affine_bounds: ClassVar[bool] = True

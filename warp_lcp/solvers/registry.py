@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 from warp_lcp.problem.protocol import families
+from warp_lcp.settings import nearest
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.direct_enumeration import DirectEnumeration
@@ -20,7 +21,6 @@ from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
-from warp_lcp.solvers.method_table import METHODS
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.nncg import NNCG
@@ -29,12 +29,41 @@ from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.proximal_gauss_seidel import ProximalGaussSeidel
+from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
-METHODS.update(
+ALSO = {
+    "ipm": "interior-point",
+    "pgs": "psor",
+    "sor": "psor",
+    "gauss-seidel": "psor",
+    "jacobi": "projected-jacobi",
+    "simplex": "lemke",
+    "piqp": "quadratic-program",
+}
+
+
+class Methods(dict[str, type[Any]]):
+    """Methods by their names; an unknown one's KeyError says which is meant, or which there are."""
+
+    def __missing__(self, name: str) -> type[Any]:
+        """Refuse a name that no method has."""
+        raise KeyError(f"no such method: {name!r}; {self.nearest(name)}")
+
+    def nearest(self, name: object) -> str:
+        """Return `did you mean ...?` for initials, class names and synonyms, else `settings.nearest`."""
+        word = str(name).lower().replace("_", "-").replace(" ", "-")
+        for known, kind in self.items():
+            initials = "".join(part[0] for part in known.split("-"))
+            if ALSO.get(word, known) == known and (word in ALSO or word in (initials, kind.__name__.lower())):
+                return f"did you mean {known!r}?"
+        return nearest(word, self)
+
+
+METHODS = Methods(
     {
         "accelerated-projected-gradient": AcceleratedProjectedGradient,
         "blocked-gauss-seidel": BlockedGaussSeidel,
@@ -52,6 +81,7 @@ METHODS.update(
         "projected-jacobi": ProjectedJacobi,
         "projected-multigrid": ProjectedMultigrid,
         "proximal-gauss-seidel": ProximalGaussSeidel,  # of `FrictionalContact`
+        "proximal-point": ProximalPoint,
         "psor": ProjectedSOR,
         "quadratic-program": QuadraticProgram,
         "staggering": Staggering,

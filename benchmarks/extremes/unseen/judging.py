@@ -120,7 +120,7 @@ def by_method(name: str, problem: Problem, device: str, solve: Solve = wl.solve)
     operator = "grid" if isinstance(problem, GridProblem) else "sparse" if scipy.sparse.issparse(problem.matrix) else "dense"
     if operator not in families(method) or unknowns > getattr(method, "most_unknowns", np.inf):
         return "not for it", []
-    asked = SolveCase(METHODS_FAMILY, name, lambda: problem, name, stopping=CRITERIA, solve=solve)
+    asked = SolveCase(METHODS_FAMILY, name, lambda: problem, name, stopping=CRITERIA, solve=solve, alone=True)
     attempt = case.in_time(asked, getattr(method, "precision", "mixed"), device)
     if attempt.status == REFUSED:
         return REFUSED, [] if attempt.message else ["refused without a message"]

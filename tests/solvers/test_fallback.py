@@ -1,0 +1,305 @@
+"""`wl.Fallback` against a plain loop: which method is asked in which step, what it is handed, and who is named."""
+
+import pickle
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import scipy.sparse
+import warp as wp
+
+import warp_lcp as wl
+from oracle import natural_residual
+from warp_lcp.default_chain import PathCreeps
+from warp_lcp.problem.solve import IterateMemory, Step, method_name
+from warp_lcp.solvers.fallback import FIRST, Progress
+
+TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
+LINES = wl.StoppingCriteria(rtol=1e-12, max_iterations=60)
+
+
+class Memory(IterateMemory):
+    """Of a toy: where each start was, and with what tolerance."""
+
+    def start(self, *, warm, tolerance):
+        self.begun, self.warm, self.tolerance, self.taken = self.x.numpy().copy(), warm, tolerance, 0
+
+
+@dataclass(frozen=True)
+class Shrink:
+    """Multiply the distance to the solution 1 of x = 1 by a rate in each step."""
+
+    rate: float
+    name: str = "shrink"
+    fails_after: int = 1000
+    linear: int = 1
+    works: list = field(default_factory=list, compare=False, hash=False)
+
+    def init(self, problem):
+        self.works.append(Memory(problem))
+        return self.works[-1]
+
+    def step(self, problem, work, x):
+        work.taken += 1
+        x.assign(1 - self.rate * (1 - x.numpy()))
+        failed = wl.SolveStatus.NON_DESCENT if work.taken == self.fails_after else None
+        return Step(f"step of {self.name}", self.linear, failure=failed)
+
+
+@dataclass(frozen=True)
+class Refuses:
+    """A method that takes no such problem."""
+
+    name: ClassVar[str] = "refuses"
+
+    def init(self, problem):
+        raise ValueError("not this one")
+
+    def step(self, problem, work, x):
+        raise AssertionError
+
+
+def lines(n=3):
+    """x_i = 1, equations."""
+    return wl.LCP(np.eye(n), -np.ones(n), -np.inf, np.inf)
+
+
+def plain(chain, problem, most):
+    """The same by a loop over plain numbers: names and distances to 1 before each step; `chain` has (rate, name, when)."""
+    distance, size, place, told = 1.0, np.sqrt(3), 0, Progress(problem, 1e-12 * np.sqrt(3))
+    names, distances = [chain[0][1]], [1.0]
+    for _ in range(most):
+        told.record(size * distance)
+        if place + 1 < len(chain) and chain[place + 1][2](told):
+            place += 1
+            told.begin()
+            told.record(size * distance)
+        distance *= chain[place][0]
+        names.append(chain[place][1])
+        distances.append(distance)
+        told.step = Step("")
+        if distance <= 1e-12:
+            break
+    return names, np.array(distances)
+
+
+def after(steps):
+    return lambda progress: progress.taken >= steps
+
+
+@pytest.mark.parametrize("first", [1.0, 0.97, 0.11, 1.1])
+def test_the_chain_is_a_plain_loop(first):
+    rows = [(first, "a", None), (0.9, "b", wl.stalls), (0.3, "c", lambda p: wl.crawls(p) or after(15)(p))]
+    problem = lines()
+    chain = wl.Fallback(*((Shrink(rate, name), when) if when else Shrink(rate, name) for rate, name, when in rows))
+    result = wl.solve(problem, chain, stopping=LINES)
+    names, distances = plain(rows, problem, 60)
+    assert [record.method for record in result.history] == names
+    np.testing.assert_allclose([record.residual for record in result.history], np.sqrt(3) * distances, rtol=1e-6, atol=1e-15)
+    assert result.method == names[int(np.argmin(distances))]
+    assert (len(set(names)) > 1) == (first >= 1.0)
+
+
+def test_the_best_iterate_is_handed_on_after_a_failure():
+    """The first method doubles the distance and fails; x = 0, the best so far, is where the second begins."""
+    second = Shrink(0.1, "b")
+    result = wl.solve(lines(), wl.Fallback(Shrink(2.0, "a", fails_after=3), (second, wl.fails)), stopping=LINES)
+    assert result
+    np.testing.assert_array_equal(second.works[0].begun, np.zeros(3))
+    assert second.works[0].warm
+    assert second.works[0].tolerance == pytest.approx(1e-12 * np.sqrt(3))
+    assert [record.method for record in result.history[:5]] == ["a", "a", "a", "a", "b"]
+
+
+def test_the_last_iterate_is_handed_on_otherwise():
+    second = Shrink(0.1, "b")
+    wl.solve(lines(), wl.Fallback(Shrink(0.5, "a"), (second, after(4))), stopping=LINES)
+    np.testing.assert_allclose(second.works[0].begun, 1 - 0.5**4)
+
+
+def test_a_restarted_method_begins_cold_and_hands_on_the_best_iterate():
+    restarted, last = Shrink(0.9, "b", fails_after=2), Shrink(0.1, "c")
+    chain = wl.Fallback(Shrink(0.5, "a"), wl.FallbackEntry(restarted, after(3), restart=True), (last, wl.fails))
+    assert wl.solve(lines(), chain, stopping=LINES)
+    np.testing.assert_array_equal(restarted.works[0].begun, np.zeros(3))
+    assert not restarted.works[0].warm
+    np.testing.assert_allclose(last.works[0].begun, 1 - 0.5**3)
+
+
+def test_a_batch_counts_as_one_step():
+    chain = wl.Fallback(Shrink(1.0, "a"), wl.FallbackEntry(Shrink(0.5, "b"), after(1), batch=10))
+    result = wl.solve(lines(), chain, stopping=LINES)
+    steps = [record for record in result.history if record.method == "b"]
+    np.testing.assert_allclose(steps[0].residual, np.sqrt(3) * 0.5**4)  # the first power below a tenth
+    assert steps[0].linear_iterations == 1 + 4
+
+
+def test_methods_that_refuse_are_skipped():
+    result = wl.solve(lines(), wl.Fallback(Shrink(1.0, "a"), (Refuses(), after(1)), (wl.ProjectedMultigrid(), after(1)),
+                                           (Shrink(0.1, "c"), after(3))), stopping=LINES)  # fmt: skip
+    assert result
+    assert {record.method for record in result.history} == {"a", "c"}
+
+
+def test_a_failure_without_a_successor_is_the_status():
+    for chain in (Shrink(0.5, fails_after=2), wl.Fallback(Shrink(0.5, fails_after=2), (Refuses(), wl.fails)),
+                  wl.Fallback(Shrink(0.5, fails_after=2), (Shrink(0.1, "b"), after(9)), (Shrink(0.1, "c"), wl.fails))):  # fmt: skip
+        assert wl.solve(lines(), chain, stopping=LINES).status is wl.SolveStatus.NON_DESCENT
+
+
+def test_nothing_is_handed_over_at_the_rounding_floor():
+    result = wl.solve(lines(), wl.Fallback(Shrink(0.1, "a"), (Shrink(0.1, "b"), wl.stalls)), stopping=wl.StoppingCriteria(rtol=0.0))
+    assert {record.method for record in result.history} == {"a"}
+
+
+def test_slow_linear_solves():
+    chain = wl.Fallback(Shrink(0.9, "a", linear=30), (Shrink(0.1, "b"), wl.slow_linear_solves))
+    result = wl.solve(lines(), chain, stopping=LINES)
+    assert [record.method for record in result.history[:3]] == ["a", "a", "b"]
+
+
+@pytest.mark.parametrize(("factor", "tolerance", "crawls"), [(0.5, 1e-6, False), (0.9, 1e-6, True), (1.0, 1e-6, True), (0.2, 0.0, False),
+                                                             (0.9, 0.1, False)])  # fmt: skip
+def test_crawls(factor, tolerance, crawls):
+    progress = Progress(None, tolerance)
+    for k in range(FIRST + 1):
+        assert not wl.crawls(progress)
+        progress.record(factor**k)
+    assert wl.crawls(progress) is crawls
+
+
+def test_interim_steps_do_not_stall():
+    progress = Progress(None, 0.0)
+    for _ in range(40):
+        progress.record(1.0)
+        assert not wl.stalls(progress)
+        progress.step = Step("", interim=True)
+    for _ in range(10):
+        progress.step = Step("")
+        assert not wl.stalls(progress)
+        progress.record(1.0)
+    assert wl.stalls(progress)
+
+
+def test_a_path_creeps():
+    for factor, creeps in ((0.999, True), (0.95, False), (0.5, False)):
+        progress = Progress(None, 0.0)
+        for k in range(12):
+            progress.record(factor**k)
+        assert PathCreeps()(progress) is creeps
+        assert not PathCreeps(steps=30)(progress)
+
+
+def test_a_workspace_is_used_again():
+    """The second solve begins with the first method, from its own start."""
+    first, second = Shrink(0.5, "a", fails_after=3), Shrink(0.1, "b")
+    problem, chain = lines(), wl.Fallback(first, (second, wl.fails))
+    work = chain.init(problem)
+    histories = [[r.method for r in wl.solve(problem, chain, stopping=LINES, workspace=work).history] for _ in range(2)]
+    assert histories[0] == histories[1]
+    assert len(first.works) == len(second.works) == 1
+
+
+def test_settings_are_frozen_and_compare():
+    make = lambda: wl.Fallback(wl.ProjectedSOR(), (wl.Lemke(), wl.stalls))  # noqa: E731
+    chain = make()
+    assert chain == make()
+    assert hash(chain) == hash(make())
+    assert chain != wl.Fallback(wl.ProjectedSOR())
+    assert pickle.loads(pickle.dumps(chain)) == chain
+    assert repr(chain) == "Fallback(psor, (lemke, stalls))"
+    assert chain.names == ("psor", "lemke")
+    with pytest.raises(AttributeError, match="frozen"):
+        chain.entries = ()
+
+
+@pytest.mark.parametrize(("entries", "message"), [
+    ((), "at least one method"), ((wl.Lemke(), wl.ProjectedSOR()), "must be a pair"), ((wl.Lemke,), "with its settings"),
+    ((wl.Lemke(), (wl.ProjectedSOR(), 3)), "must be a condition"),
+])  # fmt: skip
+def test_wrong_chains_are_refused(entries, message):
+    with pytest.raises(ValueError, match=message):
+        wl.Fallback(*entries)
+
+
+def test_each_method_knows_its_name():
+    for name, kind in wl.METHODS.items():
+        assert method_name(kind.__new__(kind)) == name
+
+
+def quarter_turn(kind=scipy.sparse.csr_array):
+    return wl.LCP(kind(TURN), np.array([-1.0, 1.0]))
+
+
+@pytest.mark.parametrize("method", [wl.MinimumMapNewton(), wl.PrimalDualActiveSet()], ids=method_name)
+@pytest.mark.parametrize("kind", [np.array, scipy.sparse.csr_array], ids=["dense", "sparse"])
+def test_newton_and_active_sets_end_in_a_status_of_their_own(kind, method):
+    """Free blocks of one unknown are 0: neither method solves the problem alone, and no step is another method's."""
+    result = wl.solve(quarter_turn(kind), method)
+    assert result.status in (wl.SolveStatus.STAGNATED, wl.SolveStatus.NON_DESCENT, wl.SolveStatus.CONVERGED)
+    assert {record.method for record in result.history} == {method_name(method)}
+    chain = wl.default_chain(method, quarter_turn(kind))
+    solved = wl.solve(quarter_turn(kind), chain)
+    assert solved
+    np.testing.assert_allclose(solved.x.numpy(), [1.0, 1.0], atol=1e-5)
+    if not result:
+        assert solved.method != method_name(method)
+
+
+def maze(n=61):
+    """A comb of channels one cell wide, in which cycles of whole blocks crawl."""
+    cells = np.full((n, n), wl.SOLID)
+    cells[::2] = wl.FLUID
+    cells[1::4, -1], cells[3::4, 0] = wl.FLUID, wl.FLUID
+    cells[0, 0] = wl.AIR
+    b = np.where(cells == wl.FLUID, np.random.default_rng(5).standard_normal(cells.shape) - 0.2, 0.0)
+    return wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), b)
+
+
+def test_without_fallback_the_first_method_ends_the_solve():
+    problem = maze()
+    alone = wl.solve(problem, fallback=False)
+    assert not alone
+    assert {record.method for record in alone.history} == {"projected-multigrid"} == {alone.method}
+    chain = wl.solve(problem)
+    assert chain, chain.status
+    assert chain.method == "minimum-map-newton"
+    names = [record.method for record in chain.history]
+    change = names.index("minimum-map-newton")
+    assert FIRST < change <= FIRST + 10
+    assert set(names[:change]) == {"projected-multigrid"}
+    assert set(names[change:]) == {"minimum-map-newton"}
+    advice = wl.recommend(problem)
+    assert advice.chain.names[:2] == ("projected-multigrid", "minimum-map-newton")
+    assert advice.chain == wl.default_chain(advice.method, problem)
+
+
+def test_a_chain_costs_easy_grids_nothing():
+    """The bits and the steps are those of the first method, with kept workspaces too."""
+    cells = np.ones((20, 30), dtype=np.int8)
+    cells[0] = 0
+    b = np.where(cells == 1, np.random.default_rng(6).standard_normal(cells.shape), 0.0)
+    make = lambda: wl.LCP(wl.GridPoisson(cells, device="cpu"), b)  # noqa: E731
+    alone, method = wl.solve(make(), wl.ProjectedMultigrid()), wl.default_chain(wl.ProjectedMultigrid())
+    for _ in range(3):
+        chain = wl.solve(make(), method)
+        np.testing.assert_array_equal(chain.x.numpy(), alone.x.numpy())
+        assert [record.residual for record in chain.history] == [record.residual for record in alone.history]
+    wl.release_workspace()
+
+
+def test_a_users_chain():
+    rng = np.random.default_rng(8)
+    B = rng.standard_normal((30, 30))
+    A, b = B @ B.T / 30 + 1e-3 * np.eye(30), rng.standard_normal(30)
+
+    def soon(progress: Any) -> bool:
+        return progress.taken >= 5
+
+    chain = wl.Fallback(wl.ProjectedSOR(), (wl.Lemke(), soon))
+    result = wl.solve(wl.LCP(A, b), chain, stopping=wl.StoppingCriteria(rtol=1e-9))
+    assert result
+    assert result.method == "lemke"
+    assert natural_residual(A, b, 0.0, np.inf, result.x.numpy()) <= 1e-8
+    assert [record.method for record in result.history[:7]] == ["psor"] * 6 + ["lemke"]

@@ -1,0 +1,154 @@
+"""Default chains: the methods that take over where one stops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from warp_lcp.multigrid.aggregates import suits_multigrid
+from warp_lcp.multigrid.line_hierarchy import takes_points
+from warp_lcp.operators.banded_matrix import NARROW
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasColumns, HasRows, HasScale, HasStencil, has
+from warp_lcp.problem.solve import Solver
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.settings import Count, Settings
+from warp_lcp.solvers.assembled_matrix import AssembledMatrix
+from warp_lcp.solvers.fallback import WEAK, Fallback, FallbackEntry, Progress, crawls, fails, slow_linear_solves, stalls
+from warp_lcp.solvers.interior_point import InteriorPoint
+from warp_lcp.solvers.minimum_map_newton import LARGE, MinimumMapNewton
+from warp_lcp.solvers.mprgp import MPRGP
+from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
+from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+from warp_lcp.solvers.proximal_point import ProximalPoint
+
+FALL = 0.9  # a residual above this part of the smallest so far is no progress of a path
+PATH_IDLE = 10  # steps without progress before the proximal-point method: a path is joined far from the start
+CREEPS = 0.97  # of the residual PATH_IDLE steps ago: above it, a path that was joined far from the start leads nowhere
+BATCH = 200  # steps of MPRGP that count as one: together they cost about as much as a linear solve
+
+
+def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
+    """Return a method with those that take over where it stops; the method itself if none does.
+
+    - `ProjectedMultigrid`: where cycles crawl, `MinimumMapNewton` on the assembled matrix, unless in single precision, on ranks or
+      with floating components; beside rigid bodies `MinimumMapNewton`, where cycles crawl or the free set goes round in circles.
+    - `MinimumMapNewton` on matrices: `MPRGP` where linear solves of a large symmetric matrix that is no M-matrix are slow, or its
+      near null space is known; `InteriorPoint` where steps stall or fail; then `ProximalPoint`. On grids that need line relaxation
+      or are not symmetric: on the assembled matrix.
+    - `PrimalDualActiveSet`: `MinimumMapNewton` (not on dense matrices), then as above.
+
+    Args:
+        method: the first method.
+        problem: the problem; None: one of a grid.
+    """
+    if isinstance(method, ProjectedMultigrid):
+        return _of_multigrid(method)
+    if isinstance(method, MinimumMapNewton) and method.safeguard:
+        return _of_newton(method, problem)
+    if isinstance(method, PrimalDualActiveSet):
+        return _of_active_set(method, problem)
+    return method
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathCreeps(Settings):
+    """Whether the last step has failed, or a path that was joined far from the start leads nowhere.
+
+    Args:
+        steps: without a residual below 0.9 of the smallest so far.
+    """
+
+    steps: Count = PATH_IDLE
+
+    def __call__(self, progress: Progress) -> bool:
+        """Return whether that is so."""
+        if fails(progress):
+            return True
+        after = progress.norms[1:]  # the start of a path says nothing
+        if len(after) <= PATH_IDLE or not after[-1] > CREEPS * after[-1 - PATH_IDLE]:
+            return False
+        smallest, idle = math.inf, 0
+        for norm in after:
+            idle = 0 if norm <= FALL * smallest else idle + 1
+            smallest = min(smallest, norm)
+        return idle >= self.steps
+
+
+def cycles_fail_beside_bodies(progress: Progress) -> bool:
+    """Return whether a step on a grid with bodies has failed, or its cycles crawl."""
+    return not has(progress.problem.A, HasStencil) and (fails(progress) or crawls(progress))
+
+
+def stalls_or_crawls(progress: Progress) -> bool:
+    """Return whether either is so."""
+    return stalls(progress) or crawls(progress)
+
+
+def weak_preconditioner(progress: Progress) -> bool:
+    """Return whether steps stall, linear solves are slow, or a near null space is known.
+
+    With that, cycles are so good that MPRGP as a whole takes about as many iterations as a linear solve.
+    """
+    return stalls(progress) or slow_linear_solves(progress) or getattr(progress.problem.A, "near_null_space", None) is not None
+
+
+def _of_multigrid(method: ProjectedMultigrid) -> Solver:
+    newton = MinimumMapNewton(precision=method.precision, cycle=method.cycle)
+    entries = [FallbackEntry(method)]
+    if method.precision != "single":
+        entries.append(FallbackEntry(ON_ASSEMBLED, crawls))
+    return Fallback(*entries, FallbackEntry(newton, cycles_fail_beside_bodies))
+
+
+def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
+    A = None if problem is None else problem.A
+    if problem is None or has(A, HasColumns):
+        return method
+    if has(A, HasStencil):
+        return method if takes_points(A) else Fallback(method, (ON_ASSEMBLED, stalls_or_crawls))
+    if not (has(A, HasRows) and has(A, HasScale)):
+        return method
+    first, *between = [FallbackEntry(method)]
+    if _minimizes(problem):
+        first = FallbackEntry(replace(method, max_linear_iterations=min(WEAK, method.max_linear_iterations)))
+        between = [FallbackEntry(MPRGP(precision=method.precision), weak_preconditioner, batch=BATCH), FallbackEntry(method, fails)]
+    narrow = isinstance(A, SparseOperator) and A.bandwidth <= NARROW
+    return Fallback(first, *between, *_last(StoppingCriteria.patience if narrow else PATH_IDLE))
+
+
+def _of_active_set(method: PrimalDualActiveSet, problem: LCP | None) -> Solver:
+    newton = method.as_newton()
+    if problem is None or has(problem.A, HasStencil):
+        return Fallback(method, (newton, fails), (ON_ASSEMBLED, stalls_or_crawls))
+    if isinstance(problem.A, DenseOperator):
+        return Fallback(method, *_last())
+    if not (has(problem.A, HasRows) and has(problem.A, HasScale)):
+        return Fallback(method, (newton, fails))
+    return Fallback(method, (newton, fails), *_last())
+
+
+def _last(steps: int = PATH_IDLE) -> tuple[FallbackEntry, FallbackEntry]:
+    """Return what follows Newton's steps on matrices.
+
+    Linear programs and other saddle points, A skew but for a block or a small shift, have free blocks that are singular or nearly so
+    on the way to the solution's own; so have matrices of low rank, and Laplacians that nothing holds, whose active set creeps by a
+    layer of unknowns a step. The central path exists for every positive semi-definite A, and needs no free blocks.
+    """
+    return FallbackEntry(InteriorPoint(precision="double"), stalls, restart=True), FallbackEntry(ProximalPoint(), PathCreeps(steps=steps))
+
+
+def _minimizes(problem: LCP) -> bool:
+    """Return whether A has an energy, and is no matrix for problems on coarse points."""
+    A = problem.A
+    if not isinstance(A, SparseOperator) or not A.symmetric or A.unknowns < LARGE or A.bandwidth <= NARROW:
+        return False
+    if not problem.bounded or problem.preconditioner is not None:
+        return False
+    host = A.matrix()
+    return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
+
+
+ON_ASSEMBLED = AssembledMatrix(Fallback(MinimumMapNewton(precision="double"), *_last()))

@@ -1,0 +1,93 @@
+"""A method for matrices at work on the assembled matrix of a grid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.operators.grid_matrix import grid_matrix
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, check_taken, has
+from warp_lcp.problem.solve import IterateMemory, Solver, Step, method_name
+from warp_lcp.settings import Settings
+
+
+@dataclass(frozen=True)
+class AssembledMatrix(Settings):
+    """Another method, on the assembled float64 matrix of a grid.
+
+    For domains on which aggregates of whole blocks fail: channels and walls a cell wide, spirals and mazes share blocks that are not
+    joined inside; so do cells whose coefficients are random over many decades. Cycles of a geometric hierarchy are slow there, without
+    bounds too, while algebraic aggregates follow the coefficients (Vanek, Mandel, Brezina 1996). The unknowns are the fluid cells, in
+    their order. Steps are those of `inner`, with its cold start.
+
+    Args:
+        inner: a method that takes sparse matrices.
+    """
+
+    supports: ClassVar = (HasStencil,)
+    needs: ClassVar[str] = "as the inner method"
+
+    inner: Solver
+
+    @property
+    def name(self) -> str:
+        """Name of the inner method."""
+        return method_name(self.inner)
+
+    def init(self, problem: LCP) -> AssembledWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: A has no stencil, or other processes have a part of it.
+        """
+        check_taken(self, problem.A)
+        return AssembledWorkspace(problem, self.inner)
+
+    def step(self, problem: LCP, work: AssembledWorkspace, x: wp.array[Any]) -> Step:
+        """Take a step of the inner method."""
+        return work.step(x)
+
+
+class AssembledWorkspace(IterateMemory):
+    """Memory of the method for one problem; the matrix is assembled when a solve begins."""
+
+    def __init__(self, problem: LCP, method: Solver) -> None:
+        if not has(problem.A, HasStencil) or problem.A.stencil.ghosts is not None:
+            raise ValueError("A: AssembledMatrix needs a grid that lies in one process")
+        super().__init__(problem)
+        self._method, self._A = method, problem.A
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Assemble the problem as it is now, and begin at x."""
+        p = self.problem
+        self._rows = np.flatnonzero(p.unknown.numpy() == 1)
+        b, lower, upper, x = (field.numpy()[self._rows] for field in (p.b, p.lower, p.upper, self.x))
+        matrix = SparseOperator(grid_matrix(self._A), device=p.device, dtype=wp.float64)
+        self._inner = LCP(matrix, b, lower, upper)
+        work = self._work = self._method.init(self._inner)
+        work.residual.start(work.x, keep=False)
+        work.x.assign(x)
+        self._least = work.residual.evaluate(work.x)
+        work.keep()
+        work.start(warm=False, tolerance=tolerance)
+
+    def step(self, x: wp.array[Any]) -> Step:
+        """Take a step, and write the iterate to x."""
+        work = self._work
+        work.residual.current = False
+        done = self._method.step(self._inner, work, work.x)
+        if not work.residual.current:
+            work.residual.evaluate(work.x)
+        if work.residual.norm < self._least or not math.isfinite(self._least):
+            self._least = work.residual.norm
+            work.keep()
+        stored = x.numpy().copy()
+        stored[self._rows] = work.x.numpy()
+        x.assign(stored)
+        return done

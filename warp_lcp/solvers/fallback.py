@@ -1,0 +1,473 @@
+"""Fallback: methods in order, each with the condition under which it takes over from the one before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
+
+import warp as wp
+
+from warp_lcp.operators.components import FloatingComponents
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import takes
+from warp_lcp.problem.residual import EPS
+from warp_lcp.problem.result import SolveResult, SolveStatus
+from warp_lcp.problem.solve import FLOOR_MARGIN, KeepsWorkspace, Precision, Solver, Spare, Step, method_name, refusal, takes_floating
+from warp_lcp.problem.stopping import StoppingCriteria
+
+WINDOW = 10  # steps over which the fall of the residual is measured
+FIRST = 20  # steps before which `crawls` is False: residuals of conjugate gradients rise and fall
+MOST = 30  # steps that a solve may still need at that pace: assembly and set-up cost about as much
+STALLED = 10  # steps without a smaller residual after which a method stalls
+PROGRESS = 0.999  # a residual above this part of the smallest so far is no progress
+WEAK = 30  # iterations of a linear solve that tell of a weak preconditioner
+GRACE = StoppingCriteria.patience  # steps after a hand-over in which the residual need not fall
+BATCH = 0.1  # factor by which a batch of steps reduces the residual
+PROVED = (SolveStatus.INFEASIBLE, SolveStatus.NEGATIVE_CURVATURE)  # failures that no other method mends
+
+
+class Progress:
+    """What a condition sees: the residuals and steps of the method at work, since it began.
+
+    Attributes:
+        problem: the problem.
+        tolerance: residual norm that is asked for.
+        least: smallest residual norm so far, at the start of each step.
+        norms: residual norms there.
+        step: the last step; None before the first.
+        waited: steps in succession, none of them interim, that have left the smallest residual where it was.
+    """
+
+    def __init__(self, problem: Any, tolerance: float) -> None:
+        self.problem, self.tolerance = problem, tolerance
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the method before."""
+        self.least, self.norms = list[float](), list[float]()
+        self.step: Step | None = None
+        self.waited, self._smallest = 0, math.inf
+
+    def record(self, norm: float) -> None:
+        """Take note of the residual at the start of a step."""
+        self.norms.append(norm)
+        self.least.append(min(self.least[-1], norm) if self.least else norm)
+        interim = self.step is not None and self.step.interim
+        self.waited = 0 if interim or norm <= PROGRESS * self._smallest else self.waited + 1
+        self._smallest = norm if interim else min(self._smallest, norm)
+
+    @property
+    def taken(self) -> int:
+        """Number of steps that the method has taken."""
+        return len(self.norms) - 1
+
+
+Condition = Callable[[Progress], bool]
+
+
+def fails(progress: Progress) -> bool:
+    """Return whether the last step has failed, such as with NON_DESCENT or STAGNATED."""
+    return progress.step is not None and progress.step.failure is not None
+
+
+def stalls(progress: Progress) -> bool:
+    """Return whether the last step has failed, or 10 steps have not reduced the residual."""
+    return fails(progress) or progress.waited >= STALLED
+
+
+def crawls(progress: Progress) -> bool:
+    """Return whether the tolerance is more than 30 steps away at the pace of the last 10 steps; after 20 steps.
+
+    Also where it is below what float64 can tell from 0 beside the first residual: then that counts.
+    """
+    if len(progress.least) <= FIRST:
+        return False
+    least, target = progress.least[-1], max(progress.tolerance, EPS * progress.least[0])
+    return least > target and math.log(least / target) > MOST / WINDOW * math.log(progress.least[-1 - WINDOW] / least)
+
+
+def slow_linear_solves(progress: Progress) -> bool:
+    """Return whether the last step has taken 30 linear iterations or more: its preconditioner is weak."""
+    return progress.step is not None and progress.step.linear_iterations >= WEAK
+
+
+@runtime_checkable
+class StartsAfter(Protocol):
+    """A method that reuses what the method before has made for the same problem, such as a hierarchy."""
+
+    def init_after(self, problem: Any, before: Any) -> Any:
+        """Return a workspace, as `init` does.
+
+        Args:
+            problem: the problem.
+            before: the workspace of the method that hands over.
+        """
+
+
+@dataclass(frozen=True)
+class FallbackEntry:
+    """A method of a chain.
+
+    Args:
+        method: with its settings.
+        when: condition under which it takes over; not asked of the first one.
+        restart: begin at clip(0, l, u) instead of where the method before has ended.
+        batch: steps of the method, at most, that count as one step of the chain, which ends earlier where the residual
+            has fallen to a tenth. For methods whose steps are cheap.
+    """
+
+    method: Solver
+    when: Condition = fails
+    restart: bool = False
+    batch: int = 1
+
+
+class Fallback:
+    """Methods in order; one takes over from the one before as soon as its condition holds.
+
+    Before each step the condition of the next method that takes the problem is asked; others, and one equal to the method at work,
+    are skipped. If it holds, the next method gets the iterate (the best one if the last step has failed or the method at work had
+    been restarted), the tolerance, floating components, and what its `init_after` takes from the workspace before. Nothing is handed
+    over where the residual is what rounding leaves (FLOOR), or where the
+    last step has proved that there is no solution. The residual of the first workspace judges all iterates. Each `Record` names
+    the method that made it.
+
+    Args:
+        entries: a method, then pairs (method, condition) or `FallbackEntry` objects. Conditions: `fails`, `stalls`, `crawls`,
+            `slow_linear_solves`, or your own function of a `Progress`.
+
+    Raises:
+        ValueError: there is no method, or an entry is of another kind.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> chain = wl.Fallback(wl.ProjectedSOR(), (wl.Lemke(), wl.stalls))
+        >>> problem = wl.LCP(np.array([[0.0, 1.0], [-1.0, 0.0]]) + 0.01 * np.eye(2), np.array([-1.0, 1.0]))
+        >>> print(wl.solve(problem, chain).method)
+        lemke
+    """
+
+    def __init__(self, *entries: Any) -> None:
+        if not entries:
+            raise ValueError("Fallback: give at least one method")
+        object.__setattr__(self, "entries", tuple(_entry(given, first=k == 0) for k, given in enumerate(entries)))
+
+    entries: tuple[FallbackEntry, ...]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"Fallback is frozen: make a new one to change {name}")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Fallback) and self.entries == other.entries
+
+    def __hash__(self) -> int:
+        return hash(self.entries)
+
+    def __repr__(self) -> str:
+        return f"Fallback({', '.join(_described(entry, first=k == 0) for k, entry in enumerate(self.entries))})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Fallback, self.entries
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the first method says of the problems that it takes: `supports`, `distributed`, `precision`, ..."""
+        if name.startswith("__") or name == "entries":
+            raise AttributeError(name)
+        return getattr(self.entries[0].method, name)
+
+    @property
+    def name(self) -> str:
+        """Name of the first method."""
+        return method_name(self.entries[0].method)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the methods, in order."""
+        return tuple(method_name(entry.method) for entry in self.entries)
+
+    def init(self, problem: Any) -> FallbackWorkspace:
+        """Return a workspace; the methods after the first make theirs when they take over.
+
+        Raises:
+            ValueError: the first method does not take the problem.
+        """
+        return FallbackWorkspace(problem, self.entries, self.entries[0].method.init(problem))
+
+    def spare(self, problem: Any) -> SpareChain | None:
+        """Return the workspace of an earlier solve, if the first method keeps one."""
+        first = self.entries[0].method
+        lent = first.spare(problem) if isinstance(first, KeepsWorkspace) else None
+        return None if lent is None else SpareChain(lent, FallbackWorkspace(problem, self.entries, lent.work))
+
+    def step(self, problem: Any, work: FallbackWorkspace, x: wp.array[Any]) -> Step:
+        """Take a step of the method at work, after a hand-over where one is due."""
+        return work.step()
+
+
+@dataclass(frozen=True)
+class SpareChain:
+    """A chain's workspace around one that the first method keeps between solves.
+
+    Args:
+        lent: of the first method.
+        work: of the chain.
+    """
+
+    lent: Spare
+    work: FallbackWorkspace
+
+    def give_back(self, result: SolveResult) -> None:
+        """Keep the first method's workspace for the next solve."""
+        self.lent.give_back(result)
+
+
+class FallbackWorkspace:
+    """Memory of a chain for one problem. Other attributes than these are those of the first method's workspace.
+
+    Args:
+        problem: the problem.
+        entries: the chain.
+        first: workspace of the first method; it has the iterate and the residual of the whole solve.
+    """
+
+    def __init__(self, problem: Any, entries: tuple[FallbackEntry, ...], first: Any) -> None:
+        self.problem, self._entries, self._first = problem, entries, first
+        self._works: dict[int, Any] = {0: first}  # by place in the chain; None: the method does not take the problem
+        self._suited: dict[int, bool] = {}  # by place: whether a method takes such a problem, before it has a workspace
+        self._best: wp.array[Any] | None = None
+        self._progress = Progress(problem, 0.0)
+        self._place, self._since = 0, 0
+        self._floating: FloatingComponents | None = None
+        self._left_first = False  # whether the best iterate is kept here and no longer by the first workspace
+        self._at_best, self._best_norm = False, math.inf
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the first method's workspace."""
+        if name in ("_first", "__setstate__"):
+            raise AttributeError(name)
+        return getattr(self._first, name)
+
+    @property
+    def x(self) -> wp.array[Any]:
+        """The iterate, a stored field."""
+        return self._first.x
+
+    @property
+    def residual(self) -> Any:
+        """The residual that judges all iterates."""
+        return self._first.residual
+
+    @property
+    def precision(self) -> Precision:
+        """Of the iterate."""
+        return self._first.precision
+
+    def start(self, *, warm: bool, tolerance: float, floating: FloatingComponents | None = None) -> bool | None:
+        """Begin with the first method, at an iterate that `keep` has been told of; the operator may have changed."""
+        self._place, self._since, self._floating = 0, 0, floating
+        if self._left_first:
+            self._left_first = False
+            self._first.keep()
+        self._progress = Progress(self.problem, tolerance)
+        given = {"floating": floating} if takes_floating(self._first) else {}
+        return self._first.start(warm=warm, tolerance=tolerance, **given)
+
+    def keep(self) -> None:
+        """Remember x as the best iterate."""
+        self._at_best, self._best_norm = True, self.residual.norm
+        work = self._works[self._place]
+        if self._left_first:
+            self._store_best()
+        if work is not self._first or not self._left_first:
+            work.keep()
+
+    def restore(self) -> None:
+        """Make x the best iterate again."""
+        if not self._left_first:
+            self._first.restore()
+        elif self._best is not None:
+            wp.copy(self.x, self._best)
+        self._at_best = True
+
+    def step(self) -> Step:
+        """Hand over if that is due, then take a step."""
+        self._progress.record(self.residual.norm)
+        place = self._due()
+        if place is not None:
+            self._hand_over(place)
+        self._at_best = False
+        done = self._advance()
+        self._progress.step = done
+        if self._place > 0:
+            patient = self._since <= GRACE or self._place + 1 < len(self._entries)
+            name = done.method or method_name(self._entries[self._place].method)
+            done = replace(done, interim=done.interim or patient, method=name)
+        if done.failure is not None and done.failure not in PROVED:
+            if not self.residual.current:
+                self.residual.evaluate(self.x)
+            if self._due() is not None:  # at the next step
+                return replace(done, failure=None, interim=True)
+        return done
+
+    def _due(self) -> int | None:
+        """Return the place of the method that takes over now, None if none does."""
+        if self._place + 1 == len(self._entries) or getattr(self._first, "is_ahead", False):
+            return None
+        for place in range(self._place + 1, len(self._entries)):
+            entry = self._entries[place]
+            if entry.method == self._entries[self._place].method or not self._may_take(place):
+                continue
+            if not entry.when(self._progress) or self._at_floor():
+                return None
+            if self._workspace(place) is not None:
+                return place
+        return None
+
+    def _may_take(self, place: int) -> bool:
+        """Return whether a method takes the problem, as far as that is known without its workspace."""
+        if place in self._works:
+            return self._workspace(place) is not None
+        if place not in self._suited:
+            method, p = self._entries[place].method, self.problem
+            suits = not isinstance(p, LCP) or takes(method, p.A)
+            self._suited[place] = suits and refusal(p, method, preconditioned=False) is None
+        return self._suited[place]
+
+    def _at_floor(self) -> bool:
+        """Return whether the residual, here or of the best iterate, is what rounding leaves."""
+        floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
+        return min(self.residual.norm, self._best_norm) <= floor
+
+    def _workspace(self, place: int) -> Any:
+        """Return the workspace of a method, None if it does not take the problem."""
+        if place not in self._works:
+            self._works[place] = self._made(self._entries[place].method)
+        work = self._works[place]
+        return None if work is None or (self._floating is not None and not takes_floating(work)) else work
+
+    def _made(self, method: Solver) -> Any:
+        same = next((k for k, work in self._works.items() if work is not None and self._entries[k].method == method), None)
+        if same is not None:
+            return self._works[same]
+        before = self._works[self._place]
+        try:
+            return method.init_after(self.problem, before) if isinstance(method, StartsAfter) else method.init(self.problem)
+        except ValueError:
+            return None
+
+    def _hand_over(self, place: int) -> None:
+        """Let the method at a place begin where the one before has ended, or anew."""
+        entry, before, work = self._entries[place], self._entries[self._place], self._workspace(place)
+        failed = fails(self._progress) or before.restart
+        if not self._left_first:
+            self._leave_first()
+        if failed and not self._at_best:
+            wp.copy(self.x, self._best)
+        self._place, self._since = place, 0
+        self._progress.begin()
+        self._begin(work, restart=entry.restart)
+
+    def _leave_first(self) -> None:
+        """Store the best iterate here: what others do to x the first workspace cannot undo."""
+        first = self._first
+        if self._at_best:
+            self._store_best()
+        else:
+            now = wp.clone(first.x)
+            first.restore()
+            self._store_best()
+            wp.copy(first.x, now)
+        self._left_first = True
+
+    def _store_best(self) -> None:
+        if self._best is None:
+            self._best = wp.clone(self.x)
+        else:
+            wp.copy(self._best, self.x)
+
+    def _begin(self, work: Any, *, restart: bool) -> None:
+        """Start a workspace as the outer loop does, from x or from clip(0, l, u)."""
+        residual, box = work.residual, isinstance(self.problem, LCP)
+        now = wp.clone(self.x)
+        if box:
+            residual.start(work.x, keep=False)
+        if not restart:
+            wp.copy(work.x, now)
+            if box:
+                residual.start(work.x, keep=True)
+        work.round_iterate()
+        residual.evaluate(work.x)
+        work.keep()
+        given = {"floating": self._floating} if takes_floating(work) else {}
+        work.start(warm=not restart, tolerance=self._progress.tolerance, **given)
+        if work is not self._first:
+            self._take(work)
+            self.residual.evaluate(self.x)
+        self._progress.record(self.residual.norm)
+
+    def _advance(self) -> Step:
+        """Take a step, or a batch of steps, of the method at work; write the iterate to x."""
+        entry, work, first = self._entries[self._place], self._works[self._place], self._first
+        if self._place == 0:
+            return entry.method.step(self.problem, first, first.x)
+        self._since += 1
+        done = self._one_step(entry.method, work) if entry.batch == 1 else self._batch(entry, work)
+        if work is not first:
+            self._take(work)
+        return done
+
+    def _take(self, work: Any) -> None:
+        """Write the iterate of the method at work to x."""
+        wp.copy(self.x, work.x)
+        self._first.round_iterate()
+        self.residual.current = False
+
+    def _one_step(self, method: Solver, work: Any) -> Step:
+        work.residual.current = False
+        done = method.step(self.problem, work, work.x)
+        if not work.residual.current:
+            work.residual.evaluate(work.x)
+        return done
+
+    def _batch(self, entry: FallbackEntry, work: Any) -> Step:
+        """Take steps until the residual has fallen to a tenth; STAGNATED where it does not fall for some."""
+        residual, linear, idle, sank = work.residual, 0, 0, False
+        least, target = residual.norm, max(self._progress.tolerance, BATCH * residual.norm)
+        done = Step("none", 0)
+        for _ in range(entry.batch):
+            done = self._one_step(entry.method, work)
+            linear, sank = linear + done.linear_iterations, sank or done.interim
+            idle = 0 if done.interim or residual.norm < least else idle + 1
+            least = min(least, residual.norm)
+            if done.failure is not None or residual.norm <= target:
+                break
+            if idle >= GRACE:
+                done = replace(done, failure=SolveStatus.STAGNATED)
+                break
+        return replace(done, linear_iterations=linear, interim=sank)
+
+
+def _entry(given: Any, *, first: bool) -> FallbackEntry:
+    """Return what was given as an entry."""
+    if isinstance(given, FallbackEntry):
+        entry = given
+    elif isinstance(given, tuple) and len(given) == 2:
+        entry = FallbackEntry(*given)
+    elif first:
+        entry = FallbackEntry(given)
+    else:
+        raise ValueError(f"Fallback: {given!r} must be a pair (method, condition) or an FallbackEntry")
+    method = entry.method
+    if isinstance(method, type) or not (hasattr(method, "init") and hasattr(method, "step")):
+        raise ValueError(f"Fallback: {method!r} must be a method with its settings, such as wl.MinimumMapNewton()")
+    if not callable(entry.when):
+        raise ValueError(f"Fallback: {entry.when!r} must be a condition, a function of a Progress, such as wl.stalls")
+    return entry
+
+
+def _described(entry: FallbackEntry, *, first: bool) -> str:
+    """Return an entry in words."""
+    when = getattr(entry.when, "__name__", repr(entry.when))
+    return method_name(entry.method) if first else f"({method_name(entry.method)}, {when})"

@@ -1,0 +1,163 @@
+"""Problems on coarse points and grids that move the active set of Newton's method on the minimum map.
+
+Full approximation corrections (Brandt and Cryer 1983): the coarse problem has the bounds that x leaves to its points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.multigrid.aggregates import coarse_points, suits_multigrid
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.operators.stencil import AROUND, StoredStencil
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import AIR, FLUID, HasStencil
+from warp_lcp.problem.solve import solve
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.reduced.principal_system import LineSystem
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+
+ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)  # of a correction that interpolation blurs by a layer or two anyway
+# a set creeps while more than this share of what the last step moved moves again: at that rate a dozen steps or more are still to
+# come, and a first correction costs as much as those
+CREEP = 0.92
+STEPS = 3  # of creeping before the correction
+
+
+class CoarseProblem:
+    """Solves for the correction P e of an x: P'A P e + P'(A x + b), with the bounds that x leaves to the coarse points.
+
+    Those are unknowns of the fine problem, so that an obstacle's corners stay where they are, and unknowns at their bounds stay there until
+    the correction says otherwise: the contact's boundary moves as far as it must at once, where Newton's own step moves it by a layer of
+    unknowns. The coarse problem is solved by Newton's method too, which begins with a coarse problem of its own.
+
+    Args:
+        A: the matrix.
+        coarse: whether A is a coarse problem's.
+    """
+
+    def __init__(self, A: Any, settings: MinimumMapNewton, *, coarse: bool = False) -> None:
+        self._A, self._coarse, self._version = A, coarse, -1
+        self._settings = replace(settings, monotone_cycles=0, direct=False)
+        self._work: Any = None
+        self.start()
+
+    def start(self) -> None:
+        """Forget how the set has moved."""
+        self._moved, self._crept, self._wait = 0.0, STEPS if self._coarse else 0, STEPS
+
+    def is_due(self, moved: float) -> bool:
+        """Return whether a correction should come now that another part of the unknowns has moved on or off the active set."""
+        creeps = self._coarse or moved > CREEP * self._moved > 0
+        self._moved, self._crept = moved, self._crept + 1 if creeps else 0
+        if self._crept < self._wait or not self._refresh():
+            return False
+        self._moved, self._crept, self._wait = 0.0, 0, 2 * self._wait
+        return True
+
+    def correction(self, problem: LCP, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return P e for the problem at x, where A x + b = y."""
+        points = self._points
+        return self._P @ self._solved(self._R @ y, (problem.lower.numpy() - x)[points], (problem.upper.numpy() - x)[points]).numpy()
+
+    def _solved(self, *fields: np.ndarray) -> wp.array[Any]:
+        """Return the coarse problem's rough solution for this b, lower and upper."""
+        work = self._work
+        for field, values in zip((work.problem.b, work.problem.lower, work.problem.upper), fields, strict=True):
+            field.assign(values)
+        return solve(work.problem, self._settings, stopping=ROUGH(), workspace=work).x
+
+    def _refresh(self) -> bool:
+        """Choose points of A as it is now, if it has changed since; return whether there are any."""
+        if self._version == self._A.version:
+            return self._work is not None
+        self._version, self._work, host = self._A.version, None, self._A.matrix()
+        found = coarse_points(host) if self._coarse or suits_multigrid(host) else None
+        if found is not None:
+            self._P, matrix, self._points = found
+            self._R = self._P.T.tocsr()
+            A = SparseOperator(matrix, device=self._A.device, dtype=wp.float64)
+            b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
+            self._work = self._settings.init(LCP(A, b, lower, upper))
+            if self._work.coarse is not None:
+                self._work.coarse = CoarseProblem(A, self._settings, coarse=True)
+        return self._work is not None
+
+
+class CoarseStencilProblem(CoarseProblem):
+    """The same on every second cell of a compact stencil's grid, with the transfers of its hierarchy; each solve begins with a correction.
+
+    With coarse problems on all levels that is nested iteration: Newton's steps then start with a contact that is right but for a layer or
+    two of cells, cold or from another time step's solution, and come to the end in as many as a linear solve takes.
+
+    Args:
+        A: the operator.
+        system: of the fine problem.
+        settings: of Newton's method.
+    """
+
+    def __init__(self, A: HasStencil, system: LineSystem, settings: MinimumMapNewton) -> None:
+        self._system, self._hierarchy = system, system.hierarchy
+        super().__init__(A, settings)
+
+    def start(self) -> None:
+        """A correction is due at once, others where the set creeps."""
+        self._moved, self._crept, self._wait, self._begins = 0.0, 0, STEPS, True
+
+    def is_due(self, moved: float) -> bool:
+        """Return whether a correction should come now."""
+        if not self._begins:
+            return super().is_due(moved)
+        self._begins = False
+        return self._refresh()
+
+    def correction(self, problem: LCP, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return P e for the problem at x, where A x + b = y."""
+        hierarchy, kind = self._hierarchy, self._hierarchy.finest.t.dtype
+        hierarchy.take_all(self._free)
+        fine, coarse, size = hierarchy.finest, hierarchy.levels[1], float(np.abs(y).max()) or 1.0
+        fine.t.assign((y / size).astype(wp.dtype_to_numpy(kind)))
+        fine.handing_down(coarse).launch()
+        held = (self._points((bound.numpy() - x) / size) for bound in (problem.lower, problem.upper))
+        coarse.x.assign(self._solved(coarse.b.numpy().astype(np.float64), *held).numpy().astype(wp.dtype_to_numpy(kind)))
+        fine.correcting(coarse, add=False).launch()
+        return size * fine.x.numpy().astype(np.float64)
+
+    def _points(self, field: np.ndarray) -> np.ndarray:  # type: ignore[override]
+        """Return the coarse cells' values of a stored field, as a stored field."""
+        fine, coarse = self._hierarchy.levels[:2]
+        values, (fx, fy) = np.zeros(coarse.padding.shape), fine.factors
+        values[1:-1, 1:-1, 1:-1] = field.reshape(fine.padding.shape)[1:-1, 1:-1:fy, 1:-1:fx]
+        return values.ravel()
+
+    def _refresh(self) -> bool:
+        """Make the coarse problem of A as it is now, if it has changed since; return whether there is one."""
+        if self._version == self._A.version or len(self._hierarchy.levels) < 2:
+            return self._work is not None
+        self._version, hierarchy = self._A.version, self._hierarchy
+        fluid = self._A.cells.numpy().ravel() == FLUID
+        self._free = wp.array(fluid.astype(np.uint8), device=hierarchy.device)
+        hierarchy.restrict(self._free)
+        coarse = hierarchy.levels[1]
+        inside = (coarse.d.numpy() != 0) & (self._points(fluid.astype(np.float64)) != 0)
+        if not inside.any():
+            return False
+        cells = np.where(inside.reshape(coarse.padding.shape)[1, 1:-1, 1:-1], FLUID, AIR)
+        d = np.where(inside, coarse.d.numpy(), 0)
+        if self._work is not None:
+            self._work.problem.A.take(cells, d, coarse.weights)
+            return True
+        copied, n = wp.clone(coarse.weights), coarse.padding.size
+        weights = tuple(copied[i * n : (i + 1) * n] for i in range(8))
+        stored = wp.array(d, dtype=coarse.d.dtype, device=hierarchy.device)
+        A = StoredStencil(cells, stored, weights, AROUND, symmetric=self._A.symmetric)
+        b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
+        self._work = self._settings.init(LCP(A, b.reshape(A.layout.stored_shape), lower, upper))
+        return True

@@ -1,0 +1,162 @@
+"""The proximal-point method: regularized problems around centers that move to the solution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+
+from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.protocol import HasRows, HasScale, check_taken, has
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, IterateMemory, Solver, Step
+from warp_lcp.reduced.dense_problem import proved_infeasible
+from warp_lcp.settings import Settings
+from warp_lcp.solvers.fallback import Fallback, fails
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
+
+CENTER, FACTOR, LEAST = 1e-4, 0.1, 1e-10  # eps of the first center, its factor from center to center, and the smallest
+RAISED, LARGEST = 100.0, 1.0  # factor of eps where a regularized problem is not solved, and the largest eps: larger ones are easier
+NEAR = 1e-3  # of a center's residual: what the regularized problem's may be when the next center is taken
+TRIED, FEWER = 30, 15  # steps for one center, before and after eps had to be raised
+SMALL = 1000  # unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is there
+FALL = 0.9  # a center whose residual is above this part of the smallest so far is no progress
+IDLE = 4  # centers without progress before the end
+ON_DENSE = PrimalDualActiveSet(precision="double", stop_if_singular=False)
+ON_SPARSE = Fallback(ON_DENSE, (MinimumMapNewton(precision="double"), fails))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProximalPoint(Settings):
+    """Proximal-point method (Martinet 1970, Rockafellar 1976): solve regularized problems around moving centers.
+
+    Solve A x + b + eps D (x - c) = y with the same bounds, take clip(x, l, u) for the center c, lower eps, repeat. D is the natural
+    residual's d. A + eps D is a P-matrix wherever A is a P0-matrix (positive semi-definite ones, skew ones), so that free blocks are
+    regular and least-index pivoting is finite. Its solutions tend to one of the problem's own if A is monotone and there is one. Each
+    regularized problem is solved to 1e-3 of its center's residual, by an inner method; where that fails, eps is raised, and does not
+    fall below that again. Failure with eps = 1 ends the solve with NON_DESCENT, centers without progress with STAGNATED, a proof by a
+    linear program (at most 40,000 entries) with INFEASIBLE. A step is one of the inner method; `linear_iterations` counts as there.
+
+    Made for a singular block here and there. Linear programs (A skew) of more than some dozens of unknowns come to residuals of 1e-2 or
+    end with NON_DESCENT: they are InteriorPoint's.
+
+    Args:
+        inner: method for regularized problems; None: PrimalDualActiveSet; on sparse matrices of more than 1000 unknowns
+            then MinimumMapNewton, where a set recurs.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.DenseOperator(np.array([[0.0, 1.0], [-1.0, 0.0]]), device="cpu")
+        >>> result = wl.solve(wl.LCP(A, np.array([-1.0, 1.0])), wl.ProximalPoint())
+        >>> print(result.status.name, result.x.numpy().round(4))
+        CONVERGED [1. 1.]
+    """
+
+    supports: ClassVar = (HasRows,)
+    needs: ClassVar[str] = "P0-matrix, as positive semi-definite and skew ones"
+    definite: ClassVar[bool] = True
+
+    inner: Solver | None = None
+
+    def init(self, problem: LCP) -> ProximalWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: A gives no access to rows, or has no scale.
+        """
+        check_taken(self, problem.A)
+        if not has(problem.A, HasScale):
+            raise ValueError(f"{type(problem.A).__name__} has no scale: ProximalPoint needs wl.DenseOperator or wl.SparseOperator")
+        return ProximalWorkspace(problem, self.inner)
+
+    def step(self, problem: LCP, work: ProximalWorkspace, x: wp.array[Any]) -> Step:
+        """Take one step for the regularized problem, from a new center if the last one's has been solved."""
+        return work.step(x)
+
+
+class ProximalWorkspace(IterateMemory):
+    """Memory of the method for one problem; A is read when a solve begins."""
+
+    def __init__(self, problem: LCP, inner: Solver | None) -> None:
+        super().__init__(problem)
+        self._given = inner
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Take A, b and the bounds as they are now."""
+        p, self._tolerance, self._eps = self.problem, tolerance, CENTER
+        A: Any = p.A
+        self._matrix, self._D, self._b = A.rows().matrix(), A.scale(), p.b.numpy().copy()
+        if scipy.sparse.issparse(self._matrix) and len(self._D) <= SMALL:
+            self._matrix = self._matrix.toarray()
+        self._operator: Any = as_operator(self._regularized(), p.device)
+        self._lower, self._upper = p.lower.numpy().copy(), p.upper.numpy().copy()
+        self._inner = LCP(self._operator, self._b, self._lower, self._upper)
+        self._method = self._given or (ON_SPARSE if scipy.sparse.issparse(self._matrix) else ON_DENSE)
+        self._work: Any = self._method.init(self._inner)
+        self._smallest, self._idle, self._steps, self._near, self._least = self.residual.norm, 0, 0, 0.0, LEAST
+
+    def step(self, x: wp.array[Any]) -> Step:
+        """Take one step for the regularized problem."""
+        work, failure = self._work, None
+        if self._steps == 0:
+            self._take_center(x)
+        self._steps += 1
+        work.residual.current = False
+        done = self._method.step(self._inner, work, work.x)
+        if not work.residual.current:
+            work.residual.evaluate(work.x)
+        wp.copy(x, work.x)
+        near = work.residual.norm <= self._near
+        if near or done.failure is not None or self._steps >= (TRIED if self._least == LEAST else FEWER):
+            failure = self._assess(x, solved=near)
+        self.residual.current = False
+        return Step("proximal point", done.linear_iterations, done.active, failure, interim=failure is None)
+
+    def _take_center(self, x: wp.array[Any]) -> None:
+        """Write the regularized problem around clip(x, l, u), and begin there."""
+        inner, work = self._inner, self._work
+        center = np.clip(x.numpy(), self._lower, self._upper)
+        x.assign(center)
+        self._operator.update(self._regularized())
+        inner.b.assign(self._b - self._eps * self._D * center)
+        self._center = center
+        self._near = max(NEAR * self.residual.evaluate(x), 0.3 * self._tolerance)
+        work.x.assign(center)
+        work.residual.evaluate(work.x)
+        work.keep()
+        work.start(warm=True, tolerance=self._near)
+
+    def _assess(self, x: wp.array[Any], *, solved: bool) -> SolveStatus | None:
+        """Prepare for the next center; return how the solve ends if it has come no nearer to a solution for some."""
+        self._steps = 0
+        x.assign(np.clip(x.numpy(), self._lower, self._upper))
+        norm = self.residual.evaluate(x)
+        if norm <= FALL * self._smallest:
+            self._smallest, self._idle, self._eps = norm, 0, max(self._least, FACTOR * self._eps)
+            return None
+        if not solved and self._eps < LARGEST:
+            if self._least == LEAST and proved_infeasible(self.problem):
+                return SolveStatus.INFEASIBLE
+            self._eps = self._least = min(LARGEST, RAISED * self._eps)
+            x.assign(self._center)
+            return None
+        self._eps, self._idle = max(self._least, FACTOR * self._eps), self._idle + 1
+        if solved and self._idle < IDLE:
+            return None
+        floor = FLOOR_MARGIN * self.residual.rounding_floor(x, EPS)
+        if norm > floor and proved_infeasible(self.problem):
+            return SolveStatus.INFEASIBLE
+        return SolveStatus.STAGNATED if solved else SolveStatus.NON_DESCENT
+
+    def _regularized(self) -> Any:
+        """Return A + eps D."""
+        if not scipy.sparse.issparse(self._matrix):
+            return self._matrix + np.diag(self._eps * self._D)
+        entries, i = self._matrix.tocoo(), np.arange(len(self._D))
+        places = np.r_[entries.row, i], np.r_[entries.col, i]
+        # duplicates are summed and sums of 0 stay entries: the pattern is the same for all eps
+        return scipy.sparse.csr_array((np.r_[entries.data, self._eps * self._D], places), shape=self._matrix.shape)
