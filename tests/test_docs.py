@@ -18,7 +18,11 @@ ROW = re.compile(r"^\| `(\w+)`<br>`([a-z-]+)`(\\\*)?(?:<br>Book (.*?))? \| (.*) 
 ROWS = [dict(zip(COLUMNS, row, strict=True)) for row in ROW.findall(TEXT)]
 
 
-OWN = {
+OWN = {  # methods that do not take every kind of A
+    "projected-multigrid": {"grid"},
+    "proximal-gauss-seidel": set(),
+    "proximal-point": {"dense", "sparse"},
+}
     "projected-multigrid": {"grid"},
     "proximal-gauss-seidel": set(),
     "proximal-point": {"dense", "sparse"},
