@@ -18,7 +18,15 @@ ROW = re.compile(r"^\| `(\w+)`<br>`([a-z-]+)`(\\\*)?(?:<br>Book (.*?))? \| (.*) 
 ROWS = [dict(zip(COLUMNS, row, strict=True)) for row in ROW.findall(TEXT)]
 
 
-OWN = {"projected-multigrid": {"grid"}, "proximal-gauss-seidel": set()}  # methods that do not take every kind of A
+OWN = {  # methods that do not take every kind of A
+    "projected-multigrid": {"grid"},
+    "proximal-gauss-seidel": set(),
+    "proximal-point": {"dense", "sparse"},
+}
+    "projected-multigrid": {"grid"},
+    "proximal-gauss-seidel": set(),
+    "proximal-point": {"dense", "sparse"},
+}  # methods that do not take every kind of A
 
 
 def test_every_method_has_its_row():
@@ -40,7 +48,7 @@ def test_rows_say_what_the_classes_say(row):
 
 
 def test_what_the_text_says_of_all_methods_holds():
-    """Boxed bounds by all, affine ones by those of one table, every kind of A by all but two."""
+    """Boxed bounds by all, affine ones by those of one table, every kind of A by all but three."""
     assert all(getattr(method, "boxed", True) for method in wl.METHODS.values())
     assert {name for name, method in wl.METHODS.items() if families(method) != {"dense", "sparse", "grid"}} == set(OWN)
     assert {name: families(wl.METHODS[name]) for name in OWN} == OWN

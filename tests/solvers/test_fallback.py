@@ -1,7 +1,9 @@
 """`wl.Fallback` against a plain loop: which method is asked in which step, what it is handed, and who is named."""
 
+import ast
 import pickle
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -303,3 +305,13 @@ def test_a_users_chain():
     assert result.method == "lemke"
     assert natural_residual(A, b, 0.0, np.inf, result.x.numpy()) <= 1e-8
     assert [record.method for record in result.history[:7]] == ["psor"] * 6 + ["lemke"]
+
+
+def test_methods_import_no_other_inside_functions():
+    """A method that turns into another one would have to."""
+    found = []
+    for file in Path(wl.__file__).parent.joinpath("solvers").glob("*.py"):
+        for function in (node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)):
+            imports = [node for node in ast.walk(function) if isinstance(node, ast.ImportFrom)]
+            found += [ast.unparse(node) for node in imports if "warp_lcp" in str(node.module)]
+    assert not found
