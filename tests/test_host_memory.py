@@ -8,7 +8,6 @@ import warp_lcp
 ROOT = Path(warp_lcp.__file__).parent
 VIEWS = ("reshape", "ravel", "view", "T")
 WRITES = {  # function: why it may
-    "multigrid/halo_levels.py:share_changes": "assigned afterwards on CUDA",
     "rows/fields.py:copy": "sparse fields are the CPU's",
     "rows/fields.py:unload": "sparse fields are the CPU's",
     "rows/vectors.py:_add_across": "on the CPU only; assigned on CUDA",

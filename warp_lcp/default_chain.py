@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 from warp_lcp.multigrid.aggregates import suits_multigrid
 from warp_lcp.multigrid.line_hierarchy import takes_points
@@ -31,7 +32,9 @@ BATCH = 200  # steps of MPRGP that count as one: together they cost about as muc
 
 
 def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
-    """Return a method with those that take over where it stops; the method itself if none does.
+    """Return a method with those that take over where it stops.
+
+    It is the method itself if none does.
 
     - `ProjectedMultigrid`: where cycles crawl, `MinimumMapNewton` on the assembled matrix, unless in single precision, on ranks or
       with floating components; beside rigid bodies `MinimumMapNewton`, where cycles crawl or the free set goes round in circles.
@@ -99,7 +102,7 @@ def _of_multigrid(method: ProjectedMultigrid) -> Solver:
     newton = MinimumMapNewton(precision=method.precision, cycle=method.cycle)
     entries = [FallbackEntry(method)]
     if method.precision != "single":
-        entries.append(FallbackEntry(ON_ASSEMBLED, crawls))
+        entries.append(FallbackEntry(_on_assembled(), crawls))
     return Fallback(*entries, FallbackEntry(newton, cycles_fail_beside_bodies))
 
 
@@ -108,7 +111,7 @@ def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
     if problem is None or has(A, HasColumns):
         return method
     if has(A, HasStencil):
-        return method if takes_points(A) else Fallback(method, (ON_ASSEMBLED, stalls_or_crawls))
+        return method if takes_points(A) else Fallback(method, (_on_assembled(), stalls_or_crawls))
     if not (has(A, HasRows) and has(A, HasScale)):
         return method
     first, *between = [FallbackEntry(method)]
@@ -122,7 +125,7 @@ def _of_newton(method: MinimumMapNewton, problem: LCP | None) -> Solver:
 def _of_active_set(method: PrimalDualActiveSet, problem: LCP | None) -> Solver:
     newton = method.as_newton()
     if problem is None or has(problem.A, HasStencil):
-        return Fallback(method, (newton, fails), (ON_ASSEMBLED, stalls_or_crawls))
+        return Fallback(method, (newton, fails), (_on_assembled(), stalls_or_crawls))
     if isinstance(problem.A, DenseOperator):
         return Fallback(method, *_last())
     if not (has(problem.A, HasRows) and has(problem.A, HasScale)):
@@ -151,4 +154,7 @@ def _minimizes(problem: LCP) -> bool:
     return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
 
 
-ON_ASSEMBLED = AssembledMatrix(Fallback(MinimumMapNewton(precision="double"), *_last()))
+@cache
+def _on_assembled() -> AssembledMatrix:
+    """Return Newton's method, and what follows it on matrices, at work on the assembled matrix of a grid."""
+    return AssembledMatrix(Fallback(MinimumMapNewton(precision="double"), *_last()))

@@ -83,7 +83,10 @@ class Recommendation:
 
     @property
     def chain(self) -> Solver:
-        """The method with those that go on where it stops: a `wl.Fallback`, or the method itself if none does."""
+        """Method with those that take over where it stops: a `wl.Fallback`.
+
+        It is the method itself if none does.
+        """
         return default_chain(self.method, self.traits.problem)
 
 

@@ -23,7 +23,7 @@ class AssembledMatrix(Settings):
 
     For domains on which aggregates of whole blocks fail: channels and walls a cell wide, spirals and mazes share blocks that are not
     joined inside; so do cells whose coefficients are random over many decades. Cycles of a geometric hierarchy are slow there, without
-    bounds too, while algebraic aggregates follow the coefficients (Vanek, Mandel, Brezina 1996). The unknowns are the fluid cells, in
+    bounds too, while algebraic aggregates follow the coefficients (Vanek, Mandel and Brezina). The unknowns are the fluid cells, in
     their order. Steps are those of `inner`, with its cold start.
 
     Args:

@@ -29,7 +29,7 @@ PROVED = (SolveStatus.INFEASIBLE, SolveStatus.NEGATIVE_CURVATURE)  # failures th
 
 
 class Progress:
-    """What a condition sees: the residuals and steps of the method at work, since it began.
+    """Residuals and steps of the method at work, which conditions see.
 
     Attributes:
         problem: the problem.
@@ -73,14 +73,15 @@ def fails(progress: Progress) -> bool:
 
 
 def stalls(progress: Progress) -> bool:
-    """Return whether the last step has failed, or 10 steps have not reduced the residual."""
+    """Return whether a step has failed, or 10 have not reduced the residual."""
     return fails(progress) or progress.waited >= STALLED
 
 
 def crawls(progress: Progress) -> bool:
-    """Return whether the tolerance is more than 30 steps away at the pace of the last 10 steps; after 20 steps.
+    """Return whether the tolerance is more than 30 steps away.
 
-    Also where it is below what float64 can tell from 0 beside the first residual: then that counts.
+    That is at the pace of the last 10 steps, and after 20 steps. Where the tolerance is below what float64 can tell from 0 beside the
+    first residual, that counts.
     """
     if len(progress.least) <= FIRST:
         return False
@@ -89,7 +90,10 @@ def crawls(progress: Progress) -> bool:
 
 
 def slow_linear_solves(progress: Progress) -> bool:
-    """Return whether the last step has taken 30 linear iterations or more: its preconditioner is weak."""
+    """Return whether the last step has taken 30 linear iterations or more.
+
+    Then its preconditioner is weak.
+    """
     return progress.step is not None and progress.step.linear_iterations >= WEAK
 
 
@@ -125,7 +129,7 @@ class FallbackEntry:
 
 
 class Fallback:
-    """Methods in order; one takes over from the one before as soon as its condition holds.
+    """Methods in order, each with the condition under which it takes over.
 
     Before each step the condition of the next method that takes the problem is asked; others, and one equal to the method at work,
     are skipped. If it holds, the next method gets the iterate (the best one if the last step has failed or the method at work had

@@ -86,7 +86,7 @@ class MPRGP(Settings):
         return self._checked(problem, None)
 
     def init_after(self, problem: LCP, before: Any) -> MPRGPWorkspace:
-        """Return a workspace with the preconditioner of the method before, if that is a sparse matrix's; raises as `init`."""
+        """Return a workspace with the preconditioner of a sparse matrix's method."""
         system = getattr(before, "system", None)
         return self._checked(problem, system if isinstance(system, SparseSystem) else None)
 

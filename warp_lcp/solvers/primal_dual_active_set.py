@@ -39,7 +39,7 @@ class PrimalDualActiveSet(Settings):
     With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it is above, else free: y_i = 0 there. This
     is MinimumMapNewton's step without search or projection, and shares its implementation. Started anywhere it ends after finitely many
     steps if A is an M-matrix; on other P-matrices it may cycle. If a set recurs without a smaller residual, dense problems continue by
-    least-index principal pivoting (Murty 1974; with bounds Judice and Pires 1992), which is finite for every P-matrix but may be slow;
+    least-index principal pivoting (Murty 1974; with bounds Judice and Pires), which is finite for every P-matrix but may be slow;
     others end with STAGNATED. So does a solve that meets a singular free block (never in a P-matrix): its set stays while the residual
     does not fall, the residual grows by 1e7, or the block's condition number exceeds 1e12. Cold, the first steps on a grid are
     projected multigrid cycles.
@@ -81,7 +81,10 @@ class PrimalDualActiveSet(Settings):
         return ActiveSetWorkspace(problem, self.as_newton(), stop_if_singular=self.stop_if_singular)
 
     def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a full step, or least-index pivots after a recurring set."""
+        """Take a monotone cycle while the start is cold, else a full step.
+
+        After a recurring set it is one of least-index pivots.
+        """
         return work.step(x)
 
 

@@ -24,8 +24,6 @@ from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, Mul
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 
-RELAPSES = 3  # runs of monotone cycles that were due, after which the free set goes round in circles
-
 
 class CoupledResidual(AssessedResidual):
     """The natural residual of y = A x + (b + U W U' x): the term in brackets changes on U's rows only and takes b's place.
@@ -74,6 +72,9 @@ class CoupledWorkspace(MultigridWorkspace):
 
     residual: CoupledResidual
     correction: LowRankCorrection
+    # What a projection does to the force on a body that weighs next to nothing is a leap each time, and the energy
+    # of grid and bodies lets projected cycles of the grid hardly move.
+    most_runs = 3
 
     def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
         self._low = low
@@ -103,15 +104,6 @@ class CoupledWorkspace(MultigridWorkspace):
         reference = super().begin_ahead(guess, criteria, steps)
         self._prepared = reference is not None and self.correction.is_made_ahead
         return reference
-
-    @property
-    def goes_in_circles(self) -> bool:
-        """Whether the free set keeps coming again.
-
-        What a projection does to the force on a body that weighs next to nothing is a leap each time, and the energy of grid and bodies
-        lets projected cycles of the grid hardly move.
-        """
-        return self.descent.runs >= RELAPSES
 
     def _begin_cycles(self, count: int) -> None:
         self._cycles_left = count

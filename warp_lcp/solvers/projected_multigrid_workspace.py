@@ -192,6 +192,7 @@ class MultigridWorkspace(IterateMemory):
     residual: AssessedResidual
     readings: tuple[Reading, ...] = ()  # that evaluations leave besides the residual's
     correction: LowRankCorrection | None = None  # of the cycle, for bodies
+    most_runs: float = math.inf  # of projected cycles that were due: after those, the free set goes round in circles
     free_set_noted = False  # whether `LowRankCorrection.note` has been launched for the free set as it is
 
     def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid, *, shifted: bool = False) -> None:
@@ -337,8 +338,8 @@ class MultigridWorkspace(IterateMemory):
 
     @property
     def goes_in_circles(self) -> bool:
-        """Whether steps have been found to lead nowhere."""
-        return False
+        """Whether the free set keeps coming again, in a problem where that has no end."""
+        return self.descent.runs >= self.most_runs
 
     @property
     def is_ahead(self) -> bool:

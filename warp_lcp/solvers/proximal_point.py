@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -26,13 +27,13 @@ TRIED, FEWER = 30, 15  # steps for one center, before and after eps had to be ra
 SMALL = 1000  # unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is there
 FALL = 0.9  # a center whose residual is above this part of the smallest so far is no progress
 IDLE = 4  # centers without progress before the end
-ON_DENSE = PrimalDualActiveSet(precision="double", stop_if_singular=False)
-ON_SPARSE = Fallback(ON_DENSE, (MinimumMapNewton(precision="double"), fails))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProximalPoint(Settings):
-    """Proximal-point method (Martinet 1970, Rockafellar 1976): solve regularized problems around moving centers.
+    """Proximal-point method (Martinet 1970, Rockafellar 1976).
+
+    It solves regularized problems around moving centers.
 
     Solve A x + b + eps D (x - c) = y with the same bounds, take clip(x, l, u) for the center c, lower eps, repeat. D is the natural
     residual's d. A + eps D is a P-matrix wherever A is a P0-matrix (positive semi-definite ones, skew ones), so that free blocks are
@@ -74,7 +75,10 @@ class ProximalPoint(Settings):
         return ProximalWorkspace(problem, self.inner)
 
     def step(self, problem: LCP, work: ProximalWorkspace, x: wp.array[Any]) -> Step:
-        """Take one step for the regularized problem, from a new center if the last one's has been solved."""
+        """Take one step for the regularized problem.
+
+        It begins at a new center if the last one's has been solved.
+        """
         return work.step(x)
 
 
@@ -95,7 +99,7 @@ class ProximalWorkspace(IterateMemory):
         self._operator: Any = as_operator(self._regularized(), p.device)
         self._lower, self._upper = p.lower.numpy().copy(), p.upper.numpy().copy()
         self._inner = LCP(self._operator, self._b, self._lower, self._upper)
-        self._method = self._given or (ON_SPARSE if scipy.sparse.issparse(self._matrix) else ON_DENSE)
+        self._method = self._given or _inner_method(scipy.sparse.issparse(self._matrix))
         self._work: Any = self._method.init(self._inner)
         self._smallest, self._idle, self._steps, self._near, self._least = self.residual.norm, 0, 0, 0.0, LEAST
 
@@ -160,3 +164,10 @@ class ProximalWorkspace(IterateMemory):
         places = np.r_[entries.row, i], np.r_[entries.col, i]
         # duplicates are summed and sums of 0 stay entries: the pattern is the same for all eps
         return scipy.sparse.csr_array((np.r_[entries.data, self._eps * self._D], places), shape=self._matrix.shape)
+
+
+@cache
+def _inner_method(sparse: bool) -> Solver:
+    """Return the method for regularized problems, whose matrices are P-matrices wherever A is a P0-matrix."""
+    pivoting = PrimalDualActiveSet(precision="double", stop_if_singular=False)
+    return Fallback(pivoting, (MinimumMapNewton(precision="double"), fails)) if sparse else pivoting
