@@ -23,10 +23,6 @@ OWN = {  # methods that do not take every kind of A
     "proximal-gauss-seidel": set(),
     "proximal-point": {"dense", "sparse"},
 }
-    "projected-multigrid": {"grid"},
-    "proximal-gauss-seidel": set(),
-    "proximal-point": {"dense", "sparse"},
-}  # methods that do not take every kind of A
 
 
 def test_every_method_has_its_row():

@@ -83,7 +83,7 @@ class Recommendation:
 
     @property
     def chain(self) -> Solver:
-        """The method with those that go on where it stops: a `wl.Fallback`, or the method itself if none does."""
+        """The method with those that take over where it stops, see `wl.default_chain`."""
         return default_chain(self.method, self.traits.problem)
 
 

@@ -81,7 +81,10 @@ class PrimalDualActiveSet(Settings):
         return ActiveSetWorkspace(problem, self.as_newton(), stop_if_singular=self.stop_if_singular)
 
     def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, else a full step, or least-index pivots after a recurring set."""
+        """Take a monotone cycle while the start is cold, else a full step.
+
+        Least-index pivots after a recurring set.
+        """
         return work.step(x)
 
 
