@@ -25,7 +25,7 @@ def test_recommended_methods_converge(family):
     for seed in SEEDS:
         name, lcp, accuracy = make(family, seed)
         advice = wl.recommend(lcp, accuracy=accuracy)
-        result = wl.solve(lcp, advice.method, stopping=advice.stopping)
+        result = wl.solve(lcp, advice.chain, stopping=advice.stopping)
         assert result, f"{name}: {advice.name} ends {result.status.name} at {result.relative_residual:.1e}"
         assert result.relative_residual <= accuracy
         assert set(advice.alternatives) <= set(wl.METHODS) - {advice.name}
@@ -56,7 +56,7 @@ def test_the_answer_is_one_by_another_codes_residual():
     before = lcp.b.numpy().copy()
     advice = wl.recommend(lcp, accuracy=1e-8)
     assert np.array_equal(lcp.b.numpy(), before)
-    x = wl.solve(lcp, advice.method, stopping=advice.stopping).x.numpy()
+    x = wl.solve(lcp, advice.chain, stopping=advice.stopping).x.numpy()
     start = natural_residual(problem.A, problem.b, problem.lower, problem.upper, np.clip(np.zeros(40), problem.lower, problem.upper))
     assert natural_residual(problem.A, problem.b, problem.lower, problem.upper, x) <= 1e-8 * start * (1 + 1e-6)
 

@@ -34,7 +34,7 @@ BATCH = 200  # steps of MPRGP that count as one: together they cost about as muc
 def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
     """Return a method with those that take over where it stops.
 
-    It is the method itself if none does.
+    The method itself if none does.
 
     - `ProjectedMultigrid`: where cycles crawl, `MinimumMapNewton` on the assembled matrix, unless in single precision, on ranks or
       with floating components; beside rigid bodies `MinimumMapNewton`, where cycles crawl or the free set goes round in circles.
@@ -58,7 +58,7 @@ def default_chain(method: Solver, problem: LCP | None = None) -> Solver:
 
 @dataclass(frozen=True, kw_only=True)
 class PathCreeps(Settings):
-    """Whether the last step has failed, or a path that was joined far from the start leads nowhere.
+    """Condition: the last step has failed, or the path leads nowhere.
 
     Args:
         steps: without a residual below 0.9 of the smallest so far.

@@ -83,10 +83,7 @@ class Recommendation:
 
     @property
     def chain(self) -> Solver:
-        """Method with those that take over where it stops: a `wl.Fallback`.
-
-        It is the method itself if none does.
-        """
+        """The method with those that take over where it stops, see `wl.default_chain`."""
         return default_chain(self.method, self.traits.problem)
 
 

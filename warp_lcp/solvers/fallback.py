@@ -29,7 +29,7 @@ PROVED = (SolveStatus.INFEASIBLE, SolveStatus.NEGATIVE_CURVATURE)  # failures th
 
 
 class Progress:
-    """Residuals and steps of the method at work, which conditions see.
+    """Residuals and steps of the method at work, as a condition sees them.
 
     Attributes:
         problem: the problem.
@@ -73,15 +73,14 @@ def fails(progress: Progress) -> bool:
 
 
 def stalls(progress: Progress) -> bool:
-    """Return whether a step has failed, or 10 have not reduced the residual."""
+    """Return whether the last step has failed, or 10 steps brought no progress."""
     return fails(progress) or progress.waited >= STALLED
 
 
 def crawls(progress: Progress) -> bool:
-    """Return whether the tolerance is more than 30 steps away.
+    """Return whether the tolerance is more than 30 steps away at the present pace.
 
-    That is at the pace of the last 10 steps, and after 20 steps. Where the tolerance is below what float64 can tell from 0 beside the
-    first residual, that counts.
+    By the last 10 steps, and not before 20. A tolerance below float64's rounding of the first residual counts as that.
     """
     if len(progress.least) <= FIRST:
         return False
@@ -92,7 +91,7 @@ def crawls(progress: Progress) -> bool:
 def slow_linear_solves(progress: Progress) -> bool:
     """Return whether the last step has taken 30 linear iterations or more.
 
-    Then its preconditioner is weak.
+    Its preconditioner is weak then.
     """
     return progress.step is not None and progress.step.linear_iterations >= WEAK
 
@@ -129,7 +128,7 @@ class FallbackEntry:
 
 
 class Fallback:
-    """Methods in order, each with the condition under which it takes over.
+    """Chain of methods, each of which takes over as soon as its condition holds.
 
     Before each step the condition of the next method that takes the problem is asked; others, and one equal to the method at work,
     are skipped. If it holds, the next method gets the iterate (the best one if the last step has failed or the method at work had
@@ -176,7 +175,7 @@ class Fallback:
         return Fallback, self.entries
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the first method says of the problems that it takes: `supports`, `distributed`, `precision`, ..."""
+        """Return an attribute of the first method: `supports`, `distributed`, `precision`, ..."""
         if name.startswith("__") or name == "entries":
             raise AttributeError(name)
         return getattr(self.entries[0].method, name)
@@ -192,7 +191,7 @@ class Fallback:
         return tuple(method_name(entry.method) for entry in self.entries)
 
     def init(self, problem: Any) -> FallbackWorkspace:
-        """Return a workspace; the methods after the first make theirs when they take over.
+        """Return a workspace; later methods make theirs when they take over.
 
         Raises:
             ValueError: the first method does not take the problem.
@@ -228,7 +227,9 @@ class SpareChain:
 
 
 class FallbackWorkspace:
-    """Memory of a chain for one problem. Other attributes than these are those of the first method's workspace.
+    """Memory of a chain for one problem.
+
+    Attributes that are not its own are those of the first method's workspace.
 
     Args:
         problem: the problem.

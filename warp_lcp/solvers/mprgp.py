@@ -86,7 +86,10 @@ class MPRGP(Settings):
         return self._checked(problem, None)
 
     def init_after(self, problem: LCP, before: Any) -> MPRGPWorkspace:
-        """Return a workspace with the preconditioner of a sparse matrix's method."""
+        """Return a workspace with the preconditioner of the method before.
+
+        If that is a sparse matrix's. Raises as `init`.
+        """
         system = getattr(before, "system", None)
         return self._checked(problem, system if isinstance(system, SparseSystem) else None)
 

@@ -83,7 +83,7 @@ class PrimalDualActiveSet(Settings):
     def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a full step.
 
-        After a recurring set it is one of least-index pivots.
+        Least-index pivots after a recurring set.
         """
         return work.step(x)
 

@@ -31,16 +31,15 @@ IDLE = 4  # centers without progress before the end
 
 @dataclass(frozen=True, kw_only=True)
 class ProximalPoint(Settings):
-    """Proximal-point method (Martinet 1970, Rockafellar 1976).
+    """Proximal-point method: solve regularized problems around moving centers.
 
-    It solves regularized problems around moving centers.
-
-    Solve A x + b + eps D (x - c) = y with the same bounds, take clip(x, l, u) for the center c, lower eps, repeat. D is the natural
-    residual's d. A + eps D is a P-matrix wherever A is a P0-matrix (positive semi-definite ones, skew ones), so that free blocks are
-    regular and least-index pivoting is finite. Its solutions tend to one of the problem's own if A is monotone and there is one. Each
-    regularized problem is solved to 1e-3 of its center's residual, by an inner method; where that fails, eps is raised, and does not
-    fall below that again. Failure with eps = 1 ends the solve with NON_DESCENT, centers without progress with STAGNATED, a proof by a
-    linear program (at most 40,000 entries) with INFEASIBLE. A step is one of the inner method; `linear_iterations` counts as there.
+    (Martinet 1970, Rockafellar 1976.) Solve A x + b + eps D (x - c) = y with the same bounds, take clip(x, l, u) for the center c,
+    lower eps, repeat. D is the natural residual's d. A + eps D is a P-matrix wherever A is a P0-matrix (positive semi-definite ones,
+    skew ones), so that free blocks are regular and least-index pivoting is finite. Its solutions tend to one of the problem's own if A
+    is monotone and there is one. Each regularized problem is solved to 1e-3 of its center's residual, by an inner method; where that
+    fails, eps is raised, and does not fall below that again. Failure with eps = 1 ends the solve with NON_DESCENT, centers without
+    progress with STAGNATED, a proof by a linear program (at most 40,000 entries) with INFEASIBLE. A step is one of the inner method;
+    `linear_iterations` counts as there.
 
     Made for a singular block here and there. Linear programs (A skew) of more than some dozens of unknowns come to residuals of 1e-2 or
     end with NON_DESCENT: they are InteriorPoint's.
@@ -75,10 +74,7 @@ class ProximalPoint(Settings):
         return ProximalWorkspace(problem, self.inner)
 
     def step(self, problem: LCP, work: ProximalWorkspace, x: wp.array[Any]) -> Step:
-        """Take one step for the regularized problem.
-
-        It begins at a new center if the last one's has been solved.
-        """
+        """Take one step of the inner method, from a new center if one is due."""
         return work.step(x)
 
 
