@@ -134,12 +134,10 @@ FORMULAS = [
         ("self._element = np.zeros(n), np.ones(n)", "self._element = np.ones(n), np.zeros(n)"),
         ("self._element = np.zeros(n), np.ones(n)", "self._element = np.zeros(n), np.zeros(n)"),
         ("self._element = np.zeros(n), np.ones(n)", "self._element = -np.ones(n), 5 * np.ones(n)"),
-        ('"over": 1 / self.scale', '"over": 1.0'),
-        ("share = 1.0 if smoothing", "share = 0.5 if smoothing"),
+        ("over=1 / self.scale", "over=1.0"),
+        ("share=1.0 if smoothing", "share=0.5 if smoothing"),
     ),
-    *_changes(
-        "reduced/nonsmooth_map.py", MAP, ("1 - np.sqrt(0.5) * self._rng", "1 - self._rng"), ('"kinks": KINK * self.scale', '"kinks": 0.0')
-    ),
+    *_changes("reduced/nonsmooth_map.py", MAP, ("1 - np.sqrt(0.5) * self._rng", "1 - self._rng"), ("kinks=KINK * self.scale", "kinks=0.0")),
     *_changes(
         "reduced/headers/nonsmooth_map.h",
         MAP,

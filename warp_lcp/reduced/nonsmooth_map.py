@@ -399,6 +399,7 @@ class HostMap:
         """Return f, p, q and kinks: memory that the next call overwrites."""
         n, data = len(x), self.data
         reals = (x, y, self.d, data.lower, data.upper, *self._element)
-        share = 1.0 if smoothing else self.share
-        numbers: dict[str, Any] = {"share": share, "over": 1 / self.scale, "kinks": KINK * self.scale, "twice_mu": 2 * smoothing}
-        return HOST.run(reals, (), tasks=n, count=n, **numbers)[1]
+        return HOST.run(
+            reals, (), tasks=n, count=n, share=1.0 if smoothing else self.share, over=1 / self.scale, kinks=KINK * self.scale,
+            twice_mu=2 * smoothing,
+        )[1]  # fmt: skip

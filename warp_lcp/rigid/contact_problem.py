@@ -2,9 +2,11 @@
 
 The bounds are affine in the normal impulses.
 
-It is solved by `warp_lcp.solvers.nncg` on B = J J' + diag(e), whose rows live at bodies: a sweep costs the entries of J, not those of B,
-and an island of bodies is solved by one thread in one launch. Contacts of a pile are so few that launches would take all of the time:
-0.2 ms an iteration where the arithmetic takes 0.002 ms. Sweeps need about as many iterations as the ratio of masses that touch, times the
+It is solved by the method of `warp_lcp.solvers.nncg` on B = J J' + diag(e), in a loop of its own (`headers/contact_nncg.h`), which shares
+the formula of beta (`snippets.h`). It differs in three ways: rows are products with J at bodies, so that a sweep costs the entries of J,
+not those of B; contacts are swept in their order, not by colors; and an island of bodies is solved by one thread in one launch, which looks
+at the residual each 8 sweeps. `wl.NNCG` on the assembled B takes 390, 510 and 890 us an iteration with 20, 200 and 1,000 contacts, this
+loop 2.6, 26 and 110 us. Sweeps need about as many iterations as the ratio of masses that touch, times the
 square of a stack's height; the rest is solved by sparse systems in `contact_newton`.
 """
 

@@ -59,8 +59,8 @@ for (;;) {
             square += g[i]*g[i];
             change += d[i]*d[i]*g[i]*g[i];
         }
-        double beta = before > 0.0 ? square/before : 0.0, keep = 1.0;
-        if (beta > 1.0) { beta = 0.0; keep = 0.0; }
+        const double fresh = square, old = before;
+#include "snippets.h:fletcher_reeves"
         before = square;
         for (int i = low; i < high; ++i) {
             x[i] += beta*way[i];

@@ -39,3 +39,8 @@ auto grid_coordinate = [=](T x, int before = 0) -> T {
     return coordinate - (T)before;
 #endif
 };
+
+// snippet fletcher_reeves: beta = |g|^2 / |g before|^2 of the squares `fresh` and `old` (0: none
+// before), and keep = 1, for x <- x + beta p, p <- beta p - keep g. Where beta > 1 both are 0: p
+// is forgotten ([Book] algorithm 8).
+const double ratio = old > 0.0 ? fresh/old : 0.0, beta = ratio > 1.0 ? 0.0 : ratio, keep = ratio > 1.0 ? 0.0 : 1.0;

@@ -91,8 +91,8 @@ SIMD for (int k = 0; k < n; ++k) { const T v = unknown[k] == 1 ? g[k] - x[k] : (
 //   reads      float64 g; int8 unknown
 //   writes     float64 x, along
 //   whole      float64 squares
-const T now = squares[0], before = squares[1]; const bool grown = before > 0 && now/before > 1;
-const T beta = before > 0 && !grown ? now/before : (T)0, keep = grown ? (T)0 : (T)1;
+const double fresh = squares[0], old = squares[1];
+#include "snippets.h:fletcher_reeves"
 with_bounds([&](auto lower, auto upper) {
     SIMD for (int k = 0; k < n; ++k) {
         const T q = beta*along[k], c = clipped(x[k] + q, lower(k), upper(k)); const bool in = unknown[k] == 1;

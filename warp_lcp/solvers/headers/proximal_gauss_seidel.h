@@ -85,8 +85,8 @@ for (int t = first; t < last; ++t) {
 //   writes     float64 r, way
 //   whole      float64 state
 //   numbers    int now
-const double fresh = state[now], old = state[1 - now], ratio = old > 0.0 ? fresh/old : 0.0;
-const double beta = ratio > 1.0 ? 0.0 : ratio, keep = ratio > 1.0 ? 0.0 : 1.0;
+const double fresh = state[now], old = state[1 - now];
+#include "snippets.h:fletcher_reeves"
 SIMD8 for (int k = 0; k < n; ++k) {
     const double along = way[k], back = g[k];
     r[k] += beta*along;
@@ -99,8 +99,8 @@ SIMD8 for (int k = 0; k < n; ++k) {
 //   writes     float64 w, before, way
 //   whole      float64 state
 //   numbers    int now
-const double fresh = state[now], old = state[1 - now], ratio = old > 0.0 ? fresh/old : 0.0;
-const double beta = ratio > 1.0 ? 0.0 : ratio, keep = ratio > 1.0 ? 0.0 : 1.0;
+const double fresh = state[now], old = state[1 - now];
+#include "snippets.h:fletcher_reeves"
 SIMD8 for (int k = 0; k < n; ++k) {
     const double along = way[k], at = w[k], moved = at + beta*along;
     way[k] = beta*along + keep*(at - before[k]);
