@@ -303,6 +303,7 @@ FORMULAS = [
     *_changes(
         "reduced/grid_step_kernels.py", GRADIENTS, ("ratio = -zap / pap", "ratio = zap / pap"), ("gz + ratio * gp", "gz - ratio * gp")
     ),
+    *_changes("operators/banded_matrix.py", PIVOTS, ("t[:-1] - np.multiply.outer", "t[:-1] + np.multiply.outer")),
     *_changes(
         "solvers/lemke.py",
         PIVOTS,
@@ -312,7 +313,6 @@ FORMULAS = [
         ("ratios = inverse[:, column] / direction[rows]", "ratios = inverse[:, column]"),
         ("for column in range(self.m):\n            if inverse", "for column in range(1):\n            if inverse"),
         ("ratios = np.divide(q, d, out", "ratios = np.divide(q, np.ones(m), out"),
-        ("t[:-1] - np.multiply.outer", "t[:-1] + np.multiply.outer"),
     ),
     *_changes(
         "solvers/headers/penalty.h",

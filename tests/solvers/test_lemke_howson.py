@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.solvers.lemke_howson import strategies
+from warp_lcp.solvers.lemke import strategies
 
 EXACT = wl.StoppingCriteria(rtol=1e-10, max_iterations=1000)
 

@@ -1,4 +1,4 @@
-"""Lemke's complementary pivoting: any dense matrix, the oracle of the other methods."""
+"""Lemke's complementary pivoting, which starts as Lemke and Howson's on bimatrix games: any dense matrix."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import warp as wp
 from scipy.linalg.blas import dger
 
 from warp_lcp.deadline import time_is_up
+from warp_lcp.operators.banded_matrix import BandedFactors
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.bounds import without_far
 from warp_lcp.problem.lcp import LCP
@@ -19,7 +20,6 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import EPS, Step
 from warp_lcp.reduced.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of
 from warp_lcp.settings import Count, Settings
-from warp_lcp.solvers.lemke_howson import start_game
 
 REGULAR = 1e-10  # reciprocal condition number above which the equations' block is eliminated
 
@@ -125,56 +125,6 @@ def narrow_problem(problem: LCP) -> DenseProblem | None:
     data = DenseProblem.read(problem, keep_sparse=True)
     sided = (np.isfinite(data.lower) | np.isfinite(data.upper)) & (data.lower < data.upper)
     return data if sided.all() else None
-
-
-class BandedFactors:
-    """C = T + u e_p' and its factors: column i of T is e_i or -M_i, that of the pair p, both of whose variables are out, is e_p.
-
-    Args:
-        M: sparse, shape (m, m).
-        d: covering vector: z0's column is -d, and stands in place p.
-    """
-
-    def __init__(self, M: scipy.sparse.csr_array, d: np.ndarray) -> None:
-        m, entries = len(d), M.tocoo()
-        self.m, self.k = m, int(np.abs(entries.row - entries.col).max(initial=0))
-        self._bands, self._unit = np.zeros((3 * self.k + 1, m)), np.zeros((3 * self.k + 1, m))
-        self._bands[2 * self.k + entries.row - entries.col, entries.col] = -entries.data
-        self._unit[2 * self.k] = 1.0
-        self._d = d
-
-    def factor(self, by_z: np.ndarray, p: int) -> bool:
-        """Take -M_i where `by_z` says so; return whether T is regular."""
-        self._p = p
-        chosen = by_z.copy()
-        chosen[p] = False
-        self._lu, self._pivots, info = scipy.linalg.lapack.dgbtrf(np.where(chosen, self._bands, self._unit), self.k, self.k)
-        u = -self._d.copy()
-        u[p] -= 1.0
-        self._update = self._back(u)
-        self._denominator = 1.0 + self._update[p]
-        return bool(info == 0 and self._denominator != 0 and np.isfinite(self._update).all())
-
-    def column(self, j: int) -> np.ndarray:
-        """Return -M_j, shape (m,), from the bands."""
-        column, first, last = np.zeros(self.m), max(j - self.k, 0), min(j + self.k + 1, self.m)
-        column[first:last] = self._bands[2 * self.k + first - j : 2 * self.k + last - j, j]
-        return column
-
-    def solve(self, r: np.ndarray) -> np.ndarray:
-        """Return C^-1 r, r of shape (m,) or (m, columns)."""
-        s = self._back(r)
-        return s - np.multiply.outer(self._update, s[self._p] / self._denominator)
-
-    def rows(self, indices: np.ndarray) -> np.ndarray:
-        """Return rows of C^-1, shape (len(indices), m)."""
-        unit = np.zeros((self.m, len(indices) + 1))
-        unit[np.r_[indices, self._p], np.arange(len(indices) + 1)] = 1.0
-        t = self._back(unit, transposed=True).T
-        return t[:-1] - np.multiply.outer(self._update[indices] / self._denominator, t[-1])
-
-    def _back(self, r: np.ndarray, *, transposed: bool = False) -> np.ndarray:
-        return scipy.linalg.lapack.dgbtrs(self._lu, self.k, self.k, r, self._pivots, trans=int(transposed))[0]
 
 
 PIVOT = 1e-10  # entries of the entering column below this part of its largest are no pivots (methods.md: 200 of 200 with it)
@@ -391,6 +341,46 @@ class BandedBasis(Basis):
         self.regular = self.factors.factor(self.variables >= self.m, self.row)
         if self.regular:
             self.values = self.factors.solve(self.q)
+
+
+def strategies(M: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the unknowns of two players, None if this is no game.
+
+    A bimatrix game of costs has M = [[0, E], [F', 0]], E > 0, F > 0 and q < 0, in some order.
+    """
+    if not (q < 0).all() or (M.diagonal() != 0).any():
+        return None
+    own = M[0] == 0
+    first, second = np.flatnonzero(own), np.flatnonzero(~own)
+    within = [M[np.ix_(player, player)] for player in (first, second)]
+    across = [M[np.ix_(*players)] for players in ((first, second), (second, first))]
+    return (first, second) if all((A == 0).all() for A in within) and len(second) and all((A > 0).all() for A in across) else None
+
+
+def start_game(basis: Basis) -> bool:
+    """Begin with the first player's first strategy; return False if this is no game.
+
+    w = q + M z. Lemke's z0, with d > 0, makes all w >= 0; the first complement that enters then
+    meets no row, as its block of M is 0: a ray. Lemke and Howson begin with z_k alone, as large as
+    makes w >= 0 for the other player, w_s = 0 there; then z_s, as large as makes w >= 0 for the
+    first one, w_r = 0 there. That is a feasible basis, complementary but for pair k: the solution
+    if r = k. Else z_r enters, and the path ends where a variable of pair k leaves; as E, F > 0, it
+    meets no ray.
+    """
+    players = strategies(basis.M, basis.q)
+    if players is None:
+        return False
+    m, pair = basis.m, int(players[0][0])
+    entering = pair
+    for rows in reversed(players):
+        sizes = -basis.q[rows] / basis.M[rows, entering]
+        # of ties the last: the rows of the others stay lexicographically positive
+        row = int(rows[np.flatnonzero(sizes >= sizes.max())[-1]])
+        basis.exchange(row, m + entering)
+        entering = row
+    basis.ends = (pair, m + pair)
+    basis.entering = -1 if entering == pair else m + entering
+    return True
 
 
 class LemkeWorkspace(DenseWorkspace):

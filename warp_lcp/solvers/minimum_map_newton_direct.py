@@ -17,7 +17,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.reduced.dense_problem import factored
-from warp_lcp.solvers.nested_iteration import nested_iteration
+from warp_lcp.reduced.nested_iteration import nested_iteration
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace

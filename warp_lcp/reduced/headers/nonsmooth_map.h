@@ -37,8 +37,8 @@ const R c0 = c > 0 ? c : (R)0, w0 = -w > 0 ? -w : (R)0;
 const R e = root(SMOOTHED(w*w + c*c)), es = e > tiny ? e : (R)1, n = c - w;
 const R below = n > 0 ? LOWERED(-2*w*c)/(n + es) : n - e, h = high ? -below : w;
 const bool kink2 = high & (e <= tiny);
-const R p2 = high ? (kink2 ? kp : (exact & (c > 0) ? w*w/(es*(es + c0)) : 1 - c/es)) : (R)0;
-const R q2 = high ? (kink2 ? kq : (exact & (w < 0) ? c*c/(es*(es + w0)) : 1 + w/es)) : (R)1;
+const R p2 = high ? (kink2 ? kp : ((exact & (c > 0)) ? w*w/(es*(es + c0)) : 1 - c/es)) : (R)0;
+const R q2 = high ? (kink2 ? kq : ((exact & (w < 0)) ? c*c/(es*(es + w0)) : 1 + w/es)) : (R)1;
 #else
 const R h = w, p2 = 0, q2 = 1; const bool kink2 = false;
 #endif

@@ -8,7 +8,7 @@ import warp_lcp as wl
 from narrow_problems import KINDS, M_MATRICES, narrow_problem
 from warp_lcp.operators.banded_matrix import BandedMatrix, bands_of, bandwidth
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.solvers.nested_iteration import COARSEST, BlockTridiagonalProblem, nested_iteration
+from warp_lcp.reduced.nested_iteration import COARSEST, BlockTridiagonalProblem, nested_iteration
 
 EPS = float(np.finfo(np.float64).eps)
 TIGHT = wl.StoppingCriteria(rtol=1e-7)
