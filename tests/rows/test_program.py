@@ -94,6 +94,22 @@ def test_a_loop_runs_while_its_condition_holds(runs, threads, monkeypatch):
 
 
 @pytest.mark.cpu_form("the team is the CPU's")
+def test_a_loop_ends_with_what_has_failed_in_it(threads):
+    """As an exchange between ranks, after which the condition may never be 0."""
+    left, odd = (wp.zeros(1, dtype=wp.int32, device=DEVICE) for _ in range(2))
+    program, a, _ = counting(left, odd)
+
+    def fail():
+        raise RuntimeError("the exchange has failed")
+
+    program._commands[0].check = fail
+    left.fill_(2_000_000_000)
+    with pytest.raises(RuntimeError, match="the exchange has failed"):
+        program.run_while(left)
+    assert 0 < a.numpy()[0] < 1e9
+
+
+@pytest.mark.cpu_form("the team is the CPU's")
 def test_a_loop_ends_with_the_deadline(threads):
     left, odd = (wp.zeros(1, dtype=wp.int32, device=DEVICE) for _ in range(2))
     program, a, _ = counting(left, odd)
