@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,11 +121,11 @@ class ParticleMessages:
         self._cells.reserve(3 * count)
         self._count.value = count
         self._search.run()
-        inside = self._found.host[1 : 1 + sum(self._ends)]
-        self._outgoing.reserve(words * int(inside.sum()))
+        inside, ends = self._found.host[1 : 1 + sum(self._ends)].tolist(), [0, *np.cumsum(self._ends).tolist()]
+        to = [words * sum(inside[:end]) for end in ends]
+        self._outgoing.reserve(to[-1])
         self._packing.run(positions_only, variant=positions_only)
-        sizes = words * np.add.reduceat(inside, np.cumsum([0, *self._ends[:-1]])) if len(inside) else []
-        messages = np.split(self._outgoing.host[: sum(sizes)], np.cumsum(sizes)[:-1]) if len(inside) else []
+        messages = [self._outgoing.host[begin:end] for begin, end in pairwise(to)]
         incoming = self.part.mailbox.swap(dict(zip(self._neighbors, messages, strict=False)))
         incoming += messages[len(self._neighbors) :]
         come = sum(map(len, incoming)) // words

@@ -31,15 +31,23 @@ auto side_of_box = [&](const T* at) -> int {
     return 2 - in - away;
 };
 
+// snippet copy_bytes: Copies few bytes between types
+#ifdef __CUDA_ARCH__
+#define COPY_BYTES memcpy
+#else
+#define COPY_BYTES __builtin_memcpy
+#endif
+
 // snippet columns: Columns of particles that are there
+#include "copy_bytes"
 float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data, (float*)given.affine_0.data,
                           (float*)given.affine_1.data, (float*)given.affine_2.data, (float*)given.kept.data};
 auto to_words = [&](int* to, long long p) {  // of a message: place, then what columns hold
-    __builtin_memcpy(to, place + p, 8); to += 2;
-    for (const float* column : columns) if (column) { __builtin_memcpy(to, column + 3*p, 12); to += 3; } };
+    COPY_BYTES(to, place + p, 8); to += 2;
+    for (const float* column : columns) if (column) { COPY_BYTES(to, column + 3*p, 12); to += 3; } };
 auto from_words = [&](const int* from, long long p) {
-    __builtin_memcpy(place + p, from, 8); from += 2;
-    for (float* column : columns) if (column) { __builtin_memcpy(column + 3*p, from, 12); from += 3; } };
+    COPY_BYTES(place + p, from, 8); from += 2;
+    for (float* column : columns) if (column) { COPY_BYTES(column + 3*p, from, 12); from += 3; } };
 int words = 2;
 for (const float* column : columns) words += column ? 3 : 0;
 
@@ -68,6 +76,7 @@ SIMD for (int p = first; p < last; ++p) where[p] = (unsigned char)side_of_box(po
 //              low_y, low_z, high_x, high_y, high_z, reach; int count, ends
 #include "side_of_box"
 #include "in_cells"
+#include "copy_bytes"
 constexpr int BLOCK = 1024;
 const T* at = (const T*)given.position.data;
 unsigned char side[BLOCK];
@@ -78,7 +87,7 @@ for (int from = 0; from < count; from += BLOCK) {
     SIMD for (int e = 0; e < n; ++e) side[e] = (unsigned char)side_of_box(at + 3*(long long)(from + e));
     for (int e = n; e < (n + 7)/8*8; ++e) side[e] = 0;
     for (int e = 0; e < n; e += 8) {
-        unsigned long long eight; __builtin_memcpy(&eight, side + e, 8);
+        unsigned long long eight; COPY_BYTES(&eight, side + e, 8);
         if (!eight) continue;
         for (int p = e; p < e + 8; ++p) {
             if (!side[p]) continue;
@@ -110,10 +119,10 @@ for (int b = 0; b < ends; ++b)
         to_words(to, border[e]);
         for (int d = 0; around && d < 3; ++d) {
             const double offset = offsets[3*b + d];
-            float x; __builtin_memcpy(&x, to + 2 + d, 4);
+            float x; COPY_BYTES(&x, to + 2 + d, 4);
             x = (float)((double)x + offset);
             x = offset > 0 && x < end[d] ? end[d] : x;
-            __builtin_memcpy(to + 2 + d, &x, 4); }
+            COPY_BYTES(to + 2 + d, &x, 4); }
         to += words; }
 
 // kernel warp_lcp.distributed.particles.unpack: Put the particles of messages behind the others
