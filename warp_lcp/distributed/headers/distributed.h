@@ -125,6 +125,21 @@ for (int b = 0; b < ends; ++b)
             COPY_BYTES(to + 2 + d, &x, 4); }
         to += words; }
 
+// kernel warp_lcp.distributed.particles.give_places: Give particles in the order of their cells
+// places: `most_a_cell` times the number of the cell among all ranks', and the number in the cell
+//   compute    float32
+//   whole      int32 key; int64 place
+//   box        int32 found
+//   numbers    int count, most_a_cell, before_x, before_y, before_z, nx, ny, all_x, all_y, all_z
+auto around = [](int i, int n) -> long long { return (i % n + n) % n; };  // where axes have no end
+long long next = 0;
+for (int p = 0; p < count; ++p) {
+    if (p == 0 || key[p] != key[p - 1]) {
+        const int row = key[p]/(nx + 2), i = key[p] - row*(nx + 2), k = row/(ny + 2), j = row - k*(ny + 2);
+        const long long x = around(i + before_x - 1, all_x), y = around(j + before_y - 1, all_y), z = around(k + before_z - 1, all_z);
+        next = ((z*all_y + y)*all_x + x)*most_a_cell; }
+    place[p] = next++; }
+
 // kernel warp_lcp.distributed.particles.unpack: Put the particles of messages behind the others
 //   compute    float32
 //   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
